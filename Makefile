@@ -1,0 +1,31 @@
+# netpos: make setup | demo | test | lint | bench | clean
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+
+.PHONY: help setup demo test test-unit test-integration lint bench clean
+
+help: ## list the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 20
+
+setup: ## install everything into .venv and build the workspace (does nothing when up to date)
+	@scripts/setup.sh
+
+demo: setup ## run METIS Madrid as a live graph, record, replay, score, draw; then the real BLE run where its data is
+	@. ./env.sh && scripts/demo.sh
+
+test: setup lint test-unit test-integration ## everything CI runs
+
+test-unit: setup ## the library and the nodes' conversions, without a running graph
+	@. ./env.sh && python -m pytest -q ros2_ws/src
+
+test-integration: setup ## the real processes, started with ros2 run
+	@. ./env.sh && python -m pytest -q tests
+
+lint: setup ## ruff, mypy
+	@. ./env.sh && ruff check . && ruff format --check . && mypy
+
+bench: setup ## speed as ratios measured in one run
+	@. ./env.sh && netpos bench
+
+clean: ## remove what setup made
+	rm -rf .venv ros2_ws/build ros2_ws/install ros2_ws/log out

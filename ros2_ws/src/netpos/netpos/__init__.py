@@ -1,0 +1,20 @@
+"""netpos: positioning of vehicles and pedestrians from the network side.
+
+The library behind the ROS 2 nodes; it imports no ROS. SI units and radians, integer nanoseconds for time.
+Frames follow REP-103 and REP-105: ``map`` is east-north-up, a device's ``base_link`` is forward-left-up.
+
+Rooms
+-----
+``messages``    value types of the ROS interfaces and their conversion
+``world``       maps, routes, motion, frames
+``radio``       measurement models, arrays, Cramer-Rao bounds, line of sight, clocks, noise
+``inertial``    IMU models, attitude, steps, pedestrian dead reckoning
+``filters``     Kalman filters and their compiled kernels
+``tracking``    one track per device: initialise, gate, order, reset
+``scenario``    one YAML file = one reproducible run
+``bags``        MCAP bags: read, write, recover, import
+``evaluation``  metrics, consistency, requirement verdicts, reports
+``cli``         the ``netpos`` command
+"""
+
+__version__ = "0.1.0"

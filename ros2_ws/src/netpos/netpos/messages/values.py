@@ -1,0 +1,197 @@
+"""What flows between the parts of netpos, as plain values.
+
+Stamps are integer nanoseconds of network time. Positions are metres in ``map`` (east, north, up), angles radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum, IntFlag
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Field(IntFlag):
+    """Quantities a measurement may carry (RsuMeasurement.fields)."""
+
+    AZIMUTH = 1
+    ELEVATION = 2
+    TOA = 4
+    RANGE = 8
+    PHASE = 16
+    POSITION = 32
+
+
+class TrackState(IntEnum):
+    """Health of a track (TrackStatus.state)."""
+
+    WAITING = 0
+    INITIALISING = 1
+    TRACKING = 2
+    COASTING = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RsuInfo:
+    """A roadside unit: where it is, which way it looks, which slow errors it has.
+
+    position : (3,) m in map; quaternion : (4,) x y z w, RSU axes (x boresight, y left, z up) to map.
+    Biases are first-order Gauss-Markov with ``bias_correlation_time_s``; 0 means none.
+    """
+
+    rsu_id: str
+    position: Array
+    quaternion: Array = field(default_factory=lambda: np.array([0.0, 0.0, 0.0, 1.0]))
+    network: str = ""
+    azimuth_bias_sd_rad: float = 0.0
+    elevation_bias_sd_rad: float = 0.0
+    range_bias_sd_m: float = 0.0
+    bias_correlation_time_s: float = 0.0
+    baseline_m: float = 0.0
+    wavelength_m: float = 0.0
+    stamp_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RsuMeasurement:
+    """What one RSU measured of one device at one instant; ``fields`` names the quantities that count."""
+
+    stamp_ns: int
+    rsu_id: str
+    vue_id: str
+    sequence: int = 0
+    expected: int = 0
+    fields: Field = Field(0)
+    line_of_sight: bool = True
+    rssi_dbm: float = 0.0
+    azimuth_rad: float = 0.0
+    azimuth_var: float = 0.0
+    elevation_rad: float = 0.0
+    elevation_var: float = 0.0
+    toa_s: float = 0.0
+    toa_var: float = 0.0
+    range_m: float = 0.0
+    range_var: float = 0.0
+    phase_difference_rad: float = 0.0
+    phase_difference_var: float = 0.0
+    position: Array = field(default_factory=lambda: np.zeros(3))
+    position_cov: Array = field(default_factory=lambda: np.zeros((3, 3)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Velocity:
+    """A horizontal velocity in map: steps, wheel or ground speed. velocity (2,) m/s, cov (2, 2)."""
+
+    stamp_ns: int
+    vue_id: str
+    velocity: Array
+    cov: Array
+    source: str = "step_velocity"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InitialPose:
+    """A position handed to the tracker from outside. position (3,) m, cov (3, 3) m^2."""
+
+    stamp_ns: int
+    vue_id: str
+    position: Array
+    cov: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Beacon:
+    """One simulated uplink emission: true antenna position (3,) m and device clock offset."""
+
+    stamp_ns: int
+    vue_id: str
+    sequence: int
+    position: Array
+    clock_offset_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Odometry:
+    """Pose and twist of a device, true or estimated.
+
+    position (3,) m in map; quaternion (4,) x y z w, base_link to map; pose_cov (6, 6) in map axes;
+    linear_velocity and angular_velocity (3,) in base_link axes (m/s, rad/s); twist_cov (6, 6) in base_link axes.
+    """
+
+    stamp_ns: int
+    vue_id: str
+    position: Array
+    quaternion: Array
+    linear_velocity: Array
+    angular_velocity: Array = field(default_factory=lambda: np.zeros(3))
+    pose_cov: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    twist_cov: Array = field(default_factory=lambda: np.zeros((6, 6)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockState:
+    """Device clock against network time: offset s, drift s/s, cov (2, 2)."""
+
+    stamp_ns: int
+    vue_id: str
+    offset_s: float
+    drift: float
+    cov: Array = field(default_factory=lambda: np.zeros((2, 2)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackStatus:
+    """Health of one track at one epoch; counts since start."""
+
+    stamp_ns: int
+    vue_id: str
+    state: TrackState
+    nis: float = 0.0
+    nis_dof: int = 0
+    used: int = 0
+    accepted: int = 0
+    rejected: dict[str, int] = field(default_factory=dict)
+    sources: tuple[str, ...] = ()
+    position_sd_m: float = 0.0
+    protection_level_m: float = -1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuSample:
+    """angular_velocity (3,) rad/s and specific_force (3,) m/s^2 in base_link; variances per axis (0: unknown)."""
+
+    stamp_ns: int
+    vue_id: str
+    angular_velocity: Array
+    specific_force: Array
+    angular_velocity_var: float = 0.0
+    specific_force_var: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MagneticSample:
+    """magnetic_field (3,) tesla in base_link; variance per axis (0: unknown)."""
+
+    stamp_ns: int
+    vue_id: str
+    magnetic_field: Array
+    magnetic_field_var: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """One detected step of a pedestrian."""
+
+    stamp_ns: int
+    vue_id: str
+    start_ns: int
+    end_ns: int
+    count: int
+    length_m: float
+    length_var: float
+    heading_rad: float
+    heading_var: float
+    cadence_hz: float

@@ -1,0 +1,21 @@
+from setuptools import find_packages, setup
+
+setup(
+    name="netpos",
+    version="0.1.0",
+    package_data={"netpos": ["py.typed"]},
+    packages=find_packages(exclude=["test", "test.*"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/netpos"]),
+        ("share/netpos", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=True,
+    description="The netpos library: world, radio, filters, tracking, evaluation. No ROS inside.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "netpos = netpos.cli.main:main",
+        ],
+    },
+)

@@ -1,0 +1,19 @@
+from setuptools import find_packages, setup
+
+setup(
+    name="netpos_bringup",
+    version="0.1.0",
+    packages=find_packages(exclude=["test", "test.*"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/netpos_bringup"]),
+        ("share/netpos_bringup", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=True,
+    description="Scenarios, parameters, launch files and run scripts.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+        ],
+    },
+)
