@@ -1,6 +1,7 @@
 """Values to messages and back, for any message classes with the fields of the ROS interfaces.
 
-``Codec(resolve)`` takes a function that returns the class of a type name such as ``"nav_msgs/msg/Odometry"``. Every message is built
+``Codec(resolve)`` takes a function that returns the class of a type name such as
+``"nav_msgs/msg/Odometry"``. Every message is built
 with all fields by keyword, which both rclpy's and rosbags' classes accept.
 """
 
@@ -12,10 +13,12 @@ from typing import Any
 import numpy as np
 
 from netpos.messages.values import (
+    AngleConvention,
     Array,
     Beacon,
     ClockState,
     Field,
+    GroundSpeed,
     ImuSample,
     InitialPose,
     MagneticSample,
@@ -97,7 +100,9 @@ class Codec:
         return self._quaternion(x=float(q[0]), y=float(q[1]), z=float(q[2]), w=float(q[3]))
 
     def _to_pose(self, position: Array, quaternion: Array) -> Any:
-        return self._pose(position=self._to_point(position), orientation=self._to_quaternion(quaternion))
+        return self._pose(
+            position=self._to_point(position), orientation=self._to_quaternion(quaternion)
+        )
 
     def clock_to_msg(self, ns: int) -> Any:
         """rosgraph_msgs/Clock."""
@@ -137,6 +142,10 @@ class Codec:
             elevation_bias_sd=float(info.elevation_bias_sd_rad),
             range_bias_sd=float(info.range_bias_sd_m),
             bias_correlation_time=float(info.bias_correlation_time_s),
+            common_range_bias_sd=float(info.common_range_bias_sd_m),
+            common_bias_correlation_time=float(info.common_bias_correlation_time_s),
+            noise_correlation_time=float(info.noise_correlation_time_s),
+            angle_convention=int(info.angle_convention),
             baseline=float(info.baseline_m),
             wavelength=float(info.wavelength_m),
         )
@@ -155,6 +164,10 @@ class Codec:
             elevation_bias_sd_rad=float(msg.elevation_bias_sd),
             range_bias_sd_m=float(msg.range_bias_sd),
             bias_correlation_time_s=float(msg.bias_correlation_time),
+            common_range_bias_sd_m=float(msg.common_range_bias_sd),
+            common_bias_correlation_time_s=float(msg.common_bias_correlation_time),
+            noise_correlation_time_s=float(msg.noise_correlation_time),
+            angle_convention=AngleConvention(int(msg.angle_convention)),
             baseline_m=float(msg.baseline),
             wavelength_m=float(msg.wavelength),
         )
@@ -269,7 +282,7 @@ class Codec:
     def step_to_msg(self, step: Step) -> Any:
         """netpos_msgs/Step."""
         return self._resolve("netpos_msgs/msg/Step")(
-            header=self.header(step.stamp_ns, MAP_FRAME),
+            header=self.header(step.stamp_ns, step.frame_id),
             start=self.time(step.start_ns),
             end=self.time(step.end_ns),
             count=step.count,
@@ -360,10 +373,10 @@ class Codec:
         )
 
     def velocity_to_msg(self, velocity: Velocity) -> Any:
-        """geometry_msgs/TwistWithCovarianceStamped with the velocity in map axes (frame_id map)."""
+        """geometry_msgs/TwistWithCovarianceStamped in the axes of ``frame_id``."""
         linear = np.array([velocity.velocity[0], velocity.velocity[1], 0.0])
         return self._resolve("geometry_msgs/msg/TwistWithCovarianceStamped")(
-            header=self.header(velocity.stamp_ns, MAP_FRAME),
+            header=self.header(velocity.stamp_ns, velocity.frame_id),
             twist=self._resolve("geometry_msgs/msg/TwistWithCovariance")(
                 twist=self._resolve("geometry_msgs/msg/Twist")(
                     linear=self._to_vector(linear), angular=self._to_vector(np.zeros(3))
@@ -374,17 +387,30 @@ class Codec:
 
     @staticmethod
     def velocity_from_msg(msg: Any, vue_id: str, source: str = "step_velocity") -> Velocity:
-        """Velocity value of a TwistWithCovarianceStamped in map axes; the topic names the device."""
+        """Velocity value of a TwistWithCovarianceStamped; the topic names the device."""
         return Velocity(
             stamp_ns=stamp_ns(msg.header.stamp),
             vue_id=vue_id,
+            frame_id=msg.header.frame_id,
             velocity=_xyz(msg.twist.twist.linear)[:2],
             cov=_square(msg.twist.covariance, 6)[:2, :2].copy(),
             source=source,
         )
 
+    @staticmethod
+    def ground_speed_from_msg(msg: Any, vue_id: str) -> GroundSpeed:
+        """GroundSpeed value of a TwistWithCovarianceStamped in base_link axes: linear.x and its
+        variance."""
+        return GroundSpeed(
+            stamp_ns=stamp_ns(msg.header.stamp),
+            vue_id=vue_id,
+            speed_mps=float(msg.twist.twist.linear.x),
+            speed_var=float(msg.twist.covariance[0]),
+        )
+
     def initial_pose_to_msg(self, pose: InitialPose) -> Any:
-        """geometry_msgs/PoseWithCovarianceStamped; orientation is left at identity and is not used."""
+        """geometry_msgs/PoseWithCovarianceStamped; orientation is left at identity and is not
+        used."""
         return self._resolve("geometry_msgs/msg/PoseWithCovarianceStamped")(
             header=self.header(pose.stamp_ns, MAP_FRAME),
             pose=self._resolve("geometry_msgs/msg/PoseWithCovariance")(

@@ -1,6 +1,7 @@
 """What flows between the parts of netpos, as plain values.
 
-Stamps are integer nanoseconds of network time. Positions are metres in ``map`` (east, north, up), angles radians.
+Stamps are integer nanoseconds of network time. Positions are metres in ``map`` (east, north, up),
+angles radians.
 """
 
 from __future__ import annotations
@@ -25,6 +26,13 @@ class Field(IntFlag):
     POSITION = 32
 
 
+class AngleConvention(IntEnum):
+    """What azimuth means (RsuInfo.angle_convention)."""
+
+    SPHERICAL = 0  # atan2(y, x) in the RSU's axes
+    CONE = 1  # sin(azimuth) = y / |d|, the direction cosine a linear array measures
+
+
 class TrackState(IntEnum):
     """Health of a track (TrackStatus.state)."""
 
@@ -38,8 +46,12 @@ class TrackState(IntEnum):
 class RsuInfo:
     """A roadside unit: where it is, which way it looks, which slow errors it has.
 
-    position : (3,) m in map; quaternion : (4,) x y z w, RSU axes (x boresight, y left, z up) to map.
-    Biases are first-order Gauss-Markov with ``bias_correlation_time_s``; 0 means none.
+    position : (3,) m in map; quaternion : (4,) x y z w, RSU axes (x boresight, y left, z up) to
+        map.
+    Biases are first-order Gauss-Markov with ``bias_correlation_time_s``, the common one is shared
+    by a network; 0 means none.
+    ``noise_correlation_time_s``: power spectral density at 0 of the remaining noise over its
+    variance; 0 means white.
     """
 
     rsu_id: str
@@ -50,6 +62,10 @@ class RsuInfo:
     elevation_bias_sd_rad: float = 0.0
     range_bias_sd_m: float = 0.0
     bias_correlation_time_s: float = 0.0
+    common_range_bias_sd_m: float = 0.0
+    common_bias_correlation_time_s: float = 0.0
+    noise_correlation_time_s: float = 0.0
+    angle_convention: AngleConvention = AngleConvention.SPHERICAL
     baseline_m: float = 0.0
     wavelength_m: float = 0.0
     stamp_ns: int = 0
@@ -57,14 +73,15 @@ class RsuInfo:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RsuMeasurement:
-    """What one RSU measured of one device at one instant; ``fields`` names the quantities that count."""
+    """What one RSU measured of one device at one instant; ``fields`` names the quantities that
+    count."""
 
     stamp_ns: int
     rsu_id: str
     vue_id: str
     sequence: int = 0
     expected: int = 0
-    fields: Field = Field(0)
+    fields: Field = Field(0)  # noqa: RUF009 - an immutable flag
     line_of_sight: bool = True
     rssi_dbm: float = 0.0
     azimuth_rad: float = 0.0
@@ -83,13 +100,26 @@ class RsuMeasurement:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Velocity:
-    """A horizontal velocity in map: steps, wheel or ground speed. velocity (2,) m/s, cov (2, 2)."""
+    """A horizontal velocity in the axes of ``frame_id``. velocity (2,) m/s, cov (2, 2)."""
 
     stamp_ns: int
     vue_id: str
+    frame_id: str = "map"
     velocity: Array
     cov: Array
     source: str = "step_velocity"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GroundSpeed:
+    """Speed over ground of a device [m/s] with its variance, whatever the direction (wheels,
+    Doppler)."""
+
+    stamp_ns: int
+    vue_id: str
+    speed_mps: float
+    speed_var: float
+    source: str = "ground_speed"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,7 +148,8 @@ class Odometry:
     """Pose and twist of a device, true or estimated.
 
     position (3,) m in map; quaternion (4,) x y z w, base_link to map; pose_cov (6, 6) in map axes;
-    linear_velocity and angular_velocity (3,) in base_link axes (m/s, rad/s); twist_cov (6, 6) in base_link axes.
+    linear_velocity and angular_velocity (3,) in base_link axes (m/s, rad/s); twist_cov (6, 6) in
+    base_link axes.
     """
 
     stamp_ns: int
@@ -161,7 +192,8 @@ class TrackStatus:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImuSample:
-    """angular_velocity (3,) rad/s and specific_force (3,) m/s^2 in base_link; variances per axis (0: unknown)."""
+    """angular_velocity (3,) rad/s and specific_force (3,) m/s^2 in base_link; variances per axis
+    (0: unknown)."""
 
     stamp_ns: int
     vue_id: str
@@ -187,6 +219,7 @@ class Step:
 
     stamp_ns: int
     vue_id: str
+    frame_id: str = "map"
     start_ns: int
     end_ns: int
     count: int

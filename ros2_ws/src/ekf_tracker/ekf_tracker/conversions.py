@@ -1,0 +1,52 @@
+"""Tracker output to diagnostics; everything else is the common codec."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from netpos.messages.values import TrackState, TrackStatus
+from netpos_node import CODEC
+
+_LEVELS = {
+    TrackState.WAITING: DiagnosticStatus.WARN,
+    TrackState.INITIALISING: DiagnosticStatus.WARN,
+    TrackState.TRACKING: DiagnosticStatus.OK,
+    TrackState.COASTING: DiagnosticStatus.WARN,
+}
+
+
+def diagnostics_to_msg(statuses: Iterable[TrackStatus], rsu_count: int) -> Any:
+    """diagnostic_msgs/DiagnosticArray with one entry per device, stamped with the newest epoch."""
+    array = DiagnosticArray()
+    newest = 0
+    for status in statuses:
+        newest = max(newest, status.stamp_ns)
+        array.status.append(_device(status))
+    array.status.append(
+        DiagnosticStatus(
+            level=DiagnosticStatus.OK if rsu_count else DiagnosticStatus.WARN,
+            name="ekf_tracker: rsus",
+            message=f"{rsu_count} RSUs known" if rsu_count else "no /rsu/info received yet",
+        )
+    )
+    array.header.stamp = CODEC.time(newest)
+    return array
+
+
+def _device(status: TrackStatus) -> Any:
+    values = {
+        "position_sd_m": f"{status.position_sd_m:.3f}",
+        "nis": f"{status.nis:.3f}",
+        "nis_dof": str(status.nis_dof),
+        "accepted": str(status.accepted),
+        **{f"rejected: {reason}": str(n) for reason, n in sorted(status.rejected.items())},
+    }
+    return DiagnosticStatus(
+        level=_LEVELS[status.state],
+        name=f"ekf_tracker: {status.vue_id}",
+        message=status.state.name.lower(),
+        hardware_id=status.vue_id,
+        values=[KeyValue(key=key, value=value) for key, value in values.items()],
+    )

@@ -1,0 +1,179 @@
+"""Tracker node: measurements in, odometry, clock state and health out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from netpos.messages import topics
+from netpos.messages.values import TrackStatus
+from netpos.tracking import Tracker, TrackOutput
+from netpos_msgs.msg import ClockState, RsuInfo, RsuMeasurement
+from netpos_msgs.msg import TrackStatus as TrackStatusMsg
+from netpos_node import CODEC, LATCHED, STREAM, run
+from rclpy.clock import JumpThreshold, TimeJump
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+from std_srvs.srv import SetBool, Trigger
+from tf2_msgs.msg import TFMessage
+
+from ekf_tracker.conversions import diagnostics_to_msg
+from ekf_tracker.parameters import declare_parameters
+
+_SILENCE_S = 0.5
+
+
+class EkfTrackerNode(Node):
+    """Feeds a ``Tracker``. All that has arrived is taken at once, RSU descriptions first."""
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__("ekf_tracker", **node_options)
+        parameters = declare_parameters(self)
+        self._tracker = Tracker(parameters.config)
+        self._inputs: list[tuple[Subscription, Callable[[Any], None]]] = []
+        self._outputs: dict[str, tuple[Publisher, Publisher, Publisher]] = {}
+        self._statuses: dict[str, TrackStatus] = {}
+        self._heard_since_tick = False
+        self._diagnostics_pub = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
+        self._tf_pub = None
+        if parameters.publish_tf:
+            self._tf_pub = self.create_publisher(TFMessage, topics.TF, STREAM)
+        self._listen(RsuInfo, topics.RSU_INFO, self._on_rsu_info, LATCHED)
+        for vue_id in parameters.vue_ids:
+            self._add_device(vue_id)
+        self._listen(RsuMeasurement, topics.RSU_MEASUREMENTS, self._on_measurement)
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_service(SetBool, "~/enable", self._on_enable)
+        self.create_timer(_SILENCE_S, self._on_silence_tick)
+        self.create_timer(1.0, self._publish_diagnostics)
+        threshold = JumpThreshold(
+            min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
+        )
+        self._jump_handle = self.get_clock().create_jump_callback(
+            threshold, post_callback=self._on_clock_jump
+        )
+        self.get_logger().info(f"tracking {', '.join(parameters.vue_ids)}")
+
+    # inputs
+
+    def _listen(
+        self, msg_type: Any, topic: str, handler: Callable[[Any], None], qos: Any = STREAM
+    ) -> None:
+        def on_message(msg: Any) -> None:
+            self._take_all(handler, msg)
+
+        subscription = self.create_subscription(msg_type, topic, on_message, qos)
+        self._inputs.append((subscription, handler))
+
+    def _take_all(self, first_handler: Callable[[Any], None], first: Any) -> None:
+        """Hand over everything that has arrived, so that ready topics cannot overtake each other."""
+        self._heard_since_tick = True
+        for subscription, handler in self._inputs:
+            if handler == first_handler and first is not None:
+                handler(first)
+                first = None
+            with subscription.handle:
+                while True:
+                    taken = subscription.handle.take_message(
+                        subscription.msg_type, subscription.raw
+                    )
+                    if taken is None:
+                        break
+                    handler(taken[0])
+        self._publish(self._tracker.process())
+
+    def _on_rsu_info(self, msg: Any) -> None:
+        try:
+            self._tracker.add_rsu(CODEC.rsu_info_from_msg(msg))
+        except ValueError as error:
+            self.get_logger().error(str(error))
+
+    def _on_measurement(self, msg: Any) -> None:
+        if msg.vue_id not in self._outputs:
+            self._add_device(msg.vue_id)
+        self._add(CODEC.measurement_from_msg(msg))
+
+    def _add(self, item: Any) -> None:
+        reason = self._tracker.add(item)
+        if reason is not None:
+            self.get_logger().warning(
+                f"{item.vue_id}: refused a {type(item).__name__}: {reason}",
+                throttle_duration_sec=2.0,
+            )
+
+    def _add_device(self, vue_id: str) -> None:
+        def topic(name: str) -> str:
+            return topics.of_vue(vue_id, name)
+
+        self._outputs[vue_id] = (
+            self.create_publisher(Odometry, topic(topics.ODOMETRY), STREAM),
+            self.create_publisher(ClockState, topic(topics.CLOCK_STATE), STREAM),
+            self.create_publisher(TrackStatusMsg, topic(topics.TRACK_STATUS), STREAM),
+        )
+        pose, twist = PoseWithCovarianceStamped, TwistWithCovarianceStamped
+        self._listen(
+            pose,
+            topic(topics.INITIAL_POSE),
+            lambda msg: self._add(CODEC.initial_pose_from_msg(msg, vue_id)),
+        )
+        self._listen(
+            twist,
+            topic(topics.STEP_VELOCITY),
+            lambda msg: self._add(CODEC.velocity_from_msg(msg, vue_id)),
+        )
+        self._listen(
+            twist,
+            topic(topics.GROUND_SPEED),
+            lambda msg: self._add(CODEC.ground_speed_from_msg(msg, vue_id)),
+        )
+
+    # outputs
+
+    def _publish(self, outputs: list[TrackOutput]) -> None:
+        for output in outputs:
+            self._statuses[output.status.vue_id] = output.status
+            odometry_pub, clock_pub, status_pub = self._outputs[output.status.vue_id]
+            if output.odometry is not None:
+                odometry_pub.publish(CODEC.odometry_to_msg(output.odometry))
+                if self._tf_pub is not None:
+                    self._tf_pub.publish(CODEC.transform_to_msg(output.odometry))
+            if output.clock is not None:
+                clock_pub.publish(CODEC.clock_state_to_msg(output.clock))
+            status_pub.publish(CODEC.track_status_to_msg(output.status))
+
+    def _publish_diagnostics(self) -> None:
+        self._diagnostics_pub.publish(
+            diagnostics_to_msg(self._statuses.values(), self._tracker.rsu_count)
+        )
+
+    # time and services
+
+    def _on_silence_tick(self) -> None:
+        if not self._heard_since_tick:
+            self._publish(self._tracker.flush())
+        self._heard_since_tick = False
+
+    def _on_clock_jump(self, jump: TimeJump) -> None:
+        self.get_logger().warning("the clock jumped back: all tracks start anew")
+        self._tracker.reset()
+
+    def _on_reset(self, _: Any, response: Any) -> Any:
+        self._tracker.reset()
+        response.success, response.message = True, "all tracks start anew"
+        return response
+
+    def _on_enable(self, request: Any, response: Any) -> Any:
+        self._tracker.enabled = bool(request.data)
+        response.success = True
+        response.message = "enabled" if request.data else "disabled: measurements are refused"
+        return response
+
+
+def main() -> None:
+    """Entry point of ``ros2 run ekf_tracker ekf_tracker``."""
+    run(EkfTrackerNode)

@@ -1,0 +1,31 @@
+"""Parameters of the tracker node."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from netpos.tracking import TrackerConfig
+from netpos.tracking.settings import settings_from
+from netpos_node import declare, declare_config
+from rclpy.node import Node
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackerParameters:
+    """Everything the node reads at start."""
+
+    config: TrackerConfig
+    vue_ids: tuple[str, ...]
+    publish_tf: bool
+
+
+def declare_parameters(node: Node) -> TrackerParameters:
+    """Declare and read all parameters; a scenario or a bag gives defaults, explicit values win."""
+    text = "scenario (name or YAML) or bag whose tracker parameters and devices are the defaults"
+    settings = settings_from(declare(node, "scenario", "", text))
+    text = "devices whose topics exist from the start; others appear when first heard"
+    return TrackerParameters(
+        vue_ids=tuple(declare(node, "vues", list(settings.vue_ids), text)),
+        publish_tf=declare(node, "publish_tf", True, "publish map -> base_link on /tf"),
+        config=declare_config(node, TrackerConfig, settings.parameters),
+    )

@@ -1,0 +1,23 @@
+"""Pedestrian inertial navigation: attitude, steps, dead reckoning, recorded-data readers.
+
+Modules
+-------
+``attitude``  gyro + accelerometer (+ magnetometer) -> orientation
+``steps``     streaming step detector, step length, stillness
+``pdr``       ``PedestrianDeadReckoning``: IMU samples in, steps and step velocity out
+``loaders``   public gait, phone and attitude recordings -> SI arrays
+
+Frames
+------
+map   ENU, x east, y north, z up. Without a magnetometer the frame is still level, but its
+      x axis is the horizontal forward axis of the body at alignment ("relative").
+body  FLU, x forward, y left, z up, rigidly attached to the IMU.
+Quaternions are (w, x, y, z), body -> map. Heading is counter-clockwise from map x (east),
+in [-pi, pi); it is a direction, not a compass azimuth.
+
+Units
+-----
+Stamps are int nanoseconds; m, m/s, m/s^2, rad, rad/s, tesla. An accelerometer measures specific
+force: (0, 0, +9.81) at rest and level. ``*_sd`` is a standard deviation, ``covariance`` holds
+variances.
+"""

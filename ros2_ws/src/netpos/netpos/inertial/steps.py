@@ -1,0 +1,316 @@
+"""Streaming step detection from specific force: sample by sample, bounded delay.
+
+1. Each sample is averaged into cells of 20 ms, so 50-285 Hz streams give the same signal.
+2. The vertical component is the projection on gravity, low-passed with 1 s: it does not
+   depend on how the device is turned (pocket, bag, hand, armband, waist).
+3. A zero-phase difference of Gaussians passes 0.6-3 Hz; the smooth peak after each initial
+   contact is the step (Zijlstra and Hof, Gait & Posture 18(2), 2003; Gaussian smoothing as in
+   McCamley et al., Gait & Posture 36(2), 2012).
+4. A peak counts when its prominence exceeds a floor and a fraction of the running prominence.
+5. A device being turned in the hand is not walking: peaks with a fast tilt are refused.
+6. ``bout_steps`` peaks in a row start a bout; the first ones are then released together.
+
+Step length is Weinberg's L = k (a_max - a_min)^(1/4), Analog Devices AN-602, 2002; the range
+is that of the band-passed vertical acceleration. Stillness is the moving-variance detector
+(Skog et al., IEEE Trans. Biomed. Eng. 57(11), 2010).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+CELL_NS = 20_000_000
+CELL_S = CELL_NS * 1e-9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepConfig:
+    """Parameters of ``StepDetector``; a bad value raises ``ValueError`` here."""
+
+    smooth_sd_s: float = 0.08
+    trend_sd_s: float = 0.4
+    filter_half_width_s: float = 0.5
+    peak_half_width_s: float = 0.1
+    min_prominence_mps2: float = 0.3
+    prominence_fraction: float = 0.4
+    prominence_memory_s: float = 4.0
+    min_height_fraction: float = 0.1
+    min_interval_s: float = 0.3
+    min_interval_fraction: float = 0.45
+    max_interval_s: float = 1.5
+    contact_lag_s: float = -0.05
+    gravity_memory_s: float = 1.0
+    max_tilt_change_rad: float = 0.26
+    bout_steps: int = 3
+    still_window_s: float = 1.0
+    still_acceleration_sd_mps2: float = 0.15
+
+    def __post_init__(self) -> None:
+        for name in self.__slots__:
+            value = getattr(self, name)
+            if name == "contact_lag_s":
+                if not -0.3 <= value <= 0.3:
+                    raise ValueError(f"steps.{name} must be within +-0.3 s, got {value}")
+            elif not 0 < value < math.inf:
+                raise ValueError(f"steps.{name} must be finite and > 0, got {value}")
+        for name in ("prominence_fraction", "min_height_fraction", "min_interval_fraction"):
+            if getattr(self, name) >= 1:
+                raise ValueError(f"steps.{name} must be below 1, got {getattr(self, name)}")
+        if self.trend_sd_s <= self.smooth_sd_s:
+            raise ValueError(
+                f"steps.trend_sd_s ({self.trend_sd_s}) must exceed smooth_sd_s "
+                f"({self.smooth_sd_s}): they bound the pass band"
+            )
+        if self.max_interval_s <= self.min_interval_s:
+            raise ValueError(
+                f"steps.max_interval_s ({self.max_interval_s}) must exceed min_interval_s "
+                f"({self.min_interval_s})"
+            )
+        if self.filter_half_width_s < 2 * self.smooth_sd_s:
+            raise ValueError(
+                f"steps.filter_half_width_s must be >= 2 smooth_sd_s, got "
+                f"{self.filter_half_width_s}"
+            )
+
+    @property
+    def delay_s(self) -> float:
+        """Longest time from a peak to the sample that reveals it (steps within a bout)."""
+        return self.filter_half_width_s + self.peak_half_width_s + 2 * CELL_S
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One detected step.
+
+    start_ns, end_ns : initial contacts that bound it; ``start_ns`` is the previous step's
+        ``end_ns`` inside a bout, else one typical period earlier
+    prominence_mps2 : range of the band-passed vertical acceleration over the step
+    """
+
+    start_ns: int
+    end_ns: int
+    prominence_mps2: float
+
+    @property
+    def duration_s(self) -> float:
+        return (self.end_ns - self.start_ns) * 1e-9
+
+    @property
+    def cadence_hz(self) -> float:
+        return 1.0 / self.duration_s
+
+
+def weinberg_length(range_mps2: float, k: float) -> float:
+    """Step length [m] = k (a_max - a_min)^(1/4); range [m/s^2] >= 0, k [m (m/s^2)^(-1/4)]."""
+    return k * math.sqrt(math.sqrt(max(range_mps2, 0.0)))
+
+
+def band_pass_kernel(smooth_sd_s: float, trend_sd_s: float, half_width_s: float) -> Array:
+    """(2n+1,) symmetric difference of two unit-area Gaussians on the cell grid; sums to 0."""
+    n = round(half_width_s / CELL_S)
+    t = np.arange(-n, n + 1) * CELL_S
+    smooth = np.exp(-0.5 * (t / smooth_sd_s) ** 2)
+    trend = np.exp(-0.5 * (t / trend_sd_s) ** 2)
+    kernel: Array = smooth / smooth.sum() - trend / trend.sum()
+    return kernel
+
+
+class CellAverager:
+    """Mean of the linear interpolant over consecutive cells: anti-aliased 50 Hz grid."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        self._t_ns: int | None = None
+        self._v: Vector = (0.0, 0.0, 0.0)
+        self._edge_ns = 0
+        self._area: Vector = (0.0, 0.0, 0.0)
+
+    def add(self, stamp_ns: int, value: Vector) -> list[tuple[int, Vector]]:
+        """Cells finished by this sample: (centre stamp, mean). Stamps must increase."""
+        out: list[tuple[int, Vector]] = []
+        if self._t_ns is None:
+            self._t_ns, self._v, self._edge_ns = stamp_ns, value, stamp_ns + CELL_NS
+            return out
+        while stamp_ns >= self._edge_ns:
+            a = (self._edge_ns - self._t_ns) / (stamp_ns - self._t_ns)
+            u = self._v
+            edge = tuple(u[i] + a * (value[i] - u[i]) for i in range(3))
+            self._advance(self._edge_ns, (edge[0], edge[1], edge[2]))
+            s = 1.0 / CELL_S
+            mean = (self._area[0] * s, self._area[1] * s, self._area[2] * s)
+            out.append((self._edge_ns - CELL_NS // 2, mean))
+            self._area = (0.0, 0.0, 0.0)
+            self._edge_ns += CELL_NS
+            if stamp_ns == self._t_ns:
+                return out
+        self._advance(stamp_ns, value)
+        return out
+
+    def _advance(self, t_ns: int, v: Vector) -> None:
+        assert self._t_ns is not None
+        h = 0.5e-9 * (t_ns - self._t_ns)
+        a, u = self._area, self._v
+        self._area = (a[0] + h * (u[0] + v[0]), a[1] + h * (u[1] + v[1]), a[2] + h * (u[2] + v[2]))
+        self._t_ns, self._v = t_ns, v
+
+
+class _Mean:
+    """First-order low-pass of a vector that starts as a running mean."""
+
+    def __init__(self, memory_s: float) -> None:
+        self._gain = CELL_S / memory_s
+        self._n = 0
+        self.value: Vector = (0.0, 0.0, 0.0)
+
+    def add(self, v: Vector) -> Vector:
+        self._n += 1
+        a = max(self._gain, 1.0 / self._n)
+        m = self.value
+        self.value = (m[0] + a * (v[0] - m[0]), m[1] + a * (v[1] - m[1]), m[2] + a * (v[2] - m[2]))
+        return self.value
+
+
+def _angle(a: Vector, b: Vector) -> float:
+    cx, cy, cz = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    sine = math.sqrt(cx * cx + cy * cy + cz * cz)
+    return math.atan2(sine, a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
+class StepDetector:
+    """Causal step and stillness detector; ``add`` returns the steps a sample has revealed."""
+
+    def __init__(self, config: StepConfig | None = None) -> None:
+        cfg = self.config = config if config is not None else StepConfig()
+        self._kernel = band_pass_kernel(cfg.smooth_sd_s, cfg.trend_sd_s, cfg.filter_half_width_s)
+        self._half = self._kernel.size // 2
+        self._wing = max(round(cfg.peak_half_width_s / CELL_S), 1)
+        self._decay = math.exp(-CELL_S / cfg.prominence_memory_s)
+        self._valley_cells = round(0.8 / CELL_S)
+        self._still_cells = max(round(cfg.still_window_s / CELL_S), 2)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the signal, for example after a gap; an unfinished bout is dropped."""
+        cfg = self.config
+        self._cells = CellAverager()
+        self._gravity = _Mean(cfg.gravity_memory_s)
+        self._fast, self._slow = _Mean(0.5), _Mean(2.0)
+        self._raw = np.zeros(2 * self._kernel.size)  # double buffer: the window is contiguous
+        self._count = 0
+        self._tilt: deque[float] = deque(maxlen=self._half + self._wing + 1)
+        size = self._valley_cells + 2 * self._wing + 1
+        self._band: deque[float] = deque(maxlen=size)
+        self._level = 0.0
+        self._period_s = 0.6
+        self._last_peak_ns: int | None = None
+        self._end_ns: int | None = None
+        self._pending: list[tuple[int, float]] = []
+        self._previous_peak: int | None = None
+        self._in_bout = False
+        self._force: deque[Vector] = deque(maxlen=self._still_cells)
+
+    @property
+    def acceleration_sd_mps2(self) -> float:
+        """Root of the summed per-axis variance over the still window; inf until it is full."""
+        n = len(self._force)
+        if n < self._still_cells:
+            return math.inf
+        f = np.array(self._force)
+        return math.sqrt(float(np.sum(np.var(f, axis=0))))
+
+    @property
+    def still(self) -> bool:
+        """The specific force has been constant over the last ``still_window_s``."""
+        return self.acceleration_sd_mps2 < self.config.still_acceleration_sd_mps2
+
+    def add(self, stamp_ns: int, specific_force: Vector) -> list[Step]:
+        """Add one finite sample (m/s^2, any device orientation) with a later stamp."""
+        steps: list[Step] = []
+        for centre_ns, mean in self._cells.add(stamp_ns, specific_force):
+            steps += self._add_cell(centre_ns, mean)
+        return steps
+
+    def _add_cell(self, centre_ns: int, force: Vector) -> list[Step]:
+        g = self._gravity.add(force)
+        norm = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+        if norm < 1e-6:
+            return []  # free fall or a dead sensor: no vertical
+        self._tilt.append(_angle(self._fast.add(force), self._slow.add(force)))
+        self._force.append(force)
+        vertical = (force[0] * g[0] + force[1] * g[1] + force[2] * g[2]) / norm - norm
+        size = self._kernel.size
+        slot = self._count % size
+        self._raw[slot] = self._raw[slot + size] = vertical
+        self._count += 1
+        if self._count < size:
+            return []
+        window = self._raw[slot + 1 : slot + 1 + size]
+        self._band.append(float(self._kernel @ window))
+        self._level *= self._decay
+        return self._peak(centre_ns - (self._half + self._wing) * CELL_NS)
+
+    def _peak(self, stamp_ns: int) -> list[Step]:
+        """Judge the band-passed cell at ``stamp_ns``, which now has both its wings."""
+        y, w = self._band, self._wing
+        if len(y) < 2 * w + 1:
+            return []
+        value = y[-1 - w]
+        if value <= 0 or value < max(list(y)[-1 - 2 * w :]):
+            return []
+        cfg = self.config
+        since = math.inf
+        if self._last_peak_ns is not None:
+            since = (stamp_ns - self._last_peak_ns) * 1e-9
+        prominence = self._prominence(since)
+        floor = max(cfg.min_prominence_mps2, cfg.prominence_fraction * self._level)
+        if (
+            since < max(cfg.min_interval_s, cfg.min_interval_fraction * self._period_s)
+            or prominence <= floor
+            or value < cfg.min_height_fraction * prominence  # rebound after the last step
+        ):
+            return []
+        steady = since < cfg.max_interval_s
+        self._period_s = 0.7 * self._period_s + 0.3 * since if steady else 0.6
+        self._level = 0.6 * self._level + 0.4 * prominence if self._level > 0 else prominence
+        self._last_peak_ns = stamp_ns
+        if self._tilt[0] > cfg.max_tilt_change_rad:
+            return []
+        return self._confirm(stamp_ns, prominence)
+
+    def _prominence(self, since_s: float) -> float:
+        """Height of the judged cell over the lowest since the last peak, at most 0.8 s back."""
+        band = list(self._band)[: len(self._band) - self._wing]
+        back = min(self._valley_cells, round(min(since_s, 60.0) / CELL_S))
+        return band[-1] - min(band[max(len(band) - 1 - back, 0) :])
+
+    def _confirm(self, peak_ns: int, prominence: float) -> list[Step]:
+        limit_ns = round(self.config.max_interval_s * 1e9)
+        previous = self._pending[-1][0] if self._pending else self._previous_peak
+        if previous is None or peak_ns - previous > limit_ns:
+            self._pending, self._in_bout, self._end_ns = [], False, None
+        self._pending.append((peak_ns, prominence))
+        self._previous_peak = peak_ns
+        if not self._in_bout and len(self._pending) < self.config.bout_steps:
+            return []
+        self._in_bout = True
+        steps = [self._step(t, p) for t, p in self._pending]
+        self._pending = []
+        return steps
+
+    def _step(self, peak_ns: int, prominence: float) -> Step:
+        end_ns = peak_ns + round(self.config.contact_lag_s * 1e9)
+        start_ns = self._end_ns
+        if start_ns is None:
+            start_ns = end_ns - round(self._period_s * 1e9)
+        self._end_ns = end_ns
+        return Step(start_ns, end_ns, prominence)

@@ -1,0 +1,41 @@
+"""Names and types of the topics."""
+
+from __future__ import annotations
+
+CLOCK = "/clock"
+RSU_INFO = "/rsu/info"
+RSU_MEASUREMENTS = "/rsu/measurements"
+DIAGNOSTICS = "/diagnostics"
+TF = "/tf"
+
+# Per device: /<vue>/<name>.
+BEACON = "beacon"
+GROUND_TRUTH = "ground_truth"
+GROUND_TRUTH_CLOCK = "ground_truth_clock"
+IMU = "imu"
+MAG = "mag"
+STEP = "step"
+STEP_VELOCITY = "step_velocity"
+GROUND_SPEED = "ground_speed"
+INITIAL_POSE = "initialpose"
+ODOMETRY = "odometry"
+CLOCK_STATE = "clock_state"
+TRACK_STATUS = "track_status"
+
+TRACKER_OUTPUTS = (ODOMETRY, CLOCK_STATE, TRACK_STATUS)
+
+
+def of_vue(vue_id: str, name: str) -> str:
+    """Topic of a device: ``/vue_1/beacon``."""
+    return f"/{vue_id}/{name}"
+
+
+def split(topic: str) -> tuple[str, str]:
+    """Device and name of a device's topic; ("", topic) for any other."""
+    parts = topic.strip("/").split("/")
+    return (parts[0], parts[1]) if len(parts) == 2 and parts[0] != "rsu" else ("", topic)
+
+
+def is_tracker_output(topic: str) -> bool:
+    """Whether a topic is published by the tracker (and left out when a bag is re-estimated)."""
+    return topic in (DIAGNOSTICS, TF) or split(topic)[1] in TRACKER_OUTPUTS

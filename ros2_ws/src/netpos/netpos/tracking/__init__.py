@@ -1,0 +1,17 @@
+"""One track per device: order the measurements, initialise, gate, update, report.
+
+``config``      every parameter of the tracker
+``validation``  what is refused at the door, and why
+``sequencer``   stamp order and epochs
+``initialise``  the first fix from whatever has been measured
+``track``       one device
+``output``      state to odometry, clock state and status
+``tracker``     all devices
+``replay``      a bag through the tracker, without ROS
+"""
+
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.track import TrackOutput
+from netpos.tracking.tracker import Tracker
+
+__all__ = ["TrackOutput", "Tracker", "TrackerConfig"]

@@ -1,0 +1,236 @@
+"""The first fix: the most probable state behind the first measurements, with the covariance it
+deserves.
+
+A maximum a posteriori fit of [x, y, vx, vy, clock, drift] at the newest stamp to all measurements
+of a short window: Gauss-Newton
+from several starts, under a prior as wide as the coverage of the RSUs, the initial speed and the
+clock allow. It takes any mixture of
+angles, times, ranges and fixes, and it waits while the measurements leave the position open.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+from numba import njit
+
+from netpos.filters.measurement import (
+    AXES,
+    BIAS,
+    COMMON,
+    KIND,
+    ORIGIN,
+    VALUE,
+    VARIANCE,
+    Kind,
+    predict_row,
+    wrap,
+)
+from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.messages.values import Array
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.rsus import Rsu
+
+_ITERATIONS = 30
+_REFINED = 12
+_ATTEMPT_NS = 100_000_000
+# A second solution this much worse in cost (chi-square 0.99, 2 dof) does not count as a rival.
+_RIVAL_COST = 9.21
+_RAY_M = (2.0, 6.0, 15.0, 40.0, 100.0)
+_CIRCLE = tuple(2.0 * math.pi * i / 12 for i in range(12))
+
+
+@njit(cache=True)
+def _normal_equations(
+    state: Array, ages_s: Array, rows: Array, height_m: float, prior: Array, prior_var: Array
+) -> tuple[float, Array, Array]:
+    """Cost, gradient (6,) and Gauss-Newton Hessian (6, 6) of the fit at ``state``; ``ages_s`` <= 0
+    before its stamp."""
+    A = np.diag(1.0 / prior_var)
+    difference = prior - state
+    b = difference / prior_var
+    cost = float((difference * b).sum())
+    h = np.zeros(6)
+    past = state.copy()
+    for i in range(rows.shape[0]):
+        age = ages_s[i]
+        past[:] = state
+        past[0] += state[2] * age
+        past[1] += state[3] * age
+        past[4] += state[5] * age
+        residual = rows[i, VALUE] - predict_row(rows[i], past, height_m, h)
+        if int(rows[i, KIND]) <= Kind.ELEVATION:
+            residual = wrap(residual)
+        h[2] += age * h[0]
+        h[3] += age * h[1]
+        h[5] += age * h[4]
+        w = 1.0 / rows[i, VARIANCE]
+        cost += w * residual * residual
+        for a in range(6):
+            b[a] += w * residual * h[a]
+            for c in range(6):
+                A[a, c] += w * h[a] * h[c]
+    return cost, b, A
+
+
+def _solve(
+    state: Array, problem: tuple[Array, Array, float, Array, Array]
+) -> tuple[float, Array, Array]:
+    """Levenberg-Marquardt from one start: cost, state, covariance of the fit."""
+    damping = 1e-3
+    cost, b, A = _normal_equations(state, *problem)
+    for _ in range(_ITERATIONS):
+        step = np.linalg.solve(A + damping * np.diag(np.diag(A)), b)
+        new_cost, new_b, new_A = _normal_equations(state + step, *problem)
+        if new_cost < cost:
+            done = cost - new_cost < 1e-6 * (1.0 + cost)
+            state, cost, b, A = state + step, new_cost, new_b, new_A
+            damping = max(damping / 10.0, 1e-12)
+            if done:
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e8:
+                break
+    return cost, state, np.linalg.inv(A)
+
+
+class Initialiser:
+    """Collects rows until they determine a position."""
+
+    def __init__(self, config: TrackerConfig) -> None:
+        self._config = config
+        self._window: deque[tuple[int, Array, tuple[Rsu, ...]]] = deque()
+        self._next_attempt_ns = 0
+
+    def add(self, stamp_ns: int, rows: Array, bias_var: Array, rsus: tuple[Rsu, ...]) -> None:
+        """Take the rows (m, ROW_WIDTH) of one epoch; ``bias_var`` (m,) is the variance of the
+        biases in each."""
+        rows = rows.copy()
+        rows[:, BIAS] = rows[:, COMMON] = -1
+        self._window.append((stamp_ns, np.column_stack([rows, bias_var]), rsus))
+        oldest = stamp_ns - int(self._config.initial_window_s * 1e9)
+        while self._window[0][0] < oldest:
+            self._window.popleft()
+
+    def solve(self) -> tuple[Array, Array] | None:
+        """Mean (6,) and covariance (6, 6) at the newest stamp; None while the position is open."""
+        newest = self._window[-1][0]
+        if newest < self._next_attempt_ns:
+            return None
+        self._next_attempt_ns = newest + _ATTEMPT_NS
+        rows = np.vstack([entry[1] for entry in self._window])
+        ages = np.concatenate(
+            [np.full(len(entry[1]), (entry[0] - newest) * 1e-9) for entry in self._window]
+        )
+        problem = self._problem(rows, ages)
+        fits = self._fits(rows, problem)
+        if not fits:
+            return None
+        cost, mean, cov = fits[0]
+        misfit = max(1.0, cost / max(len(rows), 1))
+        position_sd = math.sqrt(float(np.linalg.eigvalsh(cov[:2, :2])[-1]) * misfit)
+        if position_sd > self._config.initial_position_sd_max_m:
+            return None
+        waited_s = (newest - self._window[0][0]) * 1e-9
+        if waited_s < 0.8 * self._config.initial_window_s and _has_rival(fits):
+            return None
+        return mean, cov * misfit
+
+    def _problem(self, rows: Array, ages: Array) -> tuple[Array, Array, float, Array, Array]:
+        cfg = self._config
+        c = SPEED_OF_LIGHT_MPS
+        origins = np.array([r.info.position[:2] for e in self._window for r in e[2]])
+        fixes = rows[rows[:, KIND] == Kind.LINEAR]
+        centre = origins.mean(axis=0) if len(origins) else np.zeros(2)
+        reach = cfg.coverage_radius_m if len(origins) or not len(fixes) else 1e6
+        prior = np.array([*centre, 0.0, 0.0, 0.0, c * cfg.clock_drift_mean])
+        sd = np.array([reach, reach, *([cfg.initial_speed_sd_mps] * 2)])
+        clock_sd = c * np.array([cfg.clock_offset_sd_s, max(cfg.clock_drift_sd, 1e-15)])
+        prior_var = np.concatenate([sd, np.maximum(clock_sd, 1e-6)]) ** 2
+        return ages, _bias_inflated(rows), cfg.device_height_m, prior, prior_var
+
+    def _fits(
+        self, rows: Array, problem: tuple[Array, Array, float, Array, Array]
+    ) -> list[tuple[float, Array, Array]]:
+        """Solutions from the most promising starts, best first."""
+        scored: list[tuple[float, int, Array]] = []
+        for xy in _starts(rows, problem[3][:2]):
+            state = problem[3].copy()
+            state[:2] = xy
+            state[4] = _clock_at(state, rows, self._config.device_height_m)
+            scored.append((_normal_equations(state, *problem)[0], len(scored), state))
+        fits = [_solve(state, problem) for _, _, state in sorted(scored)[:_REFINED]]
+        fits = [fit for fit in fits if np.isfinite(fit[0]) and self._visible(fit[1])]
+        return sorted(fits, key=lambda fit: fit[0])
+
+    def _visible(self, state: Array) -> bool:
+        heard = {r.info.rsu_id: r for e in self._window for r in e[2]}
+        return all(
+            r.in_front(state[0] - r.info.position[0], state[1] - r.info.position[1])
+            for r in heard.values()
+        )
+
+
+def _has_rival(fits: list[tuple[float, Array, Array]]) -> bool:
+    """Whether another solution, elsewhere, explains the measurements about as well as the best."""
+    best_cost, best, best_cov = fits[0]
+    for cost, mean, cov in fits[1:]:
+        apart = mean[:2] - best[:2]
+        distance2 = float(apart @ np.linalg.solve((cov + best_cov)[:2, :2], apart))
+        if cost - best_cost < _RIVAL_COST and distance2 > _RIVAL_COST:
+            return True
+    return False
+
+
+def _bias_inflated(rows: Array) -> Array:
+    """Rows with a variance under which averaging many biased values never beats the bias.
+
+    A bias shared by k rows of the same sensor counts k times in each, so that their mean keeps the
+    bias' variance.
+    """
+    rows, bias_var = rows[:, :-1].copy(), rows[:, -1]
+    sensors, sensor = np.unique(rows[:, [KIND, *range(ORIGIN, AXES)]], axis=0, return_inverse=True)
+    count = np.bincount(sensor.reshape(-1), minlength=len(sensors))
+    rows[:, VARIANCE] += count[sensor.reshape(-1)] * bias_var
+    return rows
+
+
+def _starts(rows: Array, centre: Array) -> list[Array]:
+    """Positions to start from: along measured bearings, around measured ranges, the centre of the
+    RSUs."""
+    starts = [centre]
+    seen = set()
+    for row in rows:
+        kind = Kind(int(row[KIND]))
+        key = (kind, *row[ORIGIN:AXES])
+        if key in seen or kind is Kind.SPEED:
+            continue
+        seen.add(key)
+        origin = row[ORIGIN : ORIGIN + 2]
+        if kind in (Kind.AZIMUTH, Kind.COSINE_Y):
+            A = row[AXES : AXES + 9].reshape(3, 3)
+            angle = row[VALUE] if kind is Kind.AZIMUTH else math.asin(np.clip(row[VALUE], -1, 1))
+            ray = A.T @ np.array([math.cos(angle), math.sin(angle), 0.0])
+            starts += [origin + r * ray[:2] for r in _RAY_M]
+        elif kind is Kind.RANGE:
+            starts += [origin + row[VALUE] * np.array([math.cos(a), math.sin(a)]) for a in _CIRCLE]
+        elif kind is Kind.TOA:
+            starts += [origin + 30.0 * np.array([math.cos(a), math.sin(a)]) for a in _CIRCLE[::3]]
+    fix = rows[rows[:, KIND] == Kind.LINEAR]
+    if len(fix) >= 2:
+        H = fix[:, ORIGIN : ORIGIN + 2]
+        starts.append(np.linalg.lstsq(H, fix[:, VALUE], rcond=None)[0])
+    return starts
+
+
+def _clock_at(state: Array, rows: Array, height_m: float) -> float:
+    """Clock offset [m] that fits the TOA rows best at the position of ``state``."""
+    toa = rows[rows[:, KIND] == Kind.TOA]
+    if not len(toa):
+        return 0.0
+    d = np.column_stack([state[0] - toa[:, ORIGIN], state[1] - toa[:, ORIGIN + 1]])
+    distance = np.hypot(np.hypot(d[:, 0], d[:, 1]), height_m - toa[:, ORIGIN + 2])
+    return float(np.average(toa[:, VALUE] - distance, weights=1.0 / toa[:, VARIANCE]))

@@ -1,0 +1,92 @@
+"""The RSUs a tracker knows, and how the slow errors of each enter the state of a track."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from netpos.filters.measurement import Coupling, Kind, rsu_axes, scalar_values
+from netpos.filters.motion import N_CORE
+from netpos.messages.values import AngleConvention, Array, RsuInfo, RsuMeasurement
+
+_RANGES = (Kind.TOA, Kind.RANGE)
+_AZIMUTHS = (Kind.AZIMUTH, Kind.COSINE_Y)
+
+
+@dataclass(frozen=True, slots=True)
+class Rsu:
+    """A known RSU: its description and the rotation map -> RSU axes (9,)."""
+
+    info: RsuInfo
+    axes: Array
+
+    @classmethod
+    def of(cls, info: RsuInfo) -> Rsu:
+        """Rsu of its description."""
+        return cls(info, rsu_axes(info))
+
+    def bias_sd(self, kind: Kind) -> float:
+        """Standard deviation of the RSU's own bias in rows of a kind; 0 where it has none."""
+        if kind in _RANGES:
+            return self.info.range_bias_sd_m
+        if kind in _AZIMUTHS:
+            return self.info.azimuth_bias_sd_rad
+        return self.info.elevation_bias_sd_rad
+
+    def kinds(self, m: RsuMeasurement) -> tuple[Kind, ...]:
+        """Kinds of the scalar rows a measurement of this RSU gives."""
+        return tuple(kind for kind, _, _ in scalar_values(m, self.info.angle_convention))
+
+    def in_front(self, dx: float, dy: float) -> bool:
+        """Whether a horizontal offset from the RSU is one its array can see: a CONE array has no
+        back."""
+        if self.info.angle_convention is AngleConvention.SPHERICAL:
+            return True
+        return bool(self.axes[0] * dx + self.axes[1] * dy >= 0.0)
+
+
+@dataclass(slots=True)
+class BiasStates:
+    """State entries for the slow sensor errors of one track, added when an RSU is first heard."""
+
+    sd: list[float] = field(default_factory=list)
+    tau_s: list[float] = field(default_factory=list)
+    _slots: dict[tuple[str, str], int] = field(default_factory=dict)
+    _last_ns: dict[tuple[str, Kind], int] = field(default_factory=dict)
+
+    def coupling(self, rsu: Rsu, m: RsuMeasurement) -> Coupling:
+        """Coupling of the rows of ``m``; new biases are appended to ``sd`` and ``tau_s``."""
+        info = rsu.info
+        bias: dict[Kind, int] = {}
+        common: dict[Kind, int] = {}
+        inflation: dict[Kind, float] = {}
+        for kind in rsu.kinds(m):
+            if rsu.bias_sd(kind) > 0.0:
+                name = ("rsu/" + info.rsu_id, kind.name)
+                bias[kind] = self._slot(name, rsu.bias_sd(kind), info.bias_correlation_time_s)
+            if kind in _RANGES and info.common_range_bias_sd_m > 0.0:
+                name = ("network/" + info.network, "range")
+                tau = info.common_bias_correlation_time_s
+                common[kind] = self._slot(name, info.common_range_bias_sd_m, tau)
+            if info.noise_correlation_time_s > 0.0:
+                inflation[kind] = self._inflation(info, kind, m.stamp_ns)
+        return Coupling(bias, common, inflation)
+
+    def accepted(self, rsu: Rsu, m: RsuMeasurement) -> None:
+        """Note that ``m`` was fused: correlated noise is counted from here."""
+        for kind in rsu.kinds(m):
+            self._last_ns[rsu.info.rsu_id, kind] = m.stamp_ns
+
+    def _slot(self, name: tuple[str, str], sd: float, tau_s: float) -> int:
+        if name not in self._slots:
+            self._slots[name] = N_CORE + len(self.sd)
+            self.sd.append(sd)
+            self.tau_s.append(tau_s)
+        return self._slots[name]
+
+    def _inflation(self, info: RsuInfo, kind: Kind, stamp_ns: int) -> float:
+        """White noise of the same spectral density at 0: variance times correlation time over
+        sampling interval."""
+        last = self._last_ns.get((info.rsu_id, kind))
+        if last is None or stamp_ns <= last:
+            return 1.0
+        return max(1.0, info.noise_correlation_time_s * 1e9 / (stamp_ns - last))

@@ -1,0 +1,48 @@
+"""Tracker parameters that come with the input: of a scenario, or of a bag that carries them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from netpos.bags import BagReader
+
+# Name of the metadata entry of a bag that holds parameters for its measurements, as YAML.
+TRACKER_METADATA = "tracker"
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerSettings:
+    """Parameters by name, and the devices to expect."""
+
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    vue_ids: tuple[str, ...] = ("vue_1",)
+
+
+def bag_settings(metadata: Mapping[str, str]) -> Mapping[str, Any]:
+    """Tracker parameters in the metadata of a bag; empty where it carries none."""
+    loaded = yaml.safe_load(metadata.get(TRACKER_METADATA, "{}")) or {}
+    if not isinstance(loaded, dict):
+        raise ValueError(f"the bag's {TRACKER_METADATA!r} metadata is not a mapping of parameters")
+    return loaded
+
+
+def settings_from(source: str) -> TrackerSettings:
+    """Settings of a scenario (name or YAML file) or of a bag (folder); defaults for an empty
+    source.
+
+    Raises ``ValueError`` naming what is wrong with the source.
+    """
+    if not source:
+        return TrackerSettings()
+    if Path(source).is_dir():
+        with BagReader(Path(source)) as bag:
+            return TrackerSettings(bag_settings(bag.metadata))
+    from netpos.scenario import load_scenario  # noqa: PLC0415 - a bag needs no scenario
+
+    scenario = load_scenario(source)
+    return TrackerSettings(dict(scenario.tracker), tuple(scenario.vue_ids))

@@ -1,0 +1,213 @@
+"""Step detector against synthetic gait with known contacts."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from netpos.inertial.steps import (
+    CELL_S,
+    CellAverager,
+    Step,
+    StepConfig,
+    StepDetector,
+    band_pass_kernel,
+    weinberg_length,
+)
+from scipy.spatial.transform import Rotation
+
+G = 9.80665
+START_S = 3.0
+
+
+def gait(
+    rate_hz: float, cadence_hz: float, steps: int, amplitude: float, noise: float = 0.1
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rest, walk, rest -> stamps (n,), force (n, 3), peak times (k,).
+
+    The amplitude rises and falls over one step: 75 % at the first and the last peak.
+    """
+    walk_s = steps / cadence_hz
+    t = np.arange(0.0, START_S + walk_s + 4.0, 1.0 / rate_hz)
+    phase = 2 * np.pi * cadence_hz * (t - START_S)
+    inside = (t >= START_S) & (t < START_S + walk_s)
+    edge = np.minimum(t - START_S, START_S + walk_s - t) * cadence_hz  # in steps
+    ramp = np.clip(edge + 0.25, 0.0, 1.0)
+    vertical = -amplitude * ramp * np.cos(phase)
+    rng = np.random.default_rng(3)
+    force = np.column_stack(
+        [0.2 * vertical * inside, 0.5 * np.sin(phase / 2) * inside, G + vertical]
+    ) + rng.normal(scale=noise, size=(t.size, 3))
+    peaks = START_S + (np.arange(steps) + 0.5) / cadence_hz
+    return np.rint(t * 1e9).astype(np.int64), force, peaks
+
+
+def detect(stamps: np.ndarray, force: np.ndarray, config: StepConfig | None = None) -> list[Step]:
+    d, out = StepDetector(config), []
+    for s, f in zip(stamps.tolist(), force.tolist(), strict=True):
+        out += d.add(s, (f[0], f[1], f[2]))
+    return out
+
+
+def ends(steps: list[Step]) -> np.ndarray:
+    return np.array([s.end_ns for s in steps]) * 1e-9
+
+
+@pytest.mark.parametrize("rate_hz", [50.0, 100.0, 200.0, 285.714])
+@pytest.mark.parametrize(("cadence_hz", "amplitude"), [(0.9, 1.0), (1.8, 3.0), (2.8, 8.0)])
+def test_every_step_is_found_at_its_time(
+    rate_hz: float, cadence_hz: float, amplitude: float
+) -> None:
+    stamps, force, peaks = gait(rate_hz, cadence_hz, 30, amplitude)
+    found = ends(detect(stamps, force)) - StepConfig().contact_lag_s
+    rebound = found > peaks[-1] + 0.5 / cadence_hz  # of the filter, after a slow walk
+    assert np.count_nonzero(rebound) <= (1 if cadence_hz < 1.0 else 0)
+    found = found[~rebound]
+    assert found.size == peaks.size
+    np.testing.assert_allclose(found, peaks, atol=0.1)
+    assert abs(np.median(found - peaks)) < 0.04  # lead of the gravity high-pass at 0.9 Hz
+
+
+def test_cadence_and_interval_chain() -> None:
+    steps = detect(*gait(100.0, 1.6, 20, 2.5, noise=0.02)[:2])
+    for a, b in itertools.pairwise(steps):
+        assert b.start_ns == a.end_ns
+    assert np.median([s.cadence_hz for s in steps]) == pytest.approx(1.6, abs=0.05)
+
+
+def test_detection_does_not_depend_on_the_device_orientation() -> None:
+    stamps, force, _ = gait(100.0, 1.8, 25, 2.5)
+    rng = np.random.default_rng(5)
+    reference = detect(stamps, force)
+    for _ in range(5):
+        turned = Rotation.random(rng=rng).apply(force)
+        steps = detect(stamps, turned)
+        assert [s.end_ns for s in steps] == [s.end_ns for s in reference]
+        np.testing.assert_allclose(
+            [s.prominence_mps2 for s in steps], [s.prominence_mps2 for s in reference], rtol=1e-9
+        )
+
+
+def test_delay_within_a_bout_is_bounded() -> None:
+    stamps, force, _ = gait(100.0, 1.8, 25, 2.5)
+    d, config, worst, n = StepDetector(), StepConfig(), 0.0, 0
+    for s, f in zip(stamps.tolist(), force.tolist(), strict=True):
+        for step in d.add(s, (f[0], f[1], f[2])):
+            n += 1
+            if n > config.bout_steps:  # the opening ones wait for the third
+                worst = max(worst, s * 1e-9 - (step.end_ns * 1e-9 - config.contact_lag_s))
+    assert 0.0 < worst <= config.delay_s
+
+
+@pytest.mark.parametrize(("steps", "found"), [(2, 0), (3, 3)])
+def test_a_bout_opens_at_three_steps(steps: int, found: int) -> None:
+    assert len(detect(*gait(100.0, 1.8, steps, 3.0, noise=0.02)[:2])) == found
+
+
+@pytest.mark.parametrize(("amplitude", "expected"), [(0.05, 0), (0.6, 20)])
+def test_prominence_floor(amplitude: float, expected: int) -> None:
+    assert len(detect(*gait(100.0, 1.8, 20, amplitude, noise=0.02)[:2])) == expected
+
+
+@pytest.mark.parametrize(("turn_radps", "steps"), [(0.5, 0), (0.0, 13)])
+def test_turning_the_device_in_the_hand_is_not_walking(turn_radps: float, steps: int) -> None:
+    """The same 1.5 Hz shaking counts at a fixed tilt and not while the device turns over."""
+    t = np.arange(0.0, 16.0, 0.01)
+    shaking = (t > 4.0) & (t < 13.0)
+    vertical = G + np.where(shaking, 0.7 * np.sin(2 * np.pi * 1.5 * (t - 4.0)), 0.0)
+    tilt = np.clip(t - 3.0, 0.0, None) * turn_radps
+    force = np.column_stack([vertical * np.sin(tilt), 0 * t, vertical * np.cos(tilt)])
+    found = detect(np.rint(t * 1e9).astype(np.int64), force)
+    assert len(found) == pytest.approx(steps, abs=1 if steps else 0)
+
+
+def test_rest_has_no_steps_and_is_still() -> None:
+    rng = np.random.default_rng(2)
+    force = np.array([0.0, 0.0, G]) + rng.normal(scale=0.03, size=(2000, 3))
+    d = StepDetector()
+    assert not d.still  # the window is not full yet
+    steps = [s for i, f in enumerate(force.tolist()) for s in d.add(i * 10**7, tuple(f))]
+    assert steps == []
+    assert d.still
+
+
+@pytest.mark.parametrize(("sd", "still"), [(0.14, True), (0.16, False)])
+def test_still_threshold_at_its_boundary(sd: float, still: bool) -> None:
+    """A square wave of height +-sd, slower than the cells, has exactly that sd."""
+    d = StepDetector(StepConfig(still_acceleration_sd_mps2=0.15))
+    for i in range(500):  # two halves of the 1 s window
+        d.add(i * 10**7, (sd if (i // 50) % 2 else -sd, 0.0, G))
+    assert d.acceleration_sd_mps2 == pytest.approx(sd, rel=0.02)
+    assert d.still is still
+
+
+@pytest.mark.parametrize("rate_hz", [37.0, 50.0, 100.0, 285.714])
+def test_cell_mean_of_a_ramp_is_its_value_at_the_centre(rate_hz: float) -> None:
+    cells, out = CellAverager(), []
+    for i in range(200):
+        s = round(i / rate_hz * 1e9)
+        out += cells.add(s, (3.0 * s * 1e-9, 1.0, -s * 1e-9))
+    centres = np.array([c for c, _ in out]) * 1e-9
+    means = np.array([m for _, m in out])
+    np.testing.assert_allclose(means[:, 0], 3.0 * centres, atol=1e-9)
+    np.testing.assert_allclose(means[:, 1], 1.0, atol=1e-9)
+    np.testing.assert_allclose(np.diff(centres), CELL_S, atol=1e-9)
+
+
+def test_band_pass_is_zero_phase_and_stops_gravity_and_impacts() -> None:
+    """Gain by the Fourier sum at 0, 1.8 and 12 Hz."""
+    k = band_pass_kernel(0.08, 0.4, 0.5)
+    np.testing.assert_allclose(k, k[::-1], atol=1e-15)
+    t = (np.arange(k.size) - k.size // 2) * CELL_S
+    gain = [abs(np.sum(k * np.exp(-2j * np.pi * f * t))) for f in (0.0, 1.8, 12.0)]
+    assert gain[0] < 1e-12
+    assert 0.55 < gain[1] < 1.2
+    assert gain[2] < 0.02
+
+
+def test_weinberg_scaling() -> None:
+    assert weinberg_length(16.0, 0.5) == pytest.approx(1.0)
+    assert weinberg_length(16.0 * 81, 0.5) == pytest.approx(3.0)
+    assert weinberg_length(-1.0, 0.5) == 0.0
+
+
+def test_prominence_is_the_range_of_the_band() -> None:
+    """A sine of amplitude A has range 2 A times the gain of the kernel."""
+    f_hz, amplitude = 1.8, 2.0
+    k = band_pass_kernel(0.08, 0.4, 0.5)
+    t = (np.arange(k.size) - k.size // 2) * CELL_S
+    gain = float(np.sum(k * np.cos(2 * np.pi * f_hz * t)))
+    steps = detect(*gait(100.0, f_hz, 40, amplitude, noise=0.0)[:2])
+    middle = [s.prominence_mps2 for s in steps[10:30]]
+    assert np.mean(middle) == pytest.approx(2 * amplitude * gain, rel=0.05)
+
+
+def test_reset_forgets_an_open_bout() -> None:
+    stamps, force, _ = gait(100.0, 1.8, 20, 3.0)
+    d = StepDetector()
+    cut = int((START_S + 5.0) * 100)
+    for s, f in zip(stamps[:cut].tolist(), force[:cut].tolist(), strict=True):
+        d.add(s, tuple(f))
+    d.reset()
+    assert not d.still
+    assert math.isinf(d.acceleration_sd_mps2)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"min_prominence_mps2": 0.0},
+        {"prominence_fraction": 1.0},
+        {"trend_sd_s": 0.05},
+        {"max_interval_s": 0.2},
+        {"contact_lag_s": math.nan},
+        {"filter_half_width_s": 0.1},
+        {"bout_steps": 0},
+    ],
+)
+def test_bad_config_names_the_value(bad: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        StepConfig(**bad)

@@ -1,0 +1,15 @@
+from setuptools import find_packages, setup
+
+setup(
+    name="netpos_node",
+    version="0.1.0",
+    packages=find_packages(exclude=["test", "test.*"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/netpos_node"]),
+        ("share/netpos_node", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=True,
+    description="What every node needs: start, parameters, QoS, message conversion.",
+    license="Apache-2.0",
+)

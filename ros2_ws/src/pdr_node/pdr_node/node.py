@@ -1,0 +1,63 @@
+"""Dead-reckoning node: IMU and magnetometer in, steps and step velocities out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from geometry_msgs.msg import TwistWithCovarianceStamped
+from netpos.inertial.pdr import PedestrianDeadReckoning
+from netpos.messages import topics
+from netpos_msgs.msg import Step
+from netpos_node import CODEC, STREAM, run
+from rclpy.node import Node
+from sensor_msgs.msg import Imu, MagneticField
+
+from pdr_node.conversions import step_value, velocity_value
+from pdr_node.parameters import declare_parameters
+
+
+class PdrNode(Node):
+    """Feeds a ``PedestrianDeadReckoning`` core."""
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__("pdr_node", **node_options)
+        parameters = declare_parameters(self)
+        self._vue_id = vue = parameters.vue_id
+        self._core = PedestrianDeadReckoning(parameters.config)
+        self._counted: dict[str, int] = {}
+        self._step_pub = self.create_publisher(Step, topics.of_vue(vue, topics.STEP), STREAM)
+        self._velocity_pub = self.create_publisher(
+            TwistWithCovarianceStamped, topics.of_vue(vue, topics.STEP_VELOCITY), STREAM
+        )
+        self.create_subscription(Imu, topics.of_vue(vue, topics.IMU), self._on_imu, STREAM)
+        self.create_subscription(
+            MagneticField, topics.of_vue(vue, topics.MAG), self._on_magnetic_field, STREAM
+        )
+        self.create_timer(2.0, self._report_refusals)
+
+    def _on_imu(self, msg: Any) -> None:
+        imu = CODEC.imu_from_msg(msg)
+        output = self._core.add_imu(imu.stamp_ns, imu.angular_velocity, imu.specific_force)
+        if output is None:
+            return
+        for event in output.steps:
+            self._step_pub.publish(CODEC.step_to_msg(step_value(self._vue_id, event)))
+        if output.velocity is not None:
+            velocity = velocity_value(self._vue_id, output.velocity)
+            self._velocity_pub.publish(CODEC.velocity_to_msg(velocity))
+
+    def _on_magnetic_field(self, msg: Any) -> None:
+        sample = CODEC.magnetic_field_from_msg(msg)
+        self._core.add_magnetic_field(sample.stamp_ns, sample.magnetic_field)
+
+    def _report_refusals(self) -> None:
+        counters = self._core.counters
+        if counters != self._counted:
+            text = ", ".join(f"{reason} {n}" for reason, n in sorted(counters.items()))
+            self.get_logger().warning(f"IMU samples refused or restarts so far: {text}")
+            self._counted = dict(counters)
+
+
+def main() -> None:
+    """Entry point of ``ros2 run pdr_node pdr_node``."""
+    run(PdrNode)
