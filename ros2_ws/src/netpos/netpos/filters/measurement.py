@@ -138,6 +138,30 @@ def predict_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
 
 
 @njit(cache=True)
+def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> float:
+    """Variance of what linearising ``row`` at ``mean`` (n,) leaves out, for a prior ``cov`` (n, n).
+
+    Half the trace of (h'' P)^2 of the second-order extended Kalman filter (Bar-Shalom, Li and
+    Kirubarajan 2001, eq. 10.3.3-12), with the largest curvature of the quantity. It keeps a device
+    that may be anywhere around an RSU from being placed on top of it.
+    """
+    kind = int(row[KIND])
+    if kind in (Kind.LINEAR, Kind.SPEED):
+        return 0.0
+    dx = mean[0] - row[ORIGIN]
+    dy = mean[1] - row[ORIGIN + 1]
+    dz = height_m - row[ORIGIN + 2]
+    rho2 = dx * dx + dy * dy
+    r2 = max(rho2 + dz * dz, 1e-6)
+    if kind in (Kind.TOA, Kind.RANGE):
+        across = dy * dy * cov[0, 0] - 2.0 * dx * dy * cov[0, 1] + dx * dx * cov[1, 1]
+        return float(0.5 * (across / max(rho2, 1e-6)) ** 2 / r2)
+    square = cov[0, 0] ** 2 + 2.0 * cov[0, 1] ** 2 + cov[1, 1] ** 2
+    d2 = max(rho2, 1e-6) if kind == Kind.AZIMUTH else r2
+    return float(0.5 * square / (d2 * d2))
+
+
+@njit(cache=True)
 def linearise(rows: Array, mean: Array, height_m: float) -> tuple[Array, Array]:
     """Innovations (m,) and Jacobian H (m, n) of ``rows`` (m, ROW_WIDTH) at ``mean``; angle
     innovations are wrapped."""

@@ -11,6 +11,9 @@ from typing import Any
 from netpos.filters.motion import ProcessNoise
 
 
+FILTER_ITERATIONS = {"ekf": 1, "iekf": 8}
+
+
 def _real(default: float, low: float, high: float, text: str) -> Any:
     return field(default=default, metadata={"low": low, "high": high, "text": text})
 
@@ -23,6 +26,9 @@ class TrackerConfig:
     Raises ``ValueError`` naming the parameter, its value and the accepted range.
     """
 
+    filter: str = field(
+        default="iekf", metadata={"text": "ekf | iekf (linearised again at its own result)"}
+    )
     process_noise: str = field(
         default="continuous",
         metadata={"text": "continuous | werner (fokin2020:eq.4) | white_acceleration (eq.36)"},
@@ -59,6 +65,17 @@ class TrackerConfig:
     gate_probability: float = _real(
         0.9999, 0.5, 1.0, "share of true measurements the chi-square gate accepts; 1: no gate"
     )
+    manoeuvre_speed_sd_mps: float = _real(
+        0.0, 0.0, 1e3, "velocity step a measurement that fails the gate may reveal; 0: none"
+    )
+    inflate_after_epochs: int = field(
+        default=2,
+        metadata={
+            "low": 1,
+            "high": 10000,
+            "text": "epochs rejected in a row before the velocity is opened to initial_speed_sd_mps",
+        },
+    )
     max_rejected_epochs: int = field(
         default=10,
         metadata={
@@ -79,6 +96,9 @@ class TrackerConfig:
             raise ValueError(
                 f"process_noise must be one of {', '.join(names)}, got {self.process_noise!r}"
             )
+        if self.filter not in FILTER_ITERATIONS:
+            names = list(FILTER_ITERATIONS)
+            raise ValueError(f"filter must be one of {', '.join(names)}, got {self.filter!r}")
         for entry in fields(self):
             if "low" in entry.metadata:
                 low, high = entry.metadata["low"], entry.metadata["high"]

@@ -38,6 +38,7 @@ _REFINED = 12
 _ATTEMPT_NS = 100_000_000
 # A second solution this much worse in cost (chi-square 0.99, 2 dof) does not count as a rival.
 _RIVAL_COST = 9.21
+_NEAREST_M = 1.0
 _RAY_M = (2.0, 6.0, 15.0, 40.0, 100.0)
 _CIRCLE = tuple(2.0 * math.pi * i / 12 for i in range(12))
 
@@ -163,15 +164,18 @@ class Initialiser:
             state[4] = _clock_at(state, rows, self._config.device_height_m)
             scored.append((_normal_equations(state, *problem)[0], len(scored), state))
         fits = [_solve(state, problem) for _, _, state in sorted(scored)[:_REFINED]]
-        fits = [fit for fit in fits if np.isfinite(fit[0]) and self._visible(fit[1])]
+        fits = [fit for fit in fits if np.isfinite(fit[0]) and self._plausible(fit[1])]
         return sorted(fits, key=lambda fit: fit[0])
 
-    def _visible(self, state: Array) -> bool:
+    def _plausible(self, state: Array) -> bool:
+        """Not behind an array without a back, and not on top of an RSU, where an angle fits anything."""
         heard = {r.info.rsu_id: r for e in self._window for r in e[2]}
-        return all(
-            r.in_front(state[0] - r.info.position[0], state[1] - r.info.position[1])
-            for r in heard.values()
-        )
+        for rsu in heard.values():
+            dx, dy = state[:2] - rsu.info.position[:2]
+            dz = self._config.device_height_m - rsu.info.position[2]
+            if not rsu.in_front(dx, dy) or dx * dx + dy * dy + dz * dz < _NEAREST_M**2:
+                return False
+        return True
 
 
 def _has_rival(fits: list[tuple[float, Array, Array]]) -> bool:

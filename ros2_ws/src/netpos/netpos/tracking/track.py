@@ -25,7 +25,7 @@ from netpos.messages.values import (
     Velocity,
 )
 from netpos.tracking import output
-from netpos.tracking.config import TrackerConfig
+from netpos.tracking.config import FILTER_ITERATIONS, TrackerConfig
 from netpos.tracking.initialise import Initialiser
 from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sequencer import Epoch
@@ -163,9 +163,17 @@ class Track:
 
     def _update(self, stamp_ns: int, batch: _Batch) -> tuple[float, int, tuple[str, ...]]:
         estimate = self._predict(stamp_ns)
-        mean, cov, accepted, nis, dof = ekf.update(
-            estimate.mean, estimate.cov, batch.rows, self._config.device_height_m, self._gate
-        )
+        if self._rejected_in_row >= self._config.inflate_after_epochs:
+            estimate = self._opened(estimate, self._config.initial_speed_sd_mps)
+        result = self._gated_update(estimate, batch)
+        if not result[2].all() and self._config.manoeuvre_speed_sd_mps > 0.0:
+            opened = self._opened(estimate, self._config.manoeuvre_speed_sd_mps)
+            after_manoeuvre = self._gated_update(opened, batch)
+            if after_manoeuvre[2].sum() > result[2].sum():
+                result = after_manoeuvre
+        mean, cov, accepted, nis, dof = result
+        if not accepted.any():
+            cov = self._predict(stamp_ns).cov
         self._estimate = _Estimate(stamp_ns, mean, cov)
         self.rejected["gate"] += int(len(batch.items) - accepted.sum())
         if not accepted.any():
@@ -177,6 +185,29 @@ class Track:
         self._rejected_in_row = 0
         self._has_clock |= bool((batch.rows[:, KIND] == Kind.TOA).any())
         return nis, dof, self._note_accepted(stamp_ns, batch, accepted)
+
+    def _gated_update(
+        self, estimate: _Estimate, batch: _Batch
+    ) -> tuple[Array, Array, Array, float, int]:
+        return ekf.update(  # type: ignore[no-any-return]
+            estimate.mean,
+            estimate.cov,
+            batch.rows,
+            self._config.device_height_m,
+            self._gate,
+            FILTER_ITERATIONS[self._config.filter],
+        )
+
+    def _opened(self, estimate: _Estimate, sd: float) -> _Estimate:
+        """The estimate as if the velocity had changed by ``sd`` [m/s] after the last measurement."""
+        elapsed = (estimate.stamp_ns - self._last_accepted_ns) * 1e-9
+        cov = estimate.cov.copy()
+        for p in range(2):
+            cov[p, p] += (sd * elapsed) ** 2
+            cov[p, p + 2] += sd * sd * elapsed
+            cov[p + 2, p] += sd * sd * elapsed
+            cov[p + 2, p + 2] += sd * sd
+        return _Estimate(estimate.stamp_ns, estimate.mean, cov)
 
     def _note_accepted(self, stamp_ns: int, batch: _Batch, accepted: Array) -> tuple[str, ...]:
         sources = []
