@@ -1,3 +1,5 @@
+from glob import glob
+
 from setuptools import find_packages, setup
 
 setup(
@@ -7,13 +9,14 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/netpos_bringup"]),
         ("share/netpos_bringup", ["package.xml"]),
+        ("share/netpos_bringup/launch", sorted(glob("launch/*.launch.py"))),
+        ("share/netpos_bringup/scenarios", sorted(glob("scenarios/*.yaml"))),
     ],
     install_requires=["setuptools"],
     zip_safe=True,
     description="Scenarios, parameters, launch files and run scripts.",
     license="Apache-2.0",
     entry_points={
-        "console_scripts": [
-        ],
+        "console_scripts": [],
     },
 )

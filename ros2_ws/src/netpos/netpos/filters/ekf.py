@@ -124,7 +124,7 @@ def passes(
     if iterations <= 1:
         return False
     x, _ = iterate(mean, cov, rows, variance, height_m, iterations)
-    return misfit(mean, cov, rows, variance, height_m, x) <= threshold
+    return bool(misfit(mean, cov, rows, variance, height_m, x) <= threshold)
 
 
 @njit(cache=True)

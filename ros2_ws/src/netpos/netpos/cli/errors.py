@@ -1,0 +1,46 @@
+"""How errors reach the user of the command line."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+_BAD_INPUT = (
+    ValueError,
+    FileExistsError,
+    FileNotFoundError,
+    IsADirectoryError,
+    NotADirectoryError,
+    PermissionError,
+)
+
+
+class WorkFailedError(RuntimeError):
+    """The input was fine and the work was not done: exit status 1."""
+
+
+def _sentence(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+class Commands(TyperGroup):
+    """Turns errors of bad input and failed work into one sentence and an exit status; errors of
+    the program itself stay loud.
+    """
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the chosen command."""
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError:  # the reader of our output has gone, as in `netpos ... | head`
+            raise
+        except _BAD_INPUT as error:
+            typer.echo(f"netpos: {_sentence(error)}", err=True)
+            raise typer.Exit(2) from error
+        except (WorkFailedError, OSError) as error:
+            typer.echo(f"netpos: {_sentence(error)}", err=True)
+            raise typer.Exit(1) from error

@@ -1,0 +1,31 @@
+"""Entry point of ``netpos``: the commands in the order of the help."""
+
+from __future__ import annotations
+
+import typer
+
+from netpos.cli import recordings, results, runs
+from netpos.cli.errors import Commands
+
+app = typer.Typer(
+    cls=Commands,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Position vehicles and pedestrians from the network side.",
+)
+for command in (
+    runs.scenarios,
+    runs.run,
+    runs.replay,
+    results.evaluate,
+    results.report,
+    recordings.recover,
+):
+    app.command()(command)
+app.add_typer(recordings.importers, name="import")
+
+
+def main() -> None:
+    """Run the command line."""
+    app(prog_name="netpos")

@@ -1,0 +1,52 @@
+"""``netpos recover`` and ``netpos import``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+importers = typer.Typer(no_args_is_help=True, help="Turn other people's recordings into bags.")
+
+Bag = Annotated[Path, typer.Argument(help="Bag to write; it must not exist.")]
+
+
+def recover(bag: Annotated[Path, typer.Argument(help="Bag that was cut off.")]) -> None:
+    """Save what a killed recorder left."""
+    from netpos.bags.recover import recover as recover_bag  # noqa: PLC0415
+
+    typer.echo(str(recover_bag(bag)))
+
+
+@importers.command("ble-aoa")
+def ble_aoa(
+    path: Annotated[Path, typer.Argument(help="Folder with beacons_*.csv and truth_*.csv.")],
+    bag: Bag,
+    run: Annotated[
+        str | None, typer.Option(help="Which run of a folder, as in beacons_RUN.csv.")
+    ] = None,
+) -> None:
+    """Angles of four BLE arrays, Zenodo record 7759557."""
+    from netpos.bags.importers.ble_aoa import import_ble_aoa  # noqa: PLC0415
+
+    counts = import_ble_aoa(path, bag, run=run)
+    _report(bag, counts)
+
+
+@importers.command("uwb-anchors")
+def uwb_anchors(
+    path: Annotated[Path, typer.Argument(help="Folder with A*.csv and trajectory.csv.")], bag: Bag
+) -> None:
+    """Ranges of four UWB anchors on a car to a tag."""
+    from netpos.bags.importers.uwb_anchors import import_uwb_anchors  # noqa: PLC0415
+
+    counts = import_uwb_anchors(path, bag)
+    _report(bag, counts)
+
+
+def _report(bag: Path, counts: Mapping[str, int]) -> None:
+    for topic, count in sorted(counts.items()):
+        typer.echo(f"  {topic}: {count}")
+    typer.echo(f"wrote {bag}; track it with: netpos replay {bag} --out NEW_BAG")

@@ -1,0 +1,173 @@
+"""``netpos scenarios``, ``netpos run``, ``netpos replay``. Heavy modules load inside the
+commands, so that help is quick.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from netpos.cli.errors import WorkFailedError
+
+if TYPE_CHECKING:
+    from netpos.scenario import Scenario
+
+
+def scenarios() -> None:
+    """List the scenarios that come with netpos."""
+    from rich.console import Console  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+
+    from netpos.scenario import load_scenario, scenario_names  # noqa: PLC0415
+
+    table = Table("scenario", "description")
+    for name in scenario_names():
+        table.add_row(name, load_scenario(name).description)
+    Console().print(table)
+
+
+def run(
+    scenario: Annotated[str, typer.Argument(help="Name of a scenario, or path of a YAML file.")],
+    bag: Annotated[
+        Path | None,
+        typer.Option(help="Bag to write; it must not exist. Default: out/SCENARIO_TIME."),
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(help="Speed of the live graph against real time. Default: 1.")
+    ] = None,
+    offline: Annotated[
+        bool, typer.Option("--offline", help="Without ROS, as fast as it goes.")
+    ] = False,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of the noise. Default: the scenario's.")
+    ] = None,
+) -> None:
+    """Run a scenario, as a live ROS graph or offline, and record it."""
+    from netpos.scenario import load_scenario  # noqa: PLC0415
+
+    if offline and rate is not None:
+        raise ValueError("--rate is the speed of the live graph; leave it out with --offline")
+    if rate is not None and not rate > 0:
+        raise ValueError(f"--rate must be > 0, got {rate}")
+    chosen = load_scenario(scenario, seed=seed)
+    target = bag or Path("out") / f"{chosen.name}_{datetime.now():%Y%m%d_%H%M%S}"
+    refuse_existing(target)
+    if offline:
+        _run_offline(chosen, target)
+    else:
+        _run_live(scenario, target, 1.0 if rate is None else rate, chosen.seed)
+    typer.echo(f"recorded {target}; score it with: netpos evaluate {target}")
+
+
+def replay(
+    bag: Annotated[Path, typer.Argument(help="Recorded bag.")],
+    out: Annotated[Path, typer.Option(help="Bag to write; it must not exist.")],
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="Parameter of the tracker; may be repeated."
+        ),
+    ] = None,
+) -> None:
+    """Estimate again from the recorded measurements, without ROS."""
+    overrides = dict(parse_setting(text) for text in settings or [])
+    refuse_existing(out)
+    _track(bag, out, overrides)
+    typer.echo(f"wrote {out}")
+
+
+def parse_setting(text: str) -> tuple[str, object]:
+    """``key=value`` with the value read as YAML.
+
+    Raises
+    ------
+    ValueError  there is no ``=``, no key or no YAML scalar
+    """
+    import yaml  # noqa: PLC0415
+
+    key, equals, value = text.partition("=")
+    if not (equals and key.strip()):
+        raise ValueError(f"--set takes KEY=VALUE, got {text!r}")
+    try:
+        return key.strip(), yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise ValueError(f"--set {key}: {value!r} is not a YAML value") from error
+
+
+def refuse_existing(path: Path) -> None:
+    """FileExistsError where a recording would be overwritten; said before the work starts."""
+    if path.exists():
+        raise FileExistsError(
+            f"{path} exists and recordings are never overwritten; choose another name"
+        )
+
+
+def _track(bag: Path, out: Path, overrides: Mapping[str, object]) -> None:
+    from rich.console import Console  # noqa: PLC0415
+
+    from netpos.tracking.replay import replay_bag  # noqa: PLC0415
+
+    with Console(stderr=True).status("tracking") as status:
+
+        def show(done: int) -> None:
+            if done % 500 == 0:
+                status.update(f"tracking: {done} messages")
+
+        summary = replay_bag(bag, out, overrides, show)
+    typer.echo(f"{summary.epochs} epochs")
+    for vue, counts in sorted(summary.rejected.items()):
+        reasons = ", ".join(f"{reason} {n}" for reason, n in sorted(counts.items()) if n)
+        typer.echo(f"{vue}: rejected {reasons or 'nothing'}")
+
+
+def _run_offline(scenario: Scenario, target: Path) -> None:
+    from rich.console import Console  # noqa: PLC0415
+
+    from netpos.scenario.offline import simulate_to_bag  # noqa: PLC0415
+
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".netpos_") as folder:
+        simulated = Path(folder) / target.name
+        with Console(stderr=True).status("simulating"):
+            simulate_to_bag(scenario, simulated)
+        _track(simulated, target, scenario.tracker)
+
+
+def _run_live(scenario: str, target: Path, rate: float, seed: int) -> None:
+    """Start the graph with scripts/run_graph.sh, which ends when the scenario has ended."""
+    root = os.environ.get("NETPOS_ROOT")
+    script = Path(root or ".") / "scripts" / "run_graph.sh"
+    if root is None or not script.is_file():
+        raise ValueError(
+            "the live graph needs the netpos workspace; run: source env.sh, or use --offline"
+        )
+    if shutil.which("ros2") is None:
+        raise ValueError(
+            "ros2 is not on PATH; source env.sh or your ROS 2 installation, or use --offline"
+        )
+    is_path = os.sep in scenario or Path(scenario).suffix in {".yaml", ".yml"}
+    name = str(Path(scenario).resolve()) if is_path else scenario
+    command = [str(script), name, str(target.absolute()), f"{rate:g}", str(seed)]
+    with subprocess.Popen(command) as graph:
+        status = _wait(graph)
+    if status != 0:
+        raise WorkFailedError(f"the graph ended with status {status}; its messages are above")
+    if not target.exists():
+        raise WorkFailedError(f"the graph ended without a recording at {target}")
+
+
+def _wait(graph: subprocess.Popen[bytes]) -> int:
+    """Exit status of the graph. Ctrl-C reaches the graph as well, which then closes its bag."""
+    while True:
+        try:
+            return graph.wait()
+        except KeyboardInterrupt:
+            continue

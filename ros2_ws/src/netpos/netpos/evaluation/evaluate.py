@@ -1,0 +1,248 @@
+"""Score a recording: every device that has ground truth, in one pass over the bag."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from netpos.bags import BagReader, codec
+from netpos.evaluation.metrics import SKIP_EPOCHS, Run, Scored, score
+from netpos.evaluation.pairing import Trajectory
+from netpos.evaluation.requirements import Verdict, judge
+from netpos.evaluation.scene import buildings_of
+from netpos.messages import topics
+from netpos.messages.values import (
+    Array,
+    ClockState,
+    Odometry,
+    RsuInfo,
+    RsuMeasurement,
+    TrackStatus,
+)
+
+_Sink = tuple[str, Callable[[Any], Any], Callable[[Any], None]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Delivery:
+    """Beacons and measurements of one device as recorded.
+
+    beacons: those emitted, None where the bag has none (real RSUs need no such message);
+    epochs: beacons at least one RSU reported. received: measurements; duplicates: repeats of one
+    RSU and sequence; out_of_order: older than one recorded before. ``expected`` and ``missing``
+    are None where the RSUs do not announce how many report.
+    """
+
+    beacons: int | None
+    epochs: int
+    received: int
+    duplicates: int
+    out_of_order: int
+    expected: int | None
+    missing: int | None
+
+
+@dataclass(slots=True)
+class _DeliveryCounter:
+    received: int = 0
+    out_of_order: int = 0
+    newest_ns: int = -1
+    expected: dict[tuple[int, int], int] = field(default_factory=dict)
+    seen: set[tuple[int, int, str]] = field(default_factory=set)
+
+    def add(self, measurement: RsuMeasurement) -> None:
+        epoch = (measurement.stamp_ns, measurement.sequence)
+        self.received += 1
+        self.out_of_order += measurement.stamp_ns < self.newest_ns
+        self.newest_ns = max(self.newest_ns, measurement.stamp_ns)
+        self.expected[epoch] = max(self.expected.get(epoch, 0), measurement.expected)
+        self.seen.add((*epoch, measurement.rsu_id))
+
+    def result(self, beacons: int | None) -> Delivery:
+        announced = self.received > 0 and all(self.expected.values())
+        expected = sum(self.expected.values()) if announced else None
+        return Delivery(
+            beacons=beacons,
+            epochs=len(self.expected),
+            received=self.received,
+            duplicates=self.received - len(self.seen),
+            out_of_order=self.out_of_order,
+            expected=expected,
+            missing=None if expected is None else expected - len(self.seen),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VueEvaluation:
+    """One device: its run, the scored pairs with their figures, the verdicts and what was
+    delivered.
+    """
+
+    run: Run
+    scored: Scored
+    verdicts: tuple[Verdict, ...]
+    delivery: Delivery
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evaluation:
+    """Result of ``evaluate_bag``. ``topics``: type and number of messages; ``buildings``: (k, 4)
+    rectangles x_min, y_min, x_max, y_max [m], none where the bag does not hold its scenario."""
+
+    path: Path
+    skip: int
+    vues: Mapping[str, VueEvaluation]
+    rsus: tuple[RsuInfo, ...]
+    buildings: Array
+    topics: Mapping[str, tuple[str, int]]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain types in the form of ``netpos evaluate --json``."""
+        return {
+            "bag": self.path.name,
+            "skip": self.skip,
+            "vues": {name: vue.scored.figures.to_json() for name, vue in self.vues.items()},
+            "requirements": {
+                name: {verdict.name: verdict.to_json() for verdict in vue.verdicts}
+                for name, vue in self.vues.items()
+            },
+            "delivery": {name: asdict(vue.delivery) for name, vue in self.vues.items()},
+            "topics": {
+                topic: {"type": type_name, "messages": count}
+                for topic, (type_name, count) in sorted(self.topics.items())
+            },
+        }
+
+
+@dataclass(slots=True)
+class _Recording:
+    """The messages of a bag that matter here, as values, in recorded order."""
+
+    truth: dict[str, list[Odometry]] = field(default_factory=lambda: defaultdict(list))
+    estimate: dict[str, list[Odometry]] = field(default_factory=lambda: defaultdict(list))
+    status: dict[str, list[TrackStatus]] = field(default_factory=lambda: defaultdict(list))
+    clock: dict[str, list[ClockState]] = field(default_factory=lambda: defaultdict(list))
+    clock_truth: dict[str, list[ClockState]] = field(default_factory=lambda: defaultdict(list))
+    rsus: dict[str, RsuInfo] = field(default_factory=dict)
+    delivery: dict[str, _DeliveryCounter] = field(
+        default_factory=lambda: defaultdict(_DeliveryCounter)
+    )
+
+    def run(self, vue: str) -> Run:
+        return Run(
+            truth=Trajectory.of(self.truth[vue]),
+            estimate=Trajectory.of(self.estimate[vue]),
+            statuses=self.status[vue],
+            clock=self.clock[vue],
+            clock_truth=self.clock_truth[vue],
+        )
+
+
+def _chosen(bag: BagReader, path: Path, vue: str | None) -> list[str]:
+    """Devices to score; an error names what the bag lacks."""
+    filled = {topics.split(topic) for topic, info in bag.topics.items() if info.count}
+    found = {name for name, topic in filled if topic == topics.GROUND_TRUTH}
+    if not found:
+        raise ValueError(
+            f"{path} is a bag without ground truth (no messages on /<vue>/ground_truth); "
+            "record that topic to evaluate the run"
+        )
+    if vue is not None and vue not in found:
+        raise ValueError(
+            f"{path} has no ground truth of {vue!r}; choose one of {', '.join(sorted(found))}"
+        )
+    names = sorted(found) if vue is None else [vue]
+    if not any((name, topics.ODOMETRY) in filled for name in names):
+        raise ValueError(
+            f"{path} has no estimates (no messages on /<vue>/odometry); "
+            f"make some with: netpos replay {path} --out NEW_BAG"
+        )
+    return names
+
+
+def _sinks(recording: _Recording, vues: list[str]) -> dict[str, _Sink]:
+    """What becomes of each topic: its type, the conversion to a value and where the value goes."""
+    convert = codec()
+    odometry, clock = "nav_msgs/msg/Odometry", "netpos_msgs/msg/ClockState"
+    status = "netpos_msgs/msg/TrackStatus"
+
+    def add_rsu(info: RsuInfo) -> None:
+        recording.rsus[info.rsu_id] = info
+
+    def add_measurement(measurement: RsuMeasurement) -> None:
+        recording.delivery[measurement.vue_id].add(measurement)
+
+    sinks: dict[str, _Sink] = {
+        topics.RSU_INFO: ("netpos_msgs/msg/RsuInfo", convert.rsu_info_from_msg, add_rsu),
+        topics.RSU_MEASUREMENTS: (
+            "netpos_msgs/msg/RsuMeasurement",
+            convert.measurement_from_msg,
+            add_measurement,
+        ),
+    }
+    for vue in vues:
+        truth, estimate = recording.truth[vue], recording.estimate[vue]
+        clocks, true_clocks = recording.clock[vue], recording.clock_truth[vue]
+        of_vue: dict[str, _Sink] = {
+            topics.GROUND_TRUTH: (odometry, convert.odometry_from_msg, truth.append),
+            topics.ODOMETRY: (odometry, convert.odometry_from_msg, estimate.append),
+            topics.CLOCK_STATE: (clock, convert.clock_state_from_msg, clocks.append),
+            topics.GROUND_TRUTH_CLOCK: (clock, convert.clock_state_from_msg, true_clocks.append),
+            topics.TRACK_STATUS: (
+                status,
+                convert.track_status_from_msg,
+                recording.status[vue].append,
+            ),
+        }
+        sinks |= {topics.of_vue(vue, name): sink for name, sink in of_vue.items()}
+    return sinks
+
+
+def _read(bag: BagReader, vues: list[str]) -> _Recording:
+    recording = _Recording()
+    sinks = _sinks(recording, vues)
+    wanted = sinks.keys() & bag.topics.keys()
+    for topic in sorted(wanted):
+        expected, found = sinks[topic][0], bag.topics[topic].type_name
+        if found != expected:
+            raise ValueError(f"{bag.path}: {topic} must hold {expected}, it holds {found}")
+    for entry in bag.messages(wanted):
+        _, convert, add = sinks[entry.topic]
+        add(convert(entry.message))
+    return recording
+
+
+def evaluate_bag(path: Path, *, skip: int = SKIP_EPOCHS, vue: str | None = None) -> Evaluation:
+    """Score every device of a bag that has ground truth, or only ``vue``.
+
+    The first ``skip`` estimates of each device do not count (fokin2020 leaves out 20).
+
+    Raises
+    ------
+    ValueError  not a readable bag, no ground truth, no estimates, or no such device
+    """
+    with BagReader(path) as bag:
+        names = _chosen(bag, path, vue)
+        recording = _read(bag, names)
+        counts = {topic: (info.type_name, info.count) for topic, info in bag.topics.items()}
+        buildings = buildings_of(bag.metadata)
+    vues = {}
+    for name in names:
+        run = recording.run(name)
+        if not len(run.truth):
+            raise ValueError(f"{path}: no message on /{name}/ground_truth has finite values")
+        scored = score(run, skip=skip)
+        _, beacons = counts.get(topics.of_vue(name, topics.BEACON), ("", None))
+        vues[name] = VueEvaluation(
+            run=run,
+            scored=scored,
+            verdicts=judge(scored.figures, scored.counted.horizontal_error),
+            delivery=recording.delivery[name].result(beacons),
+        )
+    rsus = tuple(recording.rsus[name] for name in sorted(recording.rsus))
+    return Evaluation(
+        path=path, skip=skip, vues=vues, rsus=rsus, buildings=buildings, topics=counts
+    )

@@ -1,0 +1,329 @@
+"""Figures of one device's run. A figure that cannot be computed is None, never 0."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from netpos.evaluation.consistency import nees, nees_test, nis_test
+from netpos.evaluation.pairing import (
+    MAX_TRUTH_GAP_S,
+    Pairs,
+    Stamps,
+    Trajectory,
+    bracket,
+    pair,
+    wrap_angle,
+)
+from netpos.messages.values import Array, ClockState, TrackState, TrackStatus
+
+SKIP_EPOCHS = 20
+SLOT_S = 0.2
+MIN_SPEED_FOR_HEADING_MPS = 0.5
+CONVERGED_ERROR_M = 1.0
+CONVERGED_FOR_S = 1.0
+NS = 1e9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Initial:
+    """How the run began, in seconds after the first ground truth.
+
+    first fix: first estimate; ready: first estimate in state TRACKING; 1 m: first estimate that
+    opens a stretch of at least 1 s, without a pause above 1 s, in which every horizontal error is
+    at most 1 m.
+    """
+
+    time_to_first_fix_s: float | None
+    time_to_ready_s: float | None
+    time_to_1m_s: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Figures:
+    """Accuracy, availability and consistency of one device, after the convergence prefix of
+    ``skipped`` estimates.
+
+    n: estimates scored. duration_s: from the first to the last of them. availability: share of
+    the ground truth's span at which the newest ready estimate is at most 0.2 s old (5 Hz,
+    fokin2020's priority passage), convergence included; an estimate is ready in state TRACKING.
+    rmse_m, p50..max: horizontal position error; mean_error_m: mean horizontal error, which
+    fokin2020:eq.34 calls RMSE; rmse_3d_m with the vertical. velocity_rmse_mps: horizontal, map
+    axes. heading_rmse_deg: where the true speed exceeds 0.5 m/s. clock_offset_sd_ns: standard
+    deviation of the clock offset error about its mean; clock_offset_rmse_ns: about zero. nees_*:
+    horizontal position, 2 degrees of freedom, bounds for nees_n_eff independent epochs.
+    nis_mean: mean NIS of epochs with measurements; nis_dof_mean: its expectation. rejected: all
+    measurements rejected up to the end. bound_ratio: rmse_m over the posterior Cramer-Rao bound.
+    """
+
+    n: int
+    duration_s: float | None = None
+    availability: float | None = None
+    rmse_m: float | None = None
+    mean_error_m: float | None = None
+    p50_m: float | None = None
+    p95_m: float | None = None
+    p99_m: float | None = None
+    max_m: float | None = None
+    velocity_rmse_mps: float | None = None
+    heading_rmse_deg: float | None = None
+    clock_offset_sd_ns: float | None = None
+    clock_offset_rmse_ns: float | None = None
+    nees_mean: float | None = None
+    nees_bounds: tuple[float, float] | None = None
+    nees_consistent: bool | None = None
+    nis_mean: float | None = None
+    rejected: int | None = None
+    bound_ratio: float | None = None
+    rmse_3d_m: float | None = None
+    nees_n: int | None = None
+    nees_n_eff: float | None = None
+    nis_dof_mean: float | None = None
+    nis_bounds: tuple[float, float] | None = None
+    nis_consistent: bool | None = None
+    rejected_by_reason: dict[str, int] | None = None
+    output_rate_hz: float | None = None
+    longest_gap_s: float | None = None
+    speed_max_mps: float | None = None
+    initial: Initial = field(
+        default_factory=lambda: Initial(
+            time_to_first_fix_s=None, time_to_ready_s=None, time_to_1m_s=None
+        )
+    )
+    estimates: int = 0
+    skipped: int = 0
+    outside_truth: int = 0
+    in_truth_gap: int = 0
+    duplicates: int = 0
+    invalid: int = 0
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain types, keys as the field names."""
+        figures = asdict(self)
+        for name in ("nees_bounds", "nis_bounds"):
+            figures[name] = None if figures[name] is None else list(figures[name])
+        return figures
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Run:
+    """What a recording holds of one device."""
+
+    truth: Trajectory
+    estimate: Trajectory
+    statuses: Sequence[TrackStatus] = ()
+    clock: Sequence[ClockState] = ()
+    clock_truth: Sequence[ClockState] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scored:
+    """The figures of a run; ``pairs`` are all pairs of estimate and truth, those from ``from_ns``
+    on (``counted``) make the figures.
+    """
+
+    figures: Figures
+    pairs: Pairs
+    counted: Pairs
+    from_ns: int
+
+
+def rms(values: Array) -> float | None:
+    """Root mean square, None of nothing."""
+    return float(np.sqrt(np.mean(values**2))) if values.size else None
+
+
+def _percentiles(errors: Array) -> tuple[float | None, ...]:
+    if not errors.size:
+        return (None, None, None, None)
+    return tuple(float(p) for p in np.percentile(errors, [50, 95, 99, 100]))
+
+
+def availability(truth_ns: Stamps, ready_ns: Stamps, slot_s: float = SLOT_S) -> float | None:
+    """Share of the truth's span at which the newest ready estimate is at most ``slot_s`` old;
+    None where the span has no length.
+    """
+    if truth_ns.size < 2:
+        return None
+    begin, end = int(truth_ns[0]), int(truth_ns[-1])
+    starts = np.clip(ready_ns, begin, end)
+    valid_until = np.clip(ready_ns + round(slot_s * NS), begin, end)
+    next_start = np.append(starts[1:], end)
+    covered = np.maximum(np.minimum(valid_until, next_start) - starts, 0)
+    return float(covered.sum() / (end - begin))
+
+
+def ready_stamps(estimate: Trajectory, statuses: Iterable[TrackStatus]) -> Stamps:
+    """Stamps of ready estimates: state TRACKING at that stamp; every estimate where the recording
+    has no track status at all.
+    """
+    states = {status.stamp_ns: status.state for status in statuses}
+    if not states:
+        return estimate.stamp_ns
+    ready = [states.get(int(stamp)) is TrackState.TRACKING for stamp in estimate.stamp_ns]
+    return estimate.stamp_ns[np.array(ready, dtype=np.bool_)]
+
+
+def time_to_converge(
+    pairs: Pairs, limit_m: float = CONVERGED_ERROR_M, hold_s: float = CONVERGED_FOR_S
+) -> int | None:
+    """Stamp [ns] of the first estimate that opens a stretch of at least ``hold_s`` within
+    ``limit_m``; None if there is none.
+
+    A pause longer than ``hold_s`` ends a stretch.
+    """
+    hold_ns = round(hold_s * NS)
+    begin = previous = None
+    for stamp, error in zip(pairs.estimate.stamp_ns.tolist(), pairs.horizontal_error, strict=True):
+        if error > limit_m:
+            begin = None
+        elif begin is None or stamp - previous > hold_ns:
+            begin = stamp
+        elif stamp - begin >= hold_ns:
+            return int(begin)
+        previous = stamp
+    return None
+
+
+def clock_error_series(run: Run, max_gap_s: float = MAX_TRUTH_GAP_S) -> tuple[Stamps, Array]:
+    """Stamps (k,) and clock offset errors (k,) [ns], estimate minus the interpolated truth;
+    finite values only.
+    """
+    estimate = {c.stamp_ns: c.offset_s for c in run.clock if np.isfinite(c.offset_s)}
+    known = {c.stamp_ns: c.offset_s for c in run.clock_truth if np.isfinite(c.offset_s)}
+    query = np.array(sorted(estimate), dtype=np.int64)
+    base = np.array(sorted(known), dtype=np.int64)
+    found = bracket(query, base, max_gap_s)
+    stamps = query[found.inside]
+    offsets = np.array([estimate[s] for s in stamps.tolist()], dtype=np.float64)
+    true = found.interpolate(np.array([known[s] for s in base.tolist()], dtype=np.float64))
+    return stamps, (offsets - true) * NS
+
+
+def _initial(run: Run, pairs: Pairs, ready_ns: Stamps) -> Initial:
+    start = int(run.truth.stamp_ns[0])
+
+    def after_start(stamp: int | None) -> float | None:
+        return None if stamp is None else max(stamp - start, 0) / NS
+
+    first = int(run.estimate.stamp_ns[0]) if len(run.estimate) else None
+    ready = int(ready_ns[0]) if ready_ns.size else None
+    return Initial(
+        time_to_first_fix_s=after_start(first),
+        time_to_ready_s=after_start(ready),
+        time_to_1m_s=after_start(time_to_converge(pairs)),
+    )
+
+
+def _heading_errors_deg(pairs: Pairs) -> Array:
+    moving = np.linalg.norm(pairs.truth.velocity[:, :2], axis=1) > MIN_SPEED_FOR_HEADING_MPS
+    errors = wrap_angle(pairs.estimate.heading - pairs.truth.heading)
+    return np.asarray(np.rad2deg(errors[moving]))
+
+
+def _consistency(pairs: Pairs, statuses: Sequence[TrackStatus], from_ns: int) -> dict[str, Any]:
+    values, _ = nees(pairs.error[:, :2], pairs.estimate.position_cov[:, :2, :2])
+    errors = nees_test(values, dof=2)
+    evaluated = [
+        s for s in statuses if s.nis_dof > 0 and s.stamp_ns >= from_ns and np.isfinite(s.nis)
+    ]
+    innovations = nis_test(
+        np.array([s.nis for s in evaluated], dtype=np.float64),
+        np.array([s.nis_dof for s in evaluated], dtype=np.float64),
+    )
+    figures: dict[str, Any] = {"nees_n": values.size}
+    if errors is not None:
+        figures |= {
+            "nees_mean": errors.mean,
+            "nees_bounds": errors.bounds,
+            "nees_consistent": errors.consistent,
+            "nees_n_eff": errors.n_eff,
+        }
+    if innovations is not None:
+        figures |= {
+            "nis_mean": innovations.mean,
+            "nis_dof_mean": float(np.mean([s.nis_dof for s in evaluated])),
+            "nis_bounds": innovations.bounds,
+            "nis_consistent": innovations.consistent,
+        }
+    return figures
+
+
+def _output(ready_ns: Stamps) -> dict[str, Any]:
+    if ready_ns.size < 2:
+        return {"output_rate_hz": None, "longest_gap_s": None}
+    intervals = np.diff(ready_ns)
+    return {
+        "output_rate_hz": float(intervals.size * NS / intervals.sum()),
+        "longest_gap_s": float(intervals.max() / NS),
+    }
+
+
+def _accuracy(scored: Pairs) -> dict[str, Any]:
+    errors = scored.horizontal_error
+    stamps = scored.estimate.stamp_ns
+    p50, p95, p99, worst = _percentiles(errors)
+    velocity_errors = (scored.estimate.velocity - scored.truth.velocity)[:, :2]
+    return {
+        "n": len(scored),
+        "duration_s": float((stamps[-1] - stamps[0]) / NS) if stamps.size else None,
+        "rmse_m": rms(errors),
+        "rmse_3d_m": rms(np.linalg.norm(scored.error, axis=1)),
+        "mean_error_m": float(errors.mean()) if errors.size else None,
+        "p50_m": p50,
+        "p95_m": p95,
+        "p99_m": p99,
+        "max_m": worst,
+        "velocity_rmse_mps": rms(np.linalg.norm(velocity_errors, axis=1)),
+        "heading_rmse_deg": rms(_heading_errors_deg(scored)),
+    }
+
+
+def _rejections(statuses: Sequence[TrackStatus]) -> dict[str, Any]:
+    if not statuses:
+        return {}
+    last = max(statuses, key=lambda status: status.stamp_ns)
+    return {"rejected": sum(last.rejected.values()), "rejected_by_reason": dict(last.rejected)}
+
+
+def score(
+    run: Run, *, skip: int = SKIP_EPOCHS, max_truth_gap_s: float = MAX_TRUTH_GAP_S
+) -> Scored:
+    """Figures of a run, with the pairs they come from; the first ``skip`` estimates do not count.
+
+    Raises
+    ------
+    ValueError  ``skip`` is negative or there is no ground truth
+    """
+    if skip < 0:
+        raise ValueError(f"skip must be >= 0, got {skip}")
+    if not len(run.truth):
+        raise ValueError("there is no ground truth to score against")
+    pairs = pair(run.estimate, run.truth, max_truth_gap_s)
+    left = run.estimate.stamp_ns[skip:]
+    from_ns = int(left[0]) if left.size else int(np.iinfo(np.int64).max)
+    scored = pairs.take(pairs.estimate.stamp_ns >= from_ns)
+    ready_ns = ready_stamps(run.estimate, run.statuses)
+    clock_ns, clock = clock_error_series(run, max_truth_gap_s)
+    clock = clock[clock_ns >= from_ns]
+    figures = Figures(
+        availability=availability(run.truth.stamp_ns, ready_ns),
+        clock_offset_sd_ns=float(clock.std()) if clock.size else None,
+        clock_offset_rmse_ns=rms(clock),
+        speed_max_mps=float(np.linalg.norm(run.truth.velocity[:, :2], axis=1).max()),
+        initial=_initial(run, pairs, ready_ns),
+        estimates=len(run.estimate),
+        skipped=len(run.estimate) - left.size,
+        outside_truth=pairs.outside,
+        in_truth_gap=pairs.in_gap,
+        duplicates=run.estimate.duplicates,
+        invalid=run.estimate.invalid,
+        **_accuracy(scored),
+        **_output(ready_ns),
+        **_consistency(scored, run.statuses, from_ns),
+        **_rejections(run.statuses),
+    )
+    return Scored(figures=figures, pairs=pairs, counted=scored, from_ns=from_ns)

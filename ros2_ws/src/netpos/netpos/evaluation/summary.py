@@ -1,0 +1,84 @@
+"""An evaluation as rows of text, for the terminal and the report."""
+
+from __future__ import annotations
+
+from netpos.evaluation.evaluate import Evaluation
+from netpos.evaluation.metrics import Figures
+from netpos.evaluation.requirements import Row
+
+NOTHING = "–"
+
+# label, unit, field of Figures, format
+_ROWS = (
+    ("estimates scored", "", "n", "d"),
+    ("duration", "s", "duration_s", ".1f"),
+    ("availability", "%", "availability", ".1%"),
+    ("position RMSE", "m", "rmse_m", ".3f"),
+    ("position RMSE, 3-D", "m", "rmse_3d_m", ".3f"),
+    ("mean position error", "m", "mean_error_m", ".3f"),
+    ("50 % within", "m", "p50_m", ".3f"),
+    ("95 % within", "m", "p95_m", ".3f"),
+    ("99 % within", "m", "p99_m", ".3f"),
+    ("largest error", "m", "max_m", ".3f"),
+    ("velocity RMSE", "m/s", "velocity_rmse_mps", ".3f"),
+    ("heading RMSE", "°", "heading_rmse_deg", ".2f"),
+    ("clock offset sd", "ns", "clock_offset_sd_ns", ".2f"),
+    ("clock offset RMSE", "ns", "clock_offset_rmse_ns", ".2f"),
+    ("NEES, mean (2 expected)", "", "nees_mean", ".2f"),
+    ("NIS, mean", "", "nis_mean", ".2f"),
+    ("NIS, expected", "", "nis_dof_mean", ".2f"),
+    ("measurements rejected", "", "rejected", "d"),
+    ("error / bound", "", "bound_ratio", ".2f"),
+    ("output rate", "Hz", "output_rate_hz", ".2f"),
+    ("longest gap", "s", "longest_gap_s", ".2f"),
+)
+_INITIAL = (
+    ("first fix after", "s", "time_to_first_fix_s"),
+    ("ready after", "s", "time_to_ready_s"),
+    ("within 1 m after", "s", "time_to_1m_s"),
+)
+
+
+def _text(value: float | None, style: str) -> str:
+    if value is None:
+        return NOTHING
+    return format(value, style).removesuffix("%")
+
+
+def _interval(figures: Figures) -> str:
+    if figures.nees_bounds is None:
+        return NOTHING
+    low, high = figures.nees_bounds
+    verdict = "consistent" if figures.nees_consistent else "not consistent"
+    return f"{low:.2f}…{high:.2f}, {verdict}"
+
+
+def figure_rows(evaluation: Evaluation) -> list[list[str]]:
+    """Rows of label, unit and one value per device."""
+    all_figures = [vue.scored.figures for vue in evaluation.vues.values()]
+    rows = []
+    for label, unit, name, style in _ROWS:
+        rows.append([label, unit, *(_text(getattr(f, name), style) for f in all_figures)])
+        if name == "nees_mean":
+            rows.append(["NEES, 95 % bounds", "", *map(_interval, all_figures)])
+    rows += [
+        [label, unit, *(_text(getattr(f.initial, name), ".2f") for f in all_figures)]
+        for label, unit, name in _INITIAL
+    ]
+    return rows
+
+
+def _verdict(row: Row) -> str:
+    mark = {True: " ✓", False: " ✗", None: ""}[row.ok]
+    return _text(row.measured, ".3g") + mark
+
+
+def verdict_rows(evaluation: Evaluation) -> list[list[str]]:
+    """Rows of requirement set, requirement, what is required and one verdict per device."""
+    columns = [vue.verdicts for vue in evaluation.vues.values()]
+    rows = []
+    for index, verdict in enumerate(columns[0]):
+        for line, row in enumerate(verdict.rows):
+            cells = [_verdict(verdicts[index].rows[line]) for verdicts in columns]
+            rows.append([verdict.name, row.name, row.required, *cells])
+    return rows

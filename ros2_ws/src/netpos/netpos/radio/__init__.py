@@ -1,0 +1,2 @@
+"""The simulated radio: noise streams, device clocks, arrays, waveforms, lines of sight,
+measurements."""

@@ -1,0 +1,110 @@
+"""From the words of a scenario to the arrays of the simulation."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from netpos.messages.values import RsuInfo
+from netpos.radio.measure import Errors, Sight, Sites, los_model_number
+from netpos.radio.noise import stream_key
+from netpos.scenario.schema import Device, FixedErrors, Scenario
+from netpos.world.frames import quaternion_from_yaw, yaw_from_quaternion
+from netpos.world.maps import METIS_KERB_OFFSET_M, METIS_MADRID, METIS_RSU_SPACING_M
+
+Array = npt.NDArray[np.float64]
+
+
+def buildings_of(scenario: Scenario) -> Array:
+    """(k, 4) rectangles."""
+    if scenario.world.map == "metis_madrid":
+        return METIS_MADRID.buildings
+    rows = [(b.x_min, b.y_min, b.x_max, b.y_max) for b in scenario.world.buildings]
+    return np.array(rows, dtype=np.float64).reshape(-1, 4)
+
+
+def rsus_of(scenario: Scenario) -> tuple[RsuInfo, ...]:
+    """The RSUs, stamped with the start of the run."""
+    if scenario.rsus.layout == "metis_madrid":
+        places = METIS_MADRID.lamp_posts(METIS_RSU_SPACING_M, METIS_KERB_OFFSET_M)
+        return tuple(
+            RsuInfo(
+                rsu_id=f"rsu_{i + 1:02d}",
+                position=np.array([x, y, scenario.rsus.height_m]),
+                stamp_ns=scenario.start_ns,
+            )
+            for i, (x, y) in enumerate(places)
+        )
+    return tuple(
+        RsuInfo(
+            rsu_id=unit.id,
+            position=np.array(unit.position, dtype=np.float64),
+            quaternion=quaternion_from_yaw(math.radians(unit.yaw_deg)),
+            network=unit.network,
+            stamp_ns=scenario.start_ns,
+        )
+        for unit in scenario.rsus.units
+    )
+
+
+def sites_of(rsus: tuple[RsuInfo, ...], seed: int, vue_id: str) -> Sites:
+    """The RSUs as one device meets them: places and noise streams."""
+    rotations = np.empty((len(rsus), 3, 3))
+    for i, rsu in enumerate(rsus):
+        yaw = float(yaw_from_quaternion(rsu.quaternion))
+        c, s = math.cos(yaw), math.sin(yaw)
+        rotations[i] = [[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]
+    return Sites(
+        position=np.array([rsu.position for rsu in rsus]),
+        rotation=rotations,
+        noise_key=np.array([stream_key(seed, f"{r.rsu_id}/{vue_id}/noise") for r in rsus]),
+        sight_key=np.array([stream_key(seed, f"{r.rsu_id}/{vue_id}/sight") for r in rsus]),
+    )
+
+
+def sight_of(scenario: Scenario, device: Device) -> Sight:
+    """Who may hear the device."""
+    los = scenario.measurement.los
+    return Sight(
+        nearest=scenario.measurement.nearest,
+        max_distance_m=los.max_distance_m or math.inf,
+        buildings=buildings_of(scenario),
+        model=los_model_number(los.probability),
+        correlation_m=los.correlation_distance_m,
+        device_height_m=device.antenna_height_m,
+    )
+
+
+def errors_of(scenario: Scenario) -> Errors:
+    """Variances of the measurements."""
+    errors = scenario.measurement.errors
+    if isinstance(errors, FixedErrors):
+        sds = [
+            math.radians(errors.azimuth_sd_deg or 0.0),
+            math.radians(errors.elevation_sd_deg or 0.0),
+            errors.toa_sd_s or 0.0,
+            errors.range_sd_m or 0.0,
+        ]
+        return Errors(
+            fixed=np.square(sds),
+            with_elevation=False,
+            snr_at_0_db_loss=0.0,
+            path_loss=np.zeros(5),
+            second_moment=np.zeros((3, 3)),
+            rms_bandwidth_hz=0.0,
+            half_view_rad=math.pi,
+            tx_power_dbm=0.0,
+        )
+    waveform, array = errors.waveform, errors.array
+    return Errors(
+        fixed=np.zeros(4),
+        with_elevation="elevation" in scenario.measurement.quantities,
+        snr_at_0_db_loss=array.count * waveform.energy_snr_at_0_db_loss,
+        path_loss=errors.path_loss.coefficients(waveform.carrier_hz),
+        second_moment=array.second_moment(),
+        rms_bandwidth_hz=waveform.rms_bandwidth_hz,
+        half_view_rad=array.half_view_rad,
+        tx_power_dbm=waveform.tx_power_dbm,
+    )

@@ -1,0 +1,315 @@
+"""What a scenario file may say. Unknown keys are refused; every physical key carries its unit."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from netpos.inertial.imu import ImuModel, MagnetometerModel, interval_ns
+from netpos.radio.arrays import AntennaArray
+from netpos.radio.clocks import ClockModel
+from netpos.radio.noise import generator
+from netpos.radio.propagation import UMA_HIGHEST_DEVICE_M, LosModel, PathLoss
+from netpos.radio.waveform import Waveform
+from netpos.world.maps import METIS_MADRID
+from netpos.world.motion import Motion, follow
+from netpos.world.routes import random_route, rectangle
+
+Array = npt.NDArray[np.float64]
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Place = tuple[Finite, Finite]
+Quantity = Literal["azimuth", "elevation", "toa", "range"]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+
+NS = 1_000_000_000
+
+
+class Section(BaseModel):
+    """A part of a scenario: frozen, no unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Building(Section):
+    """A rectangle that blocks the line of sight."""
+
+    x_min: Finite
+    y_min: Finite
+    x_max: Finite
+    y_max: Finite
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if not (self.x_min < self.x_max and self.y_min < self.y_max):
+            raise ValueError("a building needs x_min < x_max and y_min < y_max")
+        return self
+
+
+class World(Section):
+    """``metis_madrid``: the 4 x 4 grid of fokin2020. ``open``: only the buildings listed."""
+
+    map: Literal["metis_madrid", "open"] = "open"
+    buildings: tuple[Building, ...] = ()
+
+
+class RsuUnit(Section):
+    """One RSU; ``yaw_deg`` turns its boresight (x axis) counter-clockwise from east."""
+
+    id: Name
+    position: tuple[Finite, Finite, Finite]
+    yaw_deg: Finite = 0.0
+    network: str = ""
+
+
+class Rsus(Section):
+    """``metis_madrid``: every 60 m along the streets (maps.StreetGrid.lamp_posts). ``list``: the
+    units listed."""
+
+    layout: Literal["metis_madrid", "list"] = "list"
+    units: tuple[RsuUnit, ...] = ()
+    height_m: Finite = 0.0
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.layout == "list" and not self.units:
+            raise ValueError("layout 'list' needs at least one entry in units")
+        if self.layout != "list" and self.units:
+            raise ValueError(f"layout {self.layout!r} places the RSUs itself; remove units")
+        ids = [unit.id for unit in self.units]
+        twice = sorted({i for i in ids if ids.count(i) > 1})
+        if twice:
+            raise ValueError(f"RSU ids must be unique, used more than once: {', '.join(twice)}")
+        return self
+
+
+class LineOfSight(Section):
+    """Who may hear a beacon. Buildings of the world always block.
+
+    ``max_distance_m`` is fokin2020's d_los (plane distance; absent: no limit). ``probability``
+    draws the state by ITU-R M.2412 once per (seed, RSU, device) as a field over the plane with the
+    given correlation distance."""
+
+    max_distance_m: Positive | None = None
+    probability: LosModel | None = None
+    correlation_distance_m: Positive = 50.0
+
+
+class FixedErrors(Section):
+    """Constant standard deviations of the measurements."""
+
+    model: Literal["fixed"] = "fixed"
+    azimuth_sd_deg: Positive | None = None
+    elevation_sd_deg: Positive | None = None
+    toa_sd_s: Positive | None = None
+    range_sd_m: Positive | None = None
+
+
+class CramerRaoErrors(Section):
+    """Variances are the Cramér-Rao bounds at the RSU's distance."""
+
+    model: Literal["cramer_rao"]
+    array: AntennaArray = AntennaArray()
+    waveform: Waveform = Waveform()
+    path_loss: PathLoss = PathLoss()
+
+
+class Measurement(Section):
+    """What the RSUs measure of each beacon; the ``nearest`` RSUs with a line of sight report
+    it."""
+
+    quantities: tuple[Quantity, ...] = ("azimuth", "toa")
+    nearest: int = Field(default=2, ge=1)
+    los: LineOfSight = LineOfSight()
+    errors: Annotated[FixedErrors | CramerRaoErrors, Field(discriminator="model")]
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if not self.quantities or len(set(self.quantities)) < len(self.quantities):
+            raise ValueError(
+                "quantities must name each of azimuth, elevation, toa, range at most once"
+            )
+        if isinstance(self.errors, FixedErrors):
+            keys = {
+                "azimuth": "azimuth_sd_deg",
+                "elevation": "elevation_sd_deg",
+                "toa": "toa_sd_s",
+                "range": "range_sd_m",
+            }
+            for quantity in self.quantities:
+                if getattr(self.errors, keys[quantity]) is None:
+                    raise ValueError(
+                        f"errors.{keys[quantity]} is missing: {quantity} is among the quantities"
+                    )
+        elif "elevation" in self.quantities and self.errors.array.rows < 2:
+            raise ValueError("elevation needs an array with at least 2 rows")
+        return self
+
+
+class RandomRoute(Section):
+    """fokin2020 section 2.4: random turns on the METIS grid."""
+
+    kind: Literal["metis_random"]
+    max_crossings: int = Field(default=6, ge=1)
+    corner_radius_m: NotNegative = Field(default=0.0, lt=METIS_MADRID.block_m / 2)
+
+    @property
+    def pauses_s(self) -> tuple[float, ...]:
+        """A random route never stops."""
+        return ()
+
+    def waypoints(self, rng: np.random.Generator) -> Array:
+        """(n, 2) m."""
+        return random_route(METIS_MADRID, rng, self.max_crossings)
+
+
+class WaypointRoute(Section):
+    """Straight lines between way-points; ``pauses_s`` one per way-point."""
+
+    kind: Literal["waypoints"]
+    points: tuple[Place, ...] = Field(min_length=2)
+    corner_radius_m: NotNegative = 0.0
+    pauses_s: tuple[NotNegative, ...] = ()
+
+    def waypoints(self, rng: np.random.Generator) -> Array:
+        """(n, 2) m."""
+        return np.array(self.points)
+
+
+class RectangleRoute(Section):
+    """Once or more round a rectangle, counter-clockwise from its lower left corner."""
+
+    kind: Literal["rectangle"]
+    corner: Place = (0.0, 0.0)
+    width_m: Positive
+    height_m: Positive
+    laps: int = Field(default=1, ge=1)
+    corner_radius_m: NotNegative = 0.0
+    pauses_s: tuple[NotNegative, ...] = ()
+
+    def waypoints(self, rng: np.random.Generator) -> Array:
+        """(n, 2) m."""
+        return rectangle(self.corner, self.width_m, self.height_m, laps=self.laps)
+
+
+Route = Annotated[RandomRoute | WaypointRoute | RectangleRoute, Field(discriminator="kind")]
+
+
+class Device(Section):
+    """One device, or ``count`` devices with the same settings and draws of their own."""
+
+    count: int = Field(default=1, ge=1)
+    route: Route
+    speed_mps: Positive
+    acceleration_mps2: Positive | None = None
+    antenna_height_m: Finite = 0.0
+    beacon_interval_s: Positive
+    ground_truth_rate_hz: Positive | None = None
+    clock: ClockModel = ClockModel()
+    imu: ImuModel | None = None
+    magnetometer: MagnetometerModel | None = None
+    initial_pose_sd_m: Positive | None = None
+
+    @property
+    def beacon_interval_ns(self) -> int:
+        """Beacon interval [integer ns]."""
+        return round(self.beacon_interval_s * NS)
+
+    def motion(self, seed: int, vue_id: str) -> Motion:
+        """The true motion; a random route is drawn from the stream ``<vue>/route``."""
+        return follow(
+            self.route.waypoints(generator(seed, f"{vue_id}/route")),
+            self.speed_mps,
+            corner_radius_m=self.route.corner_radius_m,
+            acceleration_mps2=self.acceleration_mps2,
+            pauses_s=self.route.pauses_s,
+        )
+
+    @model_validator(mode="after")
+    def _drivable(self) -> Self:
+        if self.beacon_interval_ns < 1:
+            raise ValueError("beacon_interval_s must be at least 1e-9")
+        sensors = [sensor for sensor in (self.imu, self.magnetometer) if sensor is not None]
+        for rate in [sensor.rate_hz for sensor in sensors]:
+            interval_ns(rate)
+        if self.ground_truth_rate_hz is not None:
+            interval_ns(self.ground_truth_rate_hz)
+        smooth = self.motion(0, "vue_1").smooth
+        if isinstance(self.route, RandomRoute):
+            smooth = self.route.corner_radius_m > 0
+        if self.imu and not smooth:
+            raise ValueError(
+                "an imu needs a motion without jumps: give the route a corner_radius_m > 0, or "
+                "pauses_s to turn in at its corners, and pauses an acceleration_mps2"
+            )
+        return self
+
+
+class Scenario(Section):
+    """A whole run. ``max_duration_s`` ends it before the routes do; absent: each device runs to
+    the end of its route.
+
+    Network time starts at ``start_s`` (the first stamp; not 0, which ROS reads as "no time").
+    ``tracker`` holds parameter overrides for the tracker and is not interpreted here.
+    """
+
+    name: str
+    description: str = ""
+    seed: int = Field(default=1, ge=0)
+    start_s: Positive = 1.0
+    max_duration_s: Positive | None = None
+    world: World = World()
+    rsus: Rsus
+    measurement: Measurement
+    devices: tuple[Device, ...] = Field(min_length=1)
+    tracker: dict[str, Any] = {}
+
+    @property
+    def start_ns(self) -> int:
+        """First stamp [integer ns]."""
+        return round(self.start_s * NS)
+
+    @property
+    def vue_ids(self) -> tuple[str, ...]:
+        """Device names in order: vue_1, vue_2, ..."""
+        return tuple(f"vue_{i + 1}" for i in range(sum(d.count for d in self.devices)))
+
+    @property
+    def each_device(self) -> tuple[tuple[str, Device], ...]:
+        """(name, settings) of every single device."""
+        settings = [d for d in self.devices for _ in range(d.count)]
+        return tuple(zip(self.vue_ids, settings, strict=True))
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first stamp to the end of the last device's run [s]."""
+        longest = max(device.motion(self.seed, vue).duration_s for vue, device in self.each_device)
+        return min(longest, self.max_duration_s or math.inf)
+
+    @model_validator(mode="after")
+    def _heights_known(self) -> Self:
+        highest = max(d.antenna_height_m for d in self.devices)
+        if self.measurement.los.probability and highest > UMA_HIGHEST_DEVICE_M:
+            raise ValueError(
+                f"los.probability needs antenna_height_m of at most {UMA_HIGHEST_DEVICE_M}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _maps_agree(self) -> Self:
+        random = any(isinstance(d.route, RandomRoute) for d in self.devices)
+        if self.world.map != "metis_madrid" and (random or self.rsus.layout == "metis_madrid"):
+            raise ValueError(
+                "route metis_random and rsus.layout metis_madrid need world.map metis_madrid"
+            )
+        if self.world.map == "metis_madrid" and self.world.buildings:
+            raise ValueError(
+                "world.map metis_madrid has its own buildings; remove world.buildings"
+            )
+        return self

@@ -1,0 +1,286 @@
+"""The one simulator: the nodes and the offline runner draw the same values from it.
+
+All stamps lie on an integer nanosecond grid that starts at the scenario's ``start_s``. Per device
+and stamp the order is: initial pose, ground truth, true clock, IMU, magnetometer, beacon."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from netpos.inertial.imu import NS, ImuSamples, interval_ns, simulate_imu, simulate_magnetometer
+from netpos.messages.values import (
+    Beacon,
+    ClockState,
+    Field,
+    ImuSample,
+    InitialPose,
+    MagneticSample,
+    Odometry,
+    RsuInfo,
+    RsuMeasurement,
+)
+from netpos.radio.clocks import simulate_clock
+from netpos.radio.measure import AZIMUTH, ELEVATION, RANGE, TOA, Observations, observe
+from netpos.radio.noise import generator
+from netpos.scenario.build import errors_of, rsus_of, sight_of, sites_of
+from netpos.scenario.schema import Device, Scenario
+from netpos.world.frames import quaternion_from_yaw
+
+Array = npt.NDArray[np.float64]
+Stamps = npt.NDArray[np.int64]
+Event = Odometry | ClockState | Beacon | ImuSample | MagneticSample | InitialPose
+
+_FIELDS = {
+    "azimuth": Field.AZIMUTH,
+    "elevation": Field.ELEVATION,
+    "toa": Field.TOA,
+    "range": Field.RANGE,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Beacons:
+    """All beacons of a device: stamp_ns (n,), antenna position (n, 3) m, velocity (n, 2) m/s,
+    clock offset (n,) s, drift (n,) s/s."""
+
+    stamp_ns: Stamps
+    position: Array
+    velocity: Array
+    clock_offset_s: Array
+    clock_drift: Array
+
+
+class Simulation:
+    """A scenario come to life; every method may be called again and gives the same values."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        self.rsus: tuple[RsuInfo, ...] = rsus_of(scenario)
+        """The RSUs, in the order of ``Observations.rsu``."""
+        self._errors = errors_of(scenario)
+        self._fields = Field(sum(_FIELDS[q] for q in scenario.measurement.quantities))
+        self._vues = {
+            vue: _Vue(scenario, vue, device, self.rsus) for vue, device in scenario.each_device
+        }
+
+    def events(self) -> Iterator[Event]:
+        """Everything the devices emit, in time order."""
+        streams = [s for vue in self._vues.values() for s in vue.streams()]
+        return heapq.merge(*streams, key=lambda event: event.stamp_ns)
+
+    def measure(self, beacon: Beacon) -> list[RsuMeasurement]:
+        """What the RSUs report of a beacon, nearest RSU first; ``expected`` is their number.
+
+        Raises
+        ------
+        ValueError  unknown device, or a position, clock offset or stamp that is not finite or
+            negative
+        """
+        vue = self._vues.get(beacon.vue_id)
+        if vue is None:
+            raise ValueError(
+                f"beacon of unknown device {beacon.vue_id!r}; scenario {self.scenario.name} has "
+                f"{', '.join(self._vues)}"
+            )
+        position = np.asarray(beacon.position, dtype=np.float64).reshape(1, 3)
+        what = f"beacon {beacon.sequence} of {beacon.vue_id}"
+        if not (np.isfinite(position).all() and np.isfinite(beacon.clock_offset_s)):
+            raise ValueError(f"{what} has a position or clock offset that is not finite")
+        if not 0 < beacon.stamp_ns < 2**63:
+            raise ValueError(f"{what} has no valid stamp: {beacon.stamp_ns} ns")
+        seen = observe(
+            np.array([beacon.stamp_ns], dtype=np.int64),
+            position,
+            np.array([beacon.clock_offset_s]),
+            vue.sites,
+            vue.sight,
+            self._errors,
+        )
+        return [self._measurement(beacon, seen, j) for j in range(int(seen.heard_by[0]))]
+
+    def warm_up(self) -> None:
+        """Compile the measurement kernel, so that the first beacon does not wait for it."""
+        vue = next(iter(self._vues.values()))
+        observe(
+            np.zeros(0, dtype=np.int64),
+            np.zeros((0, 3)),
+            np.zeros(0),
+            vue.sites,
+            vue.sight,
+            self._errors,
+        )
+
+    def beacons(self, vue_id: str) -> Beacons:
+        """All beacons of a device as arrays; the same values as in ``events``."""
+        return self._vues[vue_id].beacons
+
+    def observations(self, vue_id: str) -> Observations:
+        """All measurements of a device as arrays; the same values as of ``measure``. For many runs
+        this is the fast way."""
+        vue = self._vues[vue_id]
+        b = vue.beacons
+        seen: Observations = observe(
+            b.stamp_ns, b.position, b.clock_offset_s, vue.sites, vue.sight, self._errors
+        )
+        return seen
+
+    def initial_pose(self, vue_id: str) -> InitialPose | None:
+        """The position handed to the tracker, where the scenario asks for one."""
+        return self._vues[vue_id].initial_pose
+
+    def _measurement(self, beacon: Beacon, seen: Observations, j: int) -> RsuMeasurement:
+        value, variance, fields = seen.values[0, j], seen.variances[0, j], self._fields
+        masked = np.array([bool(fields & f) for f in _FIELDS.values()])
+        value, variance = np.where(masked, value, 0.0), np.where(masked, variance, 0.0)
+        return RsuMeasurement(
+            stamp_ns=beacon.stamp_ns,
+            rsu_id=self.rsus[int(seen.rsu[0, j])].rsu_id,
+            vue_id=beacon.vue_id,
+            sequence=beacon.sequence,
+            expected=int(seen.heard_by[0]),
+            fields=fields,
+            rssi_dbm=float(seen.rssi_dbm[0, j]),
+            azimuth_rad=float(value[AZIMUTH]),
+            azimuth_var=float(variance[AZIMUTH]),
+            elevation_rad=float(value[ELEVATION]),
+            elevation_var=float(variance[ELEVATION]),
+            toa_s=float(value[TOA]),
+            toa_var=float(variance[TOA]),
+            range_m=float(value[RANGE]),
+            range_var=float(variance[RANGE]),
+        )
+
+
+class _Vue:
+    """One device of a simulation."""
+
+    def __init__(
+        self, scenario: Scenario, vue_id: str, device: Device, rsus: tuple[RsuInfo, ...]
+    ) -> None:
+        self._vue_id = vue_id
+        self._device = device
+        self._seed = scenario.seed
+        self._start_ns = scenario.start_ns
+        self._motion = device.motion(scenario.seed, vue_id)
+        limit_s = scenario.max_duration_s or self._motion.duration_s
+        self._duration_ns = int(min(limit_s, self._motion.duration_s) * NS)
+        self.sites = sites_of(rsus, scenario.seed, vue_id)
+        self.sight = sight_of(scenario, device)
+
+    def _grid(self, step_ns: int) -> Stamps:
+        return np.arange(self._duration_ns // step_ns + 1, dtype=np.int64) * step_ns
+
+    @cached_property
+    def beacons(self) -> Beacons:
+        elapsed = self._grid(self._device.beacon_interval_ns)
+        state = self._motion.at(elapsed / NS)
+        stamps = self._start_ns + elapsed
+        offset, drift = simulate_clock(self._device.clock, stamps, self._seed, self._vue_id)
+        height = np.full(len(stamps), self._device.antenna_height_m)
+        return Beacons(
+            stamp_ns=stamps,
+            position=np.column_stack([state.position, height]),
+            velocity=state.velocity,
+            clock_offset_s=offset,
+            clock_drift=drift,
+        )
+
+    @cached_property
+    def initial_pose(self) -> InitialPose | None:
+        sd = self._device.initial_pose_sd_m
+        if sd is None:
+            return None
+        error = sd * generator(self._seed, f"{self._vue_id}/initial_pose").standard_normal(2)
+        return InitialPose(
+            stamp_ns=self._start_ns,
+            vue_id=self._vue_id,
+            position=self.beacons.position[0] + np.array([*error, 0.0]),
+            cov=np.diag([sd**2, sd**2, 0.0]),
+        )
+
+    def streams(self) -> list[Iterator[Event]]:
+        pose = self.initial_pose
+        first: Iterator[Event] = iter([pose] if pose else [])
+        streams = [first, self._truth(), self._clock()]
+        if self._device.imu:
+            streams.append(self._imu())
+        if self._device.magnetometer:
+            streams.append(self._magnetometer())
+        return [*streams, self._beacons()]
+
+    def _truth(self) -> Iterator[Event]:
+        elapsed = self._grid(self._device.beacon_interval_ns)
+        if self._device.ground_truth_rate_hz:
+            elapsed = np.union1d(
+                elapsed, self._grid(interval_ns(self._device.ground_truth_rate_hz))
+            )
+        state = self._motion.at(elapsed / NS)
+        quaternions = quaternion_from_yaw(state.yaw)
+        speed = np.hypot(state.velocity[:, 0], state.velocity[:, 1])
+        for i, stamp in enumerate((self._start_ns + elapsed).tolist()):
+            yield Odometry(
+                stamp_ns=stamp,
+                vue_id=self._vue_id,
+                position=np.array([*state.position[i], self._device.antenna_height_m]),
+                quaternion=quaternions[i],
+                linear_velocity=np.array([speed[i], 0.0, 0.0]),
+                angular_velocity=np.array([0.0, 0.0, state.yaw_rate[i]]),
+            )
+
+    def _clock(self) -> Iterator[Event]:
+        b = self.beacons
+        for i, stamp in enumerate(b.stamp_ns.tolist()):
+            yield ClockState(
+                stamp_ns=stamp,
+                vue_id=self._vue_id,
+                offset_s=float(b.clock_offset_s[i]),
+                drift=float(b.clock_drift[i]),
+            )
+
+    def _imu(self) -> Iterator[Event]:
+        assert self._device.imu is not None
+        imu: ImuSamples = simulate_imu(
+            self._device.imu, self._motion, self._start_ns, self._seed, self._vue_id
+        )
+        end_ns = self._start_ns + self._duration_ns
+        for i, stamp in enumerate(imu.stamp_ns[imu.stamp_ns <= end_ns].tolist()):
+            yield ImuSample(
+                stamp_ns=stamp,
+                vue_id=self._vue_id,
+                angular_velocity=imu.angular_velocity[i],
+                specific_force=imu.specific_force[i],
+                angular_velocity_var=imu.angular_velocity_var,
+                specific_force_var=imu.specific_force_var,
+            )
+
+    def _magnetometer(self) -> Iterator[Event]:
+        model = self._device.magnetometer
+        assert model is not None
+        stamps, fields = simulate_magnetometer(
+            model, self._motion, self._start_ns, self._seed, self._vue_id
+        )
+        end_ns = self._start_ns + self._duration_ns
+        for i, stamp in enumerate(stamps[stamps <= end_ns].tolist()):
+            yield MagneticSample(
+                stamp_ns=stamp,
+                vue_id=self._vue_id,
+                magnetic_field=fields[i],
+                magnetic_field_var=model.noise_sd_t**2,
+            )
+
+    def _beacons(self) -> Iterator[Event]:
+        b = self.beacons
+        for i, stamp in enumerate(b.stamp_ns.tolist()):
+            yield Beacon(
+                stamp_ns=stamp,
+                vue_id=self._vue_id,
+                sequence=i,
+                position=b.position[i],
+                clock_offset_s=float(b.clock_offset_s[i]),
+            )

@@ -1,0 +1,2 @@
+"""Where things are and how they move: maps, lines of sight, routes, motion, frames. Metres in map
+(east, north, up)."""

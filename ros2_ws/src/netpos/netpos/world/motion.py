@@ -1,0 +1,293 @@
+"""Exact plane motion along way-points: straight lines, circular corners, speed ramps, pauses.
+
+A motion is a list of pieces. Within one piece curvature and tangential acceleration are constant,
+so that position, velocity, acceleration, heading and yaw rate have closed forms and no step of any
+integrator enters the truth."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+_STRAIGHT_RAD = 1e-9  # a bend below this is no corner
+_TIME_TOLERANCE_S = 1e-9  # stamps are whole nanoseconds
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Kinematics:
+    """State of motion at n instants: position, velocity, acceleration (n, 2) in map; yaw, yaw_rate
+    (n,) rad, rad/s."""
+
+    position: Array
+    velocity: Array
+    acceleration: Array
+    yaw: Array
+    yaw_rate: Array
+
+
+@dataclass(frozen=True, slots=True)
+class _Segment:
+    """A stretch of constant curvature."""
+
+    x: float
+    y: float
+    yaw: float
+    curvature: float
+    length: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Piece:
+    """A stretch of constant curvature and tangential acceleration; ``spin`` turns on the spot."""
+
+    start_s: float
+    x: float
+    y: float
+    yaw: float
+    curvature: float
+    speed: float
+    acceleration: float
+    spin: float
+
+
+class Motion:
+    """Motion along way-points, built by ``follow``."""
+
+    def __init__(self, pieces: Sequence[_Piece], duration_s: float, *, smooth: bool) -> None:
+        self.duration_s = duration_s
+        self.smooth = smooth
+        """Whether velocity and heading are continuous, as an inertial sensor needs."""
+        self._start = np.array([p.start_s for p in pieces])
+        self._table = np.array(
+            [(p.x, p.y, p.yaw, p.curvature, p.speed, p.acceleration, p.spin) for p in pieces]
+        )
+
+    def at(self, time_s: npt.ArrayLike) -> Kinematics:
+        """State at times (n,) since the start [s]; at a jump, the state after it.
+
+        Raises
+        ------
+        ValueError  a time is not finite or outside [0, duration_s]
+        """
+        t = np.atleast_1d(np.asarray(time_s, dtype=np.float64))
+        if not ((t >= 0) & (t <= self.duration_s + _TIME_TOLERANCE_S)).all():
+            raise ValueError(
+                f"time must be in [0, {self.duration_s}] s, got {t.min()} to {t.max()}"
+            )
+        k = np.maximum(np.searchsorted(self._start, t, side="right") - 1, 0)
+        x, y, yaw, curvature, speed, acceleration, spin = self._table[k].T
+        tau = t - self._start[k]
+        way = speed * tau + acceleration * tau**2 / 2
+        now = speed + acceleration * tau
+        chord = way * np.sinc(curvature * way / (2 * np.pi))
+        chord_yaw = yaw + curvature * way / 2
+        heading = yaw + curvature * way + spin * tau
+        ahead = np.column_stack([np.cos(heading), np.sin(heading)])
+        left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+        return Kinematics(
+            position=np.column_stack(
+                [x + chord * np.cos(chord_yaw), y + chord * np.sin(chord_yaw)]
+            ),
+            velocity=now[:, None] * ahead,
+            acceleration=acceleration[:, None] * ahead + (curvature * now**2)[:, None] * left,
+            yaw=heading,
+            yaw_rate=curvature * now + spin,
+        )
+
+
+def follow(
+    points: npt.ArrayLike,
+    speed_mps: float,
+    *,
+    corner_radius_m: float = 0.0,
+    acceleration_mps2: float | None = None,
+    pauses_s: Sequence[float] = (),
+) -> Motion:
+    """Motion along way-points at constant speed.
+
+    Parameters
+    ----------
+    points : (n, 2)  way-points in map [m], n >= 2
+    speed_mps : cruising speed
+    corner_radius_m : corners become arcs of this radius; 0 turns on the spot, at once
+    acceleration_mps2 : ramp to and from each pause; None starts and stops at once
+    pauses_s : (n,) standing time at each way-point, or empty. A first or last pause makes the
+        motion start or end at rest;
+        without it the motion starts and ends at cruising speed. During a pause at a corner of
+        radius 0 the body turns evenly.
+
+    Raises
+    ------
+    ValueError  a leg is too short for its corners or ramps, a way-point repeats, a pause lies on
+        an arc, a value is out of range
+    """
+    xy = np.asarray(points, dtype=np.float64)
+    _check(xy, speed_mps, corner_radius_m, acceleration_mps2, pauses_s)
+    pauses = list(pauses_s) or [0.0] * len(xy)
+    runs, bends = _geometry(xy, corner_radius_m, pauses)
+    stops = [i for i in range(len(xy)) if pauses[i] > 0]
+    breaks = sorted({0, len(xy) - 1, *stops})
+    pieces: list[_Piece] = []
+    clock = 0.0
+    for a, b in itertools.pairwise(breaks):
+        segments = [s for leg in runs[a:b] for s in leg]
+        if a == 0 and pauses[0] > 0:
+            first = segments[0]
+            clock = _stand(pieces, clock, (first.x, first.y, first.yaw), 0.0, pauses[0])
+        phases = _phases(
+            sum(s.length for s in segments),
+            speed_mps,
+            acceleration_mps2,
+            ramp_up=pauses[a] > 0,
+            ramp_down=pauses[b] > 0,
+        )
+        clock = _travel(pieces, clock, segments, phases)
+        if pauses[b] > 0:
+            clock = _stand(pieces, clock, _end(segments[-1]), bends[b], pauses[b])
+    sharp = any(abs(bends[i]) > _STRAIGHT_RAD and pauses[i] == 0 for i in range(len(xy)))
+    abrupt = bool(stops) and acceleration_mps2 is None
+    return Motion(pieces, clock, smooth=not (sharp or abrupt))
+
+
+def _check(
+    xy: Array, speed: float, radius: float, acceleration: float | None, pauses: Sequence[float]
+) -> None:
+    if xy.ndim != 2 or xy.shape[1] != 2 or len(xy) < 2 or not np.isfinite(xy).all():
+        raise ValueError(
+            f"a route needs at least two finite way-points (x, y), got shape {xy.shape}"
+        )
+    if not 0 < speed < math.inf:
+        raise ValueError(f"speed_mps must be finite and > 0, got {speed}")
+    if not 0 <= radius < math.inf:
+        raise ValueError(f"corner_radius_m must be finite and >= 0, got {radius}")
+    if acceleration is not None and not 0 < acceleration < math.inf:
+        raise ValueError(f"acceleration_mps2 must be finite and > 0, got {acceleration}")
+    if pauses and len(pauses) != len(xy):
+        raise ValueError(f"pauses_s needs one value per way-point ({len(xy)}), got {len(pauses)}")
+    if not all(0 <= p < math.inf for p in pauses):
+        raise ValueError(f"pauses_s must be finite and >= 0, got {list(pauses)}")
+    repeated = np.flatnonzero((np.diff(xy, axis=0) == 0).all(axis=1))
+    if repeated.size:
+        raise ValueError(
+            f"way-points {repeated[0]} and {repeated[0] + 1} are the same place; "
+            "to stand there use pauses_s"
+        )
+
+
+def _geometry(
+    xy: Array, radius: float, pauses: Sequence[float]
+) -> tuple[list[list[_Segment]], list[float]]:
+    """Segments of every leg (its straight, then the arc at its end), and the turn left at each
+    way-point."""
+    leg = np.diff(xy, axis=0)
+    length = np.hypot(leg[:, 0], leg[:, 1])
+    yaw = np.arctan2(leg[:, 1], leg[:, 0])
+    turn = np.zeros(len(xy))
+    turn[1:-1] = np.mod(np.diff(yaw) + np.pi, 2 * np.pi) - np.pi
+    cut = np.zeros(len(xy))
+    if radius > 0:
+        bent = np.abs(turn) > _STRAIGHT_RAD
+        for i in np.flatnonzero(bent).tolist():
+            if pauses[i] > 0:
+                raise ValueError(
+                    f"way-point {i} is a rounded corner, where no pause is possible; "
+                    "set corner_radius_m to 0"
+                )
+        cut[bent] = radius * np.tan(np.abs(turn[bent]) / 2)
+    runs: list[list[_Segment]] = []
+    for i in range(len(leg)):
+        straight = length[i] - cut[i] - cut[i + 1]
+        if straight < -1e-9:
+            raise ValueError(
+                f"the leg from way-point {i} to {i + 1} ({length[i]:.3f} m) is too short for "
+                f"corner_radius_m {radius}; its corners need {cut[i] + cut[i + 1]:.3f} m"
+            )
+        ahead = leg[i] / length[i]
+        x, y = xy[i] + ahead * cut[i]
+        run = [_Segment(x, y, yaw[i], 0.0, straight)] if straight > 1e-9 else []
+        if cut[i + 1] > 0:
+            x, y = xy[i + 1] - ahead * cut[i + 1]
+            run.append(
+                _Segment(
+                    x, y, yaw[i], math.copysign(1 / radius, turn[i + 1]), radius * abs(turn[i + 1])
+                )
+            )
+        runs.append(run)
+    return runs, [0.0 if c > 0 else float(t) for c, t in zip(cut, turn, strict=True)]
+
+
+def _phases(
+    length: float, speed: float, acceleration: float | None, *, ramp_up: bool, ramp_down: bool
+) -> list[tuple[float, float, float]]:
+    """(distance, speed at its start, acceleration) of ramp up, cruise and ramp down."""
+    if acceleration is None or not (ramp_up or ramp_down):
+        return [(length, speed, 0.0)]
+    ramp = speed**2 / (2 * acceleration)
+    ramps = ramp_up + ramp_down
+    if ramps * ramp > length:
+        if ramps == 1:
+            raise ValueError(
+                f"a leg of {length:.3f} m is too short to ramp between 0 and {speed} m/s at "
+                f"{acceleration} m/s^2; raise acceleration_mps2"
+            )
+        ramp = length / 2
+    peak = math.sqrt(2 * acceleration * ramp)
+    phases = [(ramp, 0.0, acceleration)] if ramp_up else []
+    if length > ramps * ramp:
+        phases.append((length - ramps * ramp, peak, 0.0))
+    return phases + ([(ramp, peak, -acceleration)] if ramp_down else [])
+
+
+def _travel(
+    pieces: list[_Piece],
+    clock: float,
+    segments: Sequence[_Segment],
+    phases: Sequence[tuple[float, float, float]],
+) -> float:
+    """Append the pieces of a run: cut where the segment or the phase changes. Returns the time at
+    its end."""
+    segment_ends = np.cumsum([s.length for s in segments])
+    phase_ends = np.cumsum([p[0] for p in phases])
+    phase_ends[-1] = segment_ends[-1]
+    cuts = np.unique(np.concatenate([[0.0], segment_ends, phase_ends]))
+    for low, high in itertools.pairwise(cuts):
+        middle = (low + high) / 2
+        i = int(np.searchsorted(segment_ends, middle))
+        j = int(np.searchsorted(phase_ends, middle))
+        segment, (distance, speed, acceleration) = segments[i], phases[j]
+        into_phase = low - (phase_ends[j] - distance)
+        here = math.sqrt(max(speed**2 + 2 * acceleration * into_phase, 0.0))
+        there = math.sqrt(max(here**2 + 2 * acceleration * (high - low), 0.0))
+        x, y, yaw = _along(segment, low - (segment_ends[i] - segment.length))
+        pieces.append(_Piece(clock, x, y, yaw, segment.curvature, here, acceleration, 0.0))
+        clock += 2 * (high - low) / (here + there)
+    return clock
+
+
+def _stand(
+    pieces: list[_Piece], clock: float, pose: tuple[float, float, float], turn: float, pause: float
+) -> float:
+    pieces.append(_Piece(clock, *pose, 0.0, 0.0, 0.0, turn / pause))
+    return clock + pause
+
+
+def _along(segment: _Segment, way: float) -> tuple[float, float, float]:
+    """x, y, yaw after a way along a segment."""
+    half = segment.curvature * way / 2
+    chord = way * float(np.sinc(half / np.pi))
+    return (
+        segment.x + chord * math.cos(segment.yaw + half),
+        segment.y + chord * math.sin(segment.yaw + half),
+        segment.yaw + 2 * half,
+    )
+
+
+def _end(segment: _Segment) -> tuple[float, float, float]:
+    return _along(segment, segment.length)

@@ -1,0 +1,119 @@
+"""NEES, its bounds and the effective number of epochs against closed forms and simulation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from netpos.evaluation.consistency import (
+    chi2_mean_bounds,
+    effective_size,
+    nees,
+    nees_test,
+    nis_test,
+)
+from netpos.messages.values import Array
+from scipy.special import gammainc
+from scipy.stats import chi2
+
+
+def autoregressive(rng: np.random.Generator, n: int, phi: float) -> Array:
+    """Unit-variance AR(1) series."""
+    x = np.empty(n)
+    x[0] = rng.normal()
+    for k in range(1, n):
+        x[k] = phi * x[k - 1] + np.sqrt(1 - phi**2) * rng.normal()
+    return x
+
+
+def test_nees_of_a_diagonal_covariance_is_the_sum_of_squared_ratios() -> None:
+    error, sd = np.array([[3.0, -4.0]]), np.array([1.5, 2.0])
+    values, usable = nees(error, np.diag(sd**2)[None])
+    np.testing.assert_allclose(values, [8.0])
+    assert usable.tolist() == [True]
+
+
+def test_nees_does_not_depend_on_the_axes() -> None:
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    error, cov = np.array([1.0, 2.0]), np.array([[2.0, 0.5], [0.5, 1.0]])
+    plain, _ = nees(error[None], cov[None])
+    turned, _ = nees((turn @ error)[None], (turn @ cov @ turn.T)[None])
+    np.testing.assert_allclose(turned, plain, rtol=1e-12)
+
+
+def test_unusable_covariances_give_no_nees() -> None:
+    cov = np.array([np.eye(2), np.zeros((2, 2)), -np.eye(2), np.full((2, 2), np.nan)])
+    values, usable = nees(np.ones((4, 2)), cov)
+    assert usable.tolist() == [True, False, False, False]
+    np.testing.assert_allclose(values, [2.0])
+
+
+@pytest.mark.parametrize("n", [1, 10, 500])
+def test_bounds_of_two_degrees_leave_2_5_percent_on_each_side(n: int) -> None:
+    """Chi-square with 2 n degrees is distributed as the regularised gamma function."""
+    low, high = chi2_mean_bounds(2.0, n)
+    np.testing.assert_allclose(gammainc(n, n * low / 2), 0.025, rtol=1e-9)
+    np.testing.assert_allclose(gammainc(n, n * high / 2), 0.975, rtol=1e-9)
+
+
+def test_bounds_of_one_sample_have_a_closed_form() -> None:
+    """With 2 degrees of freedom the quantile is -2 ln(1 - p)."""
+    np.testing.assert_allclose(
+        chi2_mean_bounds(2.0, 1), [-2 * np.log(0.975), -2 * np.log(0.025)], rtol=1e-12
+    )
+
+
+def test_independent_values_keep_their_number() -> None:
+    values = chi2.rvs(2, size=4000, random_state=5)
+    assert effective_size(values) > 3200
+
+
+@pytest.mark.parametrize("phi", [0.5, 0.9])
+def test_effective_size_of_an_autoregressive_series(phi: float) -> None:
+    """Integrated autocorrelation time of AR(1): (1 + phi) / (1 - phi)."""
+    n = 40_000
+    series = autoregressive(np.random.default_rng(11), n, phi)
+    np.testing.assert_allclose(effective_size(series) / n, (1 - phi) / (1 + phi), rtol=0.15)
+
+
+@pytest.mark.parametrize("series", [[4.0], [4.0, 4.0, 4.0], [0.0, 0.0]])
+def test_a_constant_series_is_one_sample(series: list[float]) -> None:
+    assert effective_size(np.array(series)) == 1.0
+
+
+def test_effective_size_needs_a_sample() -> None:
+    with pytest.raises(ValueError, match="at least one sample"):
+        effective_size(np.zeros(0))
+
+
+def test_correlated_but_honest_errors_pass_at_about_the_nominal_rate() -> None:
+    """200 runs of 400 epochs with AR(1) errors and the right covariance: about 95 % pass."""
+    rng = np.random.default_rng(2)
+    passed = 0
+    for _ in range(200):
+        error = np.column_stack([autoregressive(rng, 400, 0.8) for _ in range(2)])
+        result = nees_test(np.sum(error**2, axis=1), dof=2)
+        assert result is not None
+        passed += result.consistent
+    assert 0.85 <= passed / 200 <= 0.99
+
+
+@pytest.mark.parametrize("factor", [0.25, 4.0])
+def test_a_wrong_covariance_is_noticed(factor: float) -> None:
+    values = chi2.rvs(2, size=500, random_state=1) * factor
+    result = nees_test(values, dof=2)
+    assert result is not None
+    assert not result.consistent
+
+
+def test_nis_of_epochs_with_different_sizes() -> None:
+    """The sum of independent chi-square values has the summed degrees of freedom."""
+    dof = np.array([2.0, 4.0, 4.0])
+    result = nis_test(np.array([1.0, 5.0, 3.0]), dof)
+    assert result is not None
+    assert result.mean == 3.0
+    np.testing.assert_allclose(np.array(result.bounds) * 3, chi2.interval(0.95, 10), rtol=1e-12)
+
+
+def test_nothing_evaluated_is_no_verdict() -> None:
+    assert nees_test(np.zeros(0), dof=2) is None
+    assert nis_test(np.zeros(0), np.zeros(0)) is None

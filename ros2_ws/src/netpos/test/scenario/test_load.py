@@ -1,0 +1,136 @@
+"""Scenario files: what is accepted, and that every complaint names line and key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from netpos.scenario import ScenarioError, load_scenario, scenario_names
+
+GOOD = """\
+seed: 3
+rsus:
+  units:
+    - {id: rsu_1, position: [0.0, 0.0, 0.0]}
+measurement:
+  quantities: [azimuth, toa]
+  errors: {model: fixed, azimuth_sd_deg: 2.0, toa_sd_s: 50e-9}
+devices:
+  - route: {kind: waypoints, points: [[0.0, 5.0], [10.0, 5.0]]}
+    speed_mps: 1.0
+    beacon_interval_s: 0.1
+    clock:
+      drift_sd: 1e-6
+tracker:
+  drift_step_sd: 1e-4
+"""
+
+
+def _write(folder: Path, text: str) -> str:
+    path = folder / "trial.yaml"
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+def test_a_good_file(tmp_path: Path) -> None:
+    scenario = load_scenario(_write(tmp_path, GOOD))
+    assert (scenario.name, scenario.seed, scenario.vue_ids) == ("trial", 3, ("vue_1",))
+    assert scenario.duration_s == pytest.approx(10.0)
+    assert scenario.devices[0].clock.drift_sd == 1e-6
+    assert scenario.tracker == {"drift_step_sd": 1e-4}  # a number, also without a dot
+    assert load_scenario(_write(tmp_path, GOOD), seed=8).seed == 8
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("speed_mps: 1.0", "sped_mps: 1.0", "line 10: devices.0.sped_mps: unknown key"),
+        ("    speed_mps: 1.0\n", "", "line 9: devices.0.speed_mps: is missing"),
+        ("speed_mps: 1.0", "speed_mps: -1.0", "line 10: devices.0.speed_mps: .*got -1.0"),
+        ("speed_mps: 1.0", "speed_mps: .nan", "line 10: devices.0.speed_mps: .*got nan"),
+        ("speed_mps: 1.0", "speed_mps: fast", "line 10: devices.0.speed_mps: .*got 'fast'"),
+        ("drift_sd: 1e-6", "drift_sd: -1", "line 13: devices.0.clock.drift_sd: .*got -1"),
+        ("drift_sd: 1e-6", "drift: 1", "line 13: devices.0.clock.drift: unknown key"),
+        ("azimuth_sd_deg: 2.0, ", "", "line 5: measurement: errors.azimuth_sd_deg is missing"),
+        (
+            "azimuth_sd_deg: 2.0",
+            "azimuth_sd_deg: 0",
+            "line 7: measurement.errors.azimuth_sd_deg: ",
+        ),
+        ("model: fixed", "model: magic", "line 7: measurement.errors: .*magic"),
+        ("kind: waypoints", "kind: metis_random", "line 9: devices.0.route.points: unknown key"),
+        ("[10.0, 5.0]", "[0.0, 5.0]", "line 9: devices.0: .*same place"),
+        ("seed: 3", "seed: 3\nseed: 4", "line 2: seed was given already in line 1"),
+        ("seed: 3", "seed: [3", "line .*not valid YAML"),
+        ("seed: 3", "seed: -3", "line 1: seed: .*got -3"),
+        (
+            "    - {id: rsu_1, position: [0.0, 0.0, 0.0]}\n",
+            "    []\n",
+            "line 2: rsus: layout 'list'",
+        ),
+        ("0.1\n", "0.1\n    imu: {rate_hz: 30}\n", "line 9: devices.0: .*whole nanoseconds"),
+        ("azimuth, toa", "azimuth, azimuth", "line 5: measurement: quantities must name"),
+    ],
+)
+def test_complaints_name_line_and_key(tmp_path: Path, old: str, new: str, complaint: str) -> None:
+    assert old in GOOD
+    with pytest.raises(ScenarioError, match=complaint) as caught:
+        load_scenario(_write(tmp_path, GOOD.replace(old, new, 1)))
+    assert "trial.yaml" in str(caught.value)
+
+
+def test_an_imu_on_a_sharp_corner_is_refused(tmp_path: Path) -> None:
+    text = GOOD.replace("[10.0, 5.0]]", "[10.0, 5.0], [10.0, 9.0]]").replace(
+        "    clock:", "    imu: {}\n    clock:"
+    )
+    with pytest.raises(ScenarioError, match="without jumps"):
+        load_scenario(_write(tmp_path, text))
+    rounded = text.replace("9.0]]}", "9.0]], corner_radius_m: 1.0}")
+    assert load_scenario(_write(tmp_path, rounded)).devices[0].imu is not None
+
+
+def test_empty_missing_and_unknown(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match="a mapping"):
+        load_scenario(_write(tmp_path, ""))
+    with pytest.raises(ScenarioError, match="no scenario file"):
+        load_scenario(str(tmp_path / "absent.yaml"))
+    with pytest.raises(ScenarioError, match=r"no scenario 'absent'; known: .*metis_madrid"):
+        load_scenario("absent")
+
+
+def test_changes_are_validated_too(tmp_path: Path) -> None:
+    path = _write(tmp_path, GOOD)
+    changed = load_scenario(path, changes={"devices.0.beacon_interval_s": 0.01})
+    assert changed.devices[0].beacon_interval_ns == 10_000_000
+    assert load_scenario(path, changes={"measurement.los.max_distance_m": 30}).measurement.los
+    with pytest.raises(ScenarioError, match=r"devices\.0\.speed_mps"):
+        load_scenario(path, changes={"devices.0.speed_mps": 0})
+    with pytest.raises(ScenarioError, match="no such place"):
+        load_scenario(path, changes={"devices.4.speed_mps": 1})
+
+
+def test_a_scenario_cannot_be_altered(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="frozen"):
+        load_scenario(_write(tmp_path, GOOD)).seed = 4  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_every_shipped_scenario_loads(name: str) -> None:
+    assert load_scenario(name).name == name
+    assert load_scenario(name).description
+
+
+def test_metis_interval_is_a_whole_number_of_frames() -> None:
+    assert load_scenario("metis_madrid").devices[0].beacon_interval_ns == 500 * 167_300
+
+
+def test_variants_differ_in_one_value_only() -> None:
+    def plain(name: str) -> dict[str, object]:
+        return load_scenario(name).model_dump(exclude={"name", "description"})
+
+    slow, fast = plain("fast_pass"), plain("fast_pass_100hz")
+    fast["devices"][0]["beacon_interval_s"] = 0.1  # type: ignore[index]
+    assert slow == fast
+    wide, narrow = plain("intersection_turn"), plain("intersection_turn_30m")
+    narrow["measurement"]["los"]["max_distance_m"] = 40.0  # type: ignore[index]
+    assert wide == narrow

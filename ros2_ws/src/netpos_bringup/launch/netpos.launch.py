@@ -1,0 +1,53 @@
+"""Start the graph of a scenario: ``ros2 launch netpos_bringup netpos.launch.py scenario:=metis_madrid``.
+
+For ROS installations that have `launch`; scripts/run_graph.sh does the same with `ros2 run` alone.
+The launch ends when the scenario has ended. With ``bag:=DIR`` the run is recorded.
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandler, TimerAction
+from launch.conditions import IfCondition
+from launch.event_handlers import OnProcessExit
+from launch.events import Shutdown
+from launch.substitutions import LaunchConfiguration, PythonExpression
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+FLUSH_S = 1.0  # the last messages are under way when the simulator ends
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Describe recorder, tracker, RSUs and device; the device's end shuts the rest down."""
+    scenario = {"scenario": ParameterValue(LaunchConfiguration("scenario"), value_type=str)}
+    seed = {"seed": ParameterValue(LaunchConfiguration("seed"), value_type=int)}
+    rate = {"rate": ParameterValue(LaunchConfiguration("rate"), value_type=float)}
+    bag = LaunchConfiguration("bag")
+    vue_sim = Node(package="vue_sim", executable="vue_sim", parameters=[scenario, seed, rate])
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("scenario", description="name of a scenario, or a YAML file"),
+            DeclareLaunchArgument("seed", default_value="-1", description="-1: the scenario's"),
+            DeclareLaunchArgument("rate", default_value="1.0", description="against real time"),
+            DeclareLaunchArgument("bag", default_value="", description="folder of a new recording"),
+            Node(
+                package="netpos_bag",
+                executable="record",
+                arguments=["--output", bag],
+                condition=IfCondition(PythonExpression(["'", bag, "' != ''"])),
+            ),
+            Node(package="ekf_tracker", executable="ekf_tracker", parameters=[scenario]),
+            Node(package="rsu_sensor", executable="rsu_sensor", parameters=[scenario, seed]),
+            vue_sim,
+            RegisterEventHandler(
+                OnProcessExit(
+                    target_action=vue_sim,
+                    on_exit=[
+                        TimerAction(
+                            period=FLUSH_S,
+                            actions=[EmitEvent(event=Shutdown(reason="the scenario has ended"))],
+                        )
+                    ],
+                )
+            ),
+        ]
+    )

@@ -1,0 +1,53 @@
+"""RSU node: hears the beacons of a scenario's devices and publishes what its RSUs measure."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from netpos.messages.topics import BEACON, RSU_INFO, RSU_MEASUREMENTS, of_vue
+from netpos_msgs.msg import Beacon, RsuInfo, RsuMeasurement
+from netpos_node import LATCHED, STREAM, run
+from rclpy.node import Node
+
+from rsu_sensor.conversions import beacon_from_msg, measurement_to_msg, rsu_info_to_msg
+from rsu_sensor.parameters import declare_parameters
+
+
+class RsuSensorNode(Node):
+    """Hosts the RSUs of a scenario, or some of them."""
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__("rsu_sensor", **node_options)
+        self._settings = declare_parameters(self)
+        self._settings.simulation.warm_up()
+        self.refused = 0
+        self._info_pub = self.create_publisher(RsuInfo, RSU_INFO, LATCHED)
+        self._measurement_pub = self.create_publisher(RsuMeasurement, RSU_MEASUREMENTS, STREAM)
+        for rsu in self._settings.simulation.rsus:
+            if rsu.rsu_id in self._settings.rsu_ids:
+                self._info_pub.publish(rsu_info_to_msg(rsu))
+        for vue_id in self._settings.scenario.vue_ids:
+            topic = of_vue(vue_id, BEACON)
+            self.create_subscription(Beacon, topic, self._on_beacon, STREAM)
+        self.get_logger().info(
+            f"{self._settings.scenario.name}: {len(self._settings.rsu_ids)} RSUs listen to "
+            f"{', '.join(self._settings.scenario.vue_ids)}"
+        )
+
+    def _on_beacon(self, msg: Any) -> None:
+        try:
+            measurements = self._settings.simulation.measure(beacon_from_msg(msg))
+        except ValueError as error:
+            self.refused += 1
+            self.get_logger().warning(
+                f"{self.refused} beacons refused: {error}", throttle_duration_sec=2.0
+            )
+            return
+        for measurement in measurements:
+            if measurement.rsu_id in self._settings.rsu_ids:
+                self._measurement_pub.publish(measurement_to_msg(measurement))
+
+
+def main() -> None:
+    """Entry point of ``ros2 run rsu_sensor rsu_sensor``."""
+    run(RsuSensorNode)

@@ -1,0 +1,112 @@
+"""Device node: plays a scenario's devices in real time or a multiple of it."""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+from threading import Thread
+from typing import Any
+
+from netpos.messages.topics import BEACON, CLOCK, split
+from netpos.scenario import Simulation
+from netpos.scenario.offline import timeline
+from netpos_node import STREAM, run
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+
+from vue_sim.conversions import publication, publications
+from vue_sim.parameters import declare_parameters
+
+_CLOCK_DEPTH = 10
+_POLL_S = 0.02
+_DELIVERY_S = 5
+
+
+class VueSimNode(Node):
+    """Publishes the timeline of a ``Simulation``, paced by the wall clock."""
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__("vue_sim", **node_options)
+        self._settings = declare_parameters(self)
+        self._simulation = Simulation(self._settings.scenario)
+        self._pubs = {
+            topic: self.create_publisher(
+                message_class, topic, _CLOCK_DEPTH if topic == CLOCK else STREAM
+            )
+            for topic, message_class in publications(self._settings.scenario).items()
+        }
+
+    def play(self) -> None:
+        """Wait to be heard, publish everything at its time, wait for delivery."""
+        scenario, rate = self._settings.scenario, self._settings.rate
+        self._wait_for_subscribers()
+        self.get_logger().info(
+            f"{scenario.name}, seed {scenario.seed}: {', '.join(scenario.vue_ids)} for "
+            f"{scenario.duration_s:.1f} s at rate {rate:g}"
+        )
+        started_s = time.monotonic()
+        for item in timeline(self._simulation, self._settings.clock_hz):
+            topic, stamp_ns, message = publication(item)
+            _sleep_until(started_s + (stamp_ns - scenario.start_ns) * 1e-9 / rate)
+            if not self.context.ok():
+                return
+            self._pubs[topic].publish(message)
+        for publisher in self._pubs.values():
+            publisher.wait_for_all_acked(Duration(seconds=_DELIVERY_S))
+        self.get_logger().info(f"{scenario.name} is over")
+        while not self._settings.shutdown_at_end and self.context.ok():
+            time.sleep(_POLL_S)
+
+    def _wait_for_subscribers(self) -> None:
+        """Until all beacons are heard and for a while nobody new has subscribed to anything."""
+        started_s = changed_s = time.monotonic()
+        counts: dict[str, int] = {}
+        while self.context.ok():
+            now_s, before = time.monotonic(), counts
+            counts = self._subscriber_counts()
+            if counts != before:
+                changed_s = now_s
+            unheard = [t for t, n in counts.items() if split(t)[1] == BEACON and n == 0]
+            if not unheard and now_s - changed_s >= self._settings.settle_s:
+                return
+            if unheard and now_s - started_s >= self._settings.wait_for_subscribers_s:
+                self.get_logger().warning(
+                    f"nobody subscribes to {', '.join(unheard)}; is rsu_sensor running? "
+                    "Starting anyway"
+                )
+                return
+            time.sleep(_POLL_S)
+
+    def _subscriber_counts(self) -> dict[str, int]:
+        return {topic: pub.get_subscription_count() for topic, pub in self._pubs.items()}
+
+
+def _sleep_until(due_s: float) -> None:
+    left_s = due_s - time.monotonic()
+    if left_s > 0:
+        time.sleep(left_s)
+
+
+def _play(node: Node) -> None:
+    """Play, with the node's services answered by a second thread."""
+    assert isinstance(node, VueSimNode)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    services = Thread(target=_serve, args=[executor])
+    services.start()
+    try:
+        node.play()
+    finally:
+        executor.shutdown()
+        services.join()
+
+
+def _serve(executor: SingleThreadedExecutor) -> None:
+    with suppress(ExternalShutdownException):
+        executor.spin()
+
+
+def main() -> None:
+    """Entry point of ``ros2 run vue_sim vue_sim``."""
+    run(VueSimNode, _play)
