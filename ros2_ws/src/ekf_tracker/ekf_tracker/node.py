@@ -11,6 +11,7 @@ from nav_msgs.msg import Odometry
 from netpos.messages import topics
 from netpos.messages.values import TrackStatus
 from netpos.tracking import Tracker, TrackOutput
+from netpos.tracking.warm_up import warm_up
 from netpos_msgs.msg import ClockState, RsuInfo, RsuMeasurement
 from netpos_msgs.msg import TrackStatus as TrackStatusMsg
 from netpos_node import CODEC, LATCHED, STREAM, run
@@ -32,6 +33,7 @@ class EkfTrackerNode(Node):
     """Feeds a ``Tracker``. All that has arrived is taken at once, RSU descriptions first."""
 
     def __init__(self, **node_options: Any) -> None:
+        warm_up()  # before the node is seen: whoever sees it may count on it
         super().__init__("ekf_tracker", **node_options)
         parameters = declare_parameters(self)
         self._tracker = Tracker(parameters.config)

@@ -1,7 +1,9 @@
 """netpos: positioning of vehicles and pedestrians from the network side.
 
-The library behind the ROS 2 nodes; it imports no ROS. SI units and radians, integer nanoseconds for time.
-Frames follow REP-103 and REP-105: ``map`` is east-north-up, a device's ``base_link`` is forward-left-up.
+The library behind the ROS 2 nodes; it imports no ROS. SI units and radians, integer nanoseconds
+for time.
+Frames follow REP-103 and REP-105: ``map`` is east-north-up, a device's ``base_link`` is forward-
+left-up.
 
 Rooms
 -----

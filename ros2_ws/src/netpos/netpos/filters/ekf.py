@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from netpos.filters.measurement import GATE_VARIANCE, GROUP, VARIANCE, curvature_variance, linearise
+from netpos.filters.measurement import GATE_VARIANCE, GROUP, VARIANCE, curvature_variance,
+linearise
 from netpos.messages.values import Array
 
 
@@ -69,9 +70,11 @@ def fuse(
 
 @njit(cache=True)
 def misfit(mean: Array, cov: Array, rows: Array, variance: Array, height_m: float, x: Array) -> float:
-    """Twice the negative log posterior of ``x`` (n,) but for a constant: prior and measurement terms.
+    """Twice the negative log posterior of ``x`` (n,) but for a constant: prior and measurement
+    terms.
 
-    At the most probable ``x`` of a linear model this is the NIS, chi-square with one degree of freedom
+    At the most probable ``x`` of a linear model this is the NIS, chi-square with one degree of
+    freedom
     per row; unlike the NIS it stays so where the model bends over the width of the prior.
     """
     whitened = np.linalg.solve(np.linalg.cholesky(cov), x - mean)
@@ -83,9 +86,11 @@ def misfit(mean: Array, cov: Array, rows: Array, variance: Array, height_m: floa
 def iterate(
     mean: Array, cov: Array, rows: Array, variance: Array, height_m: float, iterations: int
 ) -> tuple[Array, Array]:
-    """Posterior of ``rows`` (m, ROW_WIDTH) with ``variance`` (m,); each iteration linearises at the last result.
+    """Posterior of ``rows`` (m, ROW_WIDTH) with ``variance`` (m,); each iteration linearises at
+    the last result.
 
-    One iteration is the extended Kalman filter; more are Gauss-Newton steps to the most probable state
+    One iteration is the extended Kalman filter; more are Gauss-Newton steps to the most probable
+    state
     (Bell and Cathey 1993), halved while they overshoot, ended when they move less than 1 % of the sd.
     """
     innovation, H = linearise(rows, mean, height_m)
@@ -93,14 +98,18 @@ def iterate(
     if iterations <= 1:
         return x, P
     last, last_cost = mean, (innovation * innovation / variance).sum()
-    for _ in range(iterations - 1):
+    for remaining in range(iterations - 1, -1, -1):
         cost = misfit(mean, cov, rows, variance, height_m, x)
         halvings = 0
         while cost > last_cost and halvings < 6:
             x = (x + last) / 2.0
             cost = misfit(mean, cov, rows, variance, height_m, x)
             halvings += 1
+        if cost > last_cost:
+            return last, P
         if halvings == 0 and (np.abs(x - last) < 0.01 * np.sqrt(np.diag(P))).all():
+            break
+        if remaining == 0:
             break
         last, last_cost = x, cost
         innovation, H = linearise(rows, x, height_m)
@@ -112,9 +121,11 @@ def iterate(
 def passes(
     mean: Array, cov: Array, rows: Array, height_m: float, threshold: float, iterations: int
 ) -> bool:
-    """Whether one group lies within ``threshold`` of squared Mahalanobis distance of the prediction.
+    """Whether one group lies within ``threshold`` of squared Mahalanobis distance of the
+    prediction.
 
-    Where the linear distance says no and iterating is allowed, the misfit of the group's most probable
+    Where the linear distance says no and iterating is allowed, the misfit of the group's most
+    probable
     state decides.
     """
     innovation, H = linearise(rows, mean, height_m)

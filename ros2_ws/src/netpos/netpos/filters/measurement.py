@@ -139,7 +139,8 @@ def predict_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
 
 @njit(cache=True)
 def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> float:
-    """Variance of what linearising ``row`` at ``mean`` (n,) leaves out, for a prior ``cov`` (n, n).
+    """Variance of what linearising ``row`` at ``mean`` (n,) leaves out, for a prior ``cov`` (n,
+    n).
 
     Half the trace of (h'' P)^2 of the second-order extended Kalman filter (Bar-Shalom, Li and
     Kirubarajan 2001, eq. 10.3.3-12), with the largest curvature of the quantity. It keeps a device

@@ -73,7 +73,8 @@ class TrackerConfig:
         metadata={
             "low": 1,
             "high": 10000,
-            "text": "epochs rejected in a row before the velocity is opened to initial_speed_sd_mps",
+            "text": "epochs rejected in a row before the velocity is opened to
+            initial_speed_sd_mps",
         },
     )
     max_rejected_epochs: int = field(

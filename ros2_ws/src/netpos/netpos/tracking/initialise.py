@@ -168,7 +168,8 @@ class Initialiser:
         return sorted(fits, key=lambda fit: fit[0])
 
     def _plausible(self, state: Array) -> bool:
-        """Not behind an array without a back, and not on top of an RSU, where an angle fits anything."""
+        """Not behind an array without a back, and not on top of an RSU, where an angle fits
+        anything."""
         heard = {r.info.rsu_id: r for e in self._window for r in e[2]}
         for rsu in heard.values():
             dx, dy = state[:2] - rsu.info.position[:2]

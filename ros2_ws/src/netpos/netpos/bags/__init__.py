@@ -1,0 +1,12 @@
+"""Bags: rosbag2 folders with MCAP storage, written and read without ROS.
+
+``BagWriter`` and ``BagReader`` hold the ordinary case, ``netpos.bags.recover`` saves what a
+killed recorder left, ``netpos.bags.importers`` turn other people's recordings into bags.
+"""
+
+from netpos.bags.errors import BagError
+from netpos.bags.reader import BagEntry, BagReader, TopicInfo
+from netpos.bags.types import codec, typestore
+from netpos.bags.writer import BagWriter
+
+__all__ = ["BagEntry", "BagError", "BagReader", "BagWriter", "TopicInfo", "codec", "typestore"]

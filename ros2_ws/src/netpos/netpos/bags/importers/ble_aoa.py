@@ -1,0 +1,209 @@
+"""Bluetooth 5.1 arrays on four walls measure azimuth and elevation of a tag (Zenodo 7759557).
+
+A folder holds runs ``beacons_RUN.csv`` + ``truth_RUN.csv`` such as ``uc1_run1``. Beacon lines:
+epoch ms, tag, RSSI dBm, azimuth deg, elevation deg, RSSI of the second polarisation dBm, channel,
+anchor. Truth lines: epoch ms, unused, x cm, y cm at the corners of the walk.
+
+Signs. The authors count azimuth clockwise seen from above (bearing in the room = facing -
+azimuth), an RSU counter-clockwise: the sign turns. Azimuth is the angle to the array's own axis
+(a cone angle): its sine is the direction cosine, whatever the tag's height. Elevation keeps its sign: the tag is below the
+arrays, and as written the angles agree with atan2(1.13 m - 2.30 m, distance) within 1 to -8 deg in
+the mean; with the sign turned they are 29 to 41 deg off.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from netpos.bags.errors import BagError
+from netpos.bags.importers.common import Row, read_rows, write_recording, yaw_quaternion
+from netpos.messages.values import AngleConvention, Array, Field, Odometry, RsuInfo, RsuMeasurement
+
+MS = 1_000_000
+TAG_HEIGHT_M = 1.13
+ARRAY_HEIGHT_M = 2.30
+TRUTH_PERIOD_NS = 100 * MS
+# anchor: x m, y m, facing deg counter-clockwise from x
+ARRAYS: dict[str, tuple[float, float, float]] = {
+    "6501": (0.0, 3.0, 0.0),
+    "6502": (6.0, 0.0, 90.0),
+    "6503": (12.0, 3.0, 180.0),
+    "6504": (6.0, 6.0, -90.0),
+}
+
+
+# A walking person: v^2 / T for 0.5 m/s and turns of some seconds, sqrt(0.05) m/s^2/sqrt(Hz).
+TRACKER = {
+    "device_height_m": TAG_HEIGHT_M,
+    "accel_density_mps2_sqrthz": 0.22,
+    "initial_speed_sd_mps": 0.5,
+    "coverage_radius_m": 6.0,
+    "initial_position_sd_max_m": 2.0,
+    "gate_probability": 1.0,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArrayErrors:
+    """Error model of one array, in direction cosines (the arrays measure cone angles).
+
+    Found without the truth: each array's residual against the position the filter itself
+    estimates, pooled over arrays and runs, has an autocorrelation of two exponentials. The fast
+    one is the noise and its correlation time, the slow one the bias.
+    """
+
+    azimuth_cosine_sd: float = 0.07
+    elevation_cosine_sd: float = 0.17
+    azimuth_cosine_bias_sd: float = 0.10
+    elevation_cosine_bias_sd: float = 0.15
+    bias_correlation_time_s: float = 3.0
+    noise_correlation_time_s: float = 1.0
+
+
+def import_ble_aoa(
+    path: Path,
+    bag: Path,
+    *,
+    run: str | None = None,
+    vue_id: str = "vue_1",
+    errors: ArrayErrors | None = None,
+) -> dict[str, int]:
+    """Write one run as a bag: /rsu/info, /rsu/measurements and /VUE/ground_truth (10 Hz).
+
+    Parameters
+    ----------
+    path : the folder, or one beacons_RUN.csv with its truth_RUN.csv beside it
+    run : which run of a folder, such as ``uc1_run1``; may be left out where there is only one
+
+    Returns
+    -------
+    messages per topic
+
+    Raises
+    ------
+    BagError  missing file, several runs and none chosen, or a line that cannot be understood
+    FileExistsError  ``bag`` exists
+    """
+    errors = errors or ArrayErrors()
+    beacons = _beacon_file(Path(path), run)
+    name = beacons.stem.removeprefix("beacons_")
+    measurements = _measurements(beacons, vue_id, errors)
+    truth = _truth(beacons.with_name(f"truth_{name}.csv"), vue_id)
+    infos = [_info(rsu_id, errors) for rsu_id in ARRAYS]
+    metadata = {"source": f"ble-aoa {name}", "tracker": yaml.safe_dump(TRACKER)}
+    return write_recording(bag, infos, measurements, truth, metadata)
+
+
+def _beacon_file(path: Path, run: str | None) -> Path:
+    if not path.exists():
+        raise BagError(f"{path} does not exist; give the folder of the recording")
+    if path.is_file():
+        if not path.name.startswith("beacons_"):
+            raise BagError(f"{path} is not named beacons_RUN.csv; give the folder or such a file")
+        return path
+    files = sorted(path.glob("beacons_*.csv"))
+    names = [file.stem.removeprefix("beacons_") for file in files]
+    if not files:
+        raise BagError(f"{path} holds no beacons_RUN.csv; give the folder of the recording")
+    if run is None and len(files) > 1:
+        raise BagError(f"{path} holds the runs {', '.join(names)}; choose one with --run")
+    if run is not None and run not in names:
+        raise BagError(f"{path} has no run {run!r}; it holds {', '.join(names)}")
+    return files[0] if run is None else files[names.index(run)]
+
+
+def _info(rsu_id: str, errors: ArrayErrors) -> RsuInfo:
+    x, y, facing = ARRAYS[rsu_id]
+    return RsuInfo(
+        rsu_id=rsu_id,
+        position=np.array([x, y, ARRAY_HEIGHT_M]),
+        quaternion=yaw_quaternion(math.radians(facing)),
+        azimuth_bias_sd_rad=errors.azimuth_cosine_bias_sd,
+        elevation_bias_sd_rad=errors.elevation_cosine_bias_sd,
+        bias_correlation_time_s=errors.bias_correlation_time_s,
+        noise_correlation_time_s=errors.noise_correlation_time_s,
+        angle_convention=AngleConvention.CONE,
+    )
+
+
+def _measurements(file: Path, vue_id: str, errors: ArrayErrors) -> list[RsuMeasurement]:
+    measurements: list[RsuMeasurement] = []
+    tag = ""
+    for row in read_rows(file, 8, header=False):
+        tag = tag or row.values[1]
+        if row.values[1] != tag:
+            raise row.error(f"tag {row.values[1]}, but the run is of tag {tag}")
+        if row.values[7] not in ARRAYS:
+            raise row.error(f"anchor {row.values[7]!r} is none of {', '.join(ARRAYS)}")
+        azimuth = -_angle(row, 3, "azimuth", 89.0)
+        elevation = _angle(row, 4, "elevation", 89.0)
+        measurements.append(
+            RsuMeasurement(
+                stamp_ns=row.integer(0, "time") * MS,
+                rsu_id=row.values[7],
+                vue_id=vue_id,
+                fields=Field.AZIMUTH | Field.ELEVATION,
+                rssi_dbm=row.number(2, "RSSI"),
+                azimuth_rad=azimuth,
+                azimuth_var=(errors.azimuth_cosine_sd / math.cos(azimuth)) ** 2,
+                elevation_rad=elevation,
+                elevation_var=(errors.elevation_cosine_sd / math.cos(elevation)) ** 2,
+            )
+        )
+    return measurements
+
+
+def _angle(row: Row, column: int, name: str, limit_deg: float) -> float:
+    degrees = row.number(column, name)
+    if abs(degrees) > limit_deg:
+        raise row.error(f"{name} {degrees} deg is outside +-{limit_deg:g}")
+    return math.radians(degrees)
+
+
+def _truth(file: Path, vue_id: str) -> list[Odometry]:
+    stamps: list[int] = []
+    corners: list[list[float]] = []
+    for row in read_rows(file, 4, header=False):
+        stamp_ns = row.integer(0, "time") * MS
+        if stamps and stamp_ns <= stamps[-1]:
+            raise row.error("time does not increase")
+        stamps.append(stamp_ns)
+        corners.append([row.number(2, "x") / 100, row.number(3, "y") / 100])
+    if len(stamps) < 2:
+        raise BagError(f"{file} holds one corner; a walk needs two")
+    return walk(np.array(stamps), np.array(corners), vue_id)
+
+
+def walk(stamps_ns: NDArray[np.int64], corners: Array, vue_id: str) -> list[Odometry]:
+    """Constant speed from corner to corner, at 10 Hz; a corner belongs to the leg it begins.
+
+    stamps_ns : (n,) int64, increasing; corners : (n, 2) m. While standing, the heading stays.
+    """
+    legs = np.diff(corners, axis=0)
+    seconds = np.diff(stamps_ns) / 1e9
+    speeds = np.hypot(legs[:, 0], legs[:, 1]) / seconds
+    headings = np.arctan2(legs[:, 1], legs[:, 0])
+    for i in range(1, len(headings)):
+        if speeds[i] == 0:
+            headings[i] = headings[i - 1]
+    odometry = []
+    for stamp_ns in range(int(stamps_ns[0]), int(stamps_ns[-1]) + 1, TRUTH_PERIOD_NS):
+        leg = min(int(np.searchsorted(stamps_ns, stamp_ns, side="right")) - 1, len(legs) - 1)
+        share = (stamp_ns - int(stamps_ns[leg])) / 1e9 / seconds[leg]
+        x, y = corners[leg] + share * legs[leg]
+        odometry.append(
+            Odometry(
+                stamp_ns=stamp_ns,
+                vue_id=vue_id,
+                position=np.array([x, y, TAG_HEIGHT_M]),
+                quaternion=yaw_quaternion(float(headings[leg])),
+                linear_velocity=np.array([speeds[leg], 0.0, 0.0]),
+            )
+        )
+    return odometry

@@ -1,0 +1,130 @@
+"""What the importers share: strict CSV lines, beacons out of stamps, one merged bag."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+
+import netpos
+from netpos.bags.errors import BagError
+from netpos.bags.types import codec
+from netpos.bags.writer import BagWriter
+from netpos.messages.topics import GROUND_TRUTH, RSU_INFO, RSU_MEASUREMENTS, of_vue
+from netpos.messages.values import Array, Odometry, RsuInfo, RsuMeasurement
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of a recording, able to say where it stands."""
+
+    file: Path
+    line: int
+    values: Sequence[str]
+
+    def error(self, problem: str) -> BagError:
+        """The problem with file and line number."""
+        return BagError(f"{self.file}, line {self.line}: {problem}; repair or remove the line")
+
+    def number(self, column: int, name: str) -> float:
+        """A finite number; BagError otherwise."""
+        try:
+            value = float(self.values[column])
+        except ValueError:
+            raise self.error(f"{name} {self.values[column]!r} is not a number") from None
+        if not math.isfinite(value):
+            raise self.error(f"{name} is {value}, not finite")
+        return value
+
+    def integer(self, column: int, name: str) -> int:
+        """A whole number that is not negative; BagError otherwise."""
+        try:
+            value = int(self.values[column])
+        except ValueError:
+            raise self.error(f"{name} {self.values[column]!r} is not a whole number") from None
+        if value < 0:
+            raise self.error(f"{name} {value} is negative")
+        return value
+
+
+def read_rows(file: Path, columns: int, *, header: bool) -> Iterator[Row]:
+    """Lines of a CSV file with exactly ``columns`` fields; empty lines are skipped.
+
+    Raises
+    ------
+    BagError  no such file, not text, no data, or a line with other than ``columns`` fields
+    """
+    if not file.is_file():
+        raise BagError(f"{file} does not exist; give the folder of the recording")
+    found = False
+    try:
+        with file.open(newline="", encoding="utf-8") as stream:
+            for line, values in enumerate(csv.reader(stream), start=1):
+                if not values or (header and line == 1):
+                    continue
+                row = Row(file, line, values)
+                if len(values) != columns:
+                    raise row.error(f"{len(values)} fields, {columns} expected")
+                found = True
+                yield row
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise BagError(f"{file} is not a CSV text file ({error})") from error
+    if not found:
+        raise BagError(f"{file} holds no data")
+
+
+def yaw_quaternion(yaw_rad: float) -> Array:
+    """(4,) x y z w of a turn about z."""
+    return np.array([0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2)])
+
+
+def number_beacons(measurements: Sequence[RsuMeasurement]) -> list[RsuMeasurement]:
+    """In stamp order, with one sequence number per stamp and ``expected`` its RSUs.
+
+    The recordings carry no beacon number: measurements of one stamp are taken as one beacon.
+    """
+    ordered = sorted(measurements, key=lambda m: (m.stamp_ns, m.rsu_id))
+    numbered: list[RsuMeasurement] = []
+    for sequence, (stamp_ns, group) in enumerate(groupby(ordered, key=lambda m: m.stamp_ns)):
+        beacon = list(group)
+        names = [m.rsu_id for m in beacon]
+        if len(set(names)) != len(names):
+            raise BagError(f"an RSU of {', '.join(names)} measures twice at stamp {stamp_ns} ns")
+        numbered.extend(replace(m, sequence=sequence, expected=len(beacon)) for m in beacon)
+    return numbered
+
+
+def write_recording(
+    bag: Path,
+    infos: Sequence[RsuInfo],
+    measurements: Sequence[RsuMeasurement],
+    truth: Sequence[Odometry],
+    metadata: Mapping[str, str],
+) -> dict[str, int]:
+    """Write one bag in stamp order, /rsu/info first; messages per topic.
+
+    Raises
+    ------
+    FileExistsError  ``bag`` exists
+    """
+    messages = codec()
+    measurements = number_beacons(measurements)
+    stamps = [m.stamp_ns for m in measurements] + [t.stamp_ns for t in truth]
+    start_ns = min(stamps)
+    merged = [(m.stamp_ns, RSU_MEASUREMENTS, messages.measurement_to_msg(m)) for m in measurements]
+    merged += [
+        (t.stamp_ns, of_vue(t.vue_id, GROUND_TRUTH), messages.odometry_to_msg(t)) for t in truth
+    ]
+    merged.sort(key=lambda item: item[0])
+    with BagWriter(bag, metadata={**metadata, "netpos_version": netpos.__version__}) as writer:
+        for info in infos:
+            message = messages.rsu_info_to_msg(replace(info, stamp_ns=start_ns))
+            writer.write(RSU_INFO, message, start_ns)
+        for stamp_ns, topic, message in merged:
+            writer.write(topic, message, stamp_ns)
+        return writer.counts

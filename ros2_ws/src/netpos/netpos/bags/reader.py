@@ -1,0 +1,214 @@
+"""Read bags in log-time order, and refuse what is incomplete."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from mcap.reader import make_reader
+from rosbags.interfaces import Connection, Qos
+from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.serde import SerdeError
+
+from netpos.bags import layout
+from netpos.bags.errors import BagError
+from netpos.bags.scan import summary_is_sound
+from netpos.bags.types import require_type, store_of_definition
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TopicInfo:
+    """One topic of a bag: its type, number of messages, offered profiles and full definition."""
+
+    type_name: str
+    count: int
+    qos: list[Qos]
+    definition: str
+
+
+class BagEntry:
+    """One recorded message; ``message`` is decoded when asked for."""
+
+    __slots__ = ("_decode", "cdr", "log_time_ns", "topic", "type_name")
+
+    def __init__(
+        self,
+        topic: str,
+        type_name: str,
+        log_time_ns: int,
+        cdr: bytes,
+        decode: Callable[[str, bytes], Any],
+    ) -> None:
+        self.topic = topic
+        self.type_name = type_name
+        self.log_time_ns = log_time_ns
+        self.cdr = cdr
+        self._decode = decode
+
+    @property
+    def message(self) -> Any:
+        """The rosbags object; BagError where the bytes do not fit the type."""
+        return self._decode(self.topic, self.cdr)
+
+
+class BagReader:
+    """A bag folder, or a single .mcap file.
+
+    ``topics`` maps names to TopicInfo; ``start_ns`` and ``end_ns`` are the log times of the first
+    and last message (0 in an empty bag); ``metadata`` is what the writer was given.
+
+    Raises
+    ------
+    BagError  missing, cut off, damaged or not a bag; also later, where other messages come than
+        the index promises
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        self._reader = self._open()
+        try:
+            self.topics = self._describe_topics()
+        except BaseException:
+            self._reader.close()
+            raise
+        empty = self._reader.message_count == 0
+        self.start_ns = 0 if empty else int(self._reader.start_time)
+        self.end_ns = 0 if empty else int(self._reader.end_time) - 1
+        self.metadata: dict[str, str] = self._run_metadata()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files; may be called twice."""
+        if self._reader.is_open:
+            self._reader.close()
+
+    def _damaged(self, reason: object) -> BagError:
+        text = str(reason).rstrip(".")
+        return BagError(
+            f"{self.path} is incomplete or damaged ({text}); try: netpos recover {self.path}"
+        )
+
+    def _open(self) -> Reader:
+        if not self.path.exists():
+            raise BagError(f"{self.path} does not exist; check the path of the bag")
+        if self.path.is_dir() and not (self.path / layout.METADATA_FILE).exists():
+            if any(self.path.glob("*.mcap")):
+                raise self._damaged("its recorder did not finish")
+            raise BagError(
+                f"{self.path} is not a bag: it holds no {layout.METADATA_FILE} and no .mcap file"
+            )
+        self._check_summaries()
+        try:
+            reader = Reader(self.path)
+        except ReaderError as error:
+            raise BagError(
+                f"{self.path} is not a bag ({error}); give a bag folder or an .mcap file"
+            ) from error
+        try:
+            reader.open()
+        except Exception as error:  # damaged bytes raise nearly anything
+            raise self._damaged(error) from error
+        return reader
+
+    def _check_summaries(self) -> None:
+        """rosbags checks the chunks but not the index that names their topics and types."""
+        files = sorted(self.path.glob("*.mcap")) if self.path.is_dir() else [self.path]
+        for file in files:
+            if file.suffix == ".mcap" and not summary_is_sound(file):
+                raise self._damaged(f"{file.name} has no sound index")
+
+    def _describe_topics(self) -> dict[str, TopicInfo]:
+        topics: dict[str, TopicInfo] = {}
+        for connection in self._reader.connections:
+            known = topics.get(connection.topic)
+            if known is not None and known.type_name != connection.msgtype:
+                raise BagError(
+                    f"{self.path}: {connection.topic} holds both {known.type_name} and "
+                    f"{connection.msgtype}; split it first"
+                )
+            topics[connection.topic] = TopicInfo(
+                type_name=connection.msgtype,
+                count=connection.msgcount + (known.count if known else 0),
+                qos=list(getattr(connection.ext, "offered_qos_profiles", [])),
+                definition=connection.msgdef.data,
+            )
+        total = sum(topic.count for topic in topics.values())
+        if total != self._reader.message_count:
+            raise self._damaged(
+                f"{self._reader.message_count} messages announced, its topics count {total}"
+            )
+        return topics
+
+    def _run_metadata(self) -> dict[str, str]:
+        if self.path.is_dir():
+            custom = getattr(self._reader.storage.metadata, "custom", None) or {}
+            return {str(key): str(value) for key, value in custom.items()}
+        with self.path.open("rb") as stream:
+            for record in make_reader(stream).iter_metadata():
+                if record.name == layout.RUN_RECORD:
+                    return dict(record.metadata)
+        return {}
+
+    def _decode(self, topic: str, cdr: bytes) -> Any:
+        info = self.topics[topic]
+        if info.definition:
+            store = store_of_definition(info.type_name, info.definition)
+        else:
+            store = require_type(info.type_name)
+        try:
+            return store.deserialize_cdr(cdr, info.type_name)
+        except SerdeError as error:
+            raise BagError(f"{self.path}: {topic}: {error}; was its type changed?") from error
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[BagEntry]:
+        """Messages of ``topics`` (default: all) in log-time order, ties in the order of recording.
+
+        Raises
+        ------
+        BagError  a topic is not in the bag, or the bag holds other than the announced messages
+        """
+        if topics is not None:
+            absent = sorted(set(topics) - self.topics.keys())
+            if absent:
+                raise BagError(
+                    f"{self.path} has no topic {', '.join(absent)}; it holds "
+                    f"{', '.join(sorted(self.topics)) or 'none'}"
+                )
+        wanted = self.topics.keys() if topics is None else set(topics)
+        connections = [c for c in self._reader.connections if c.topic in wanted]
+        if connections:
+            yield from self._checked(connections)
+
+    def _checked(self, connections: list[Connection]) -> Iterator[BagEntry]:
+        counts: Counter[str] = Counter()
+        stream = self._reader.messages(connections)
+        while True:
+            try:
+                connection, log_time_ns, cdr = next(stream)
+            except StopIteration:
+                break
+            except Exception as error:  # damaged bytes raise nearly anything
+                raise self._damaged(error) from error
+            counts[connection.topic] += 1
+            yield BagEntry(
+                connection.topic, connection.msgtype, log_time_ns, bytes(cdr), self._decode
+            )
+        for topic in {c.topic for c in connections}:
+            if counts[topic] != self.topics[topic].count:
+                raise self._damaged(
+                    f"{topic}: {counts[topic]} of {self.topics[topic].count} messages found"
+                )

@@ -1,0 +1,296 @@
+"""Walk the records of an MCAP file that may be cut off or damaged.
+
+A record counts only if encoding it again gives the same bytes; a chunk only if its CRC is right as
+well. Where that fails, the walk goes on at the next place that holds a sound chunk.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import lz4.frame  # type: ignore[import-untyped]
+import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    Message,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.writer import MCAP0_MAGIC
+
+from netpos.bags.layout import DEFINITION_ATTACHMENT, LIBRARY
+
+_HEAD = struct.Struct("<BQ")
+_KINDS: dict[int, Any] = {
+    Opcode.HEADER: Header,
+    Opcode.FOOTER: Footer,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.CHUNK: Chunk,
+    Opcode.MESSAGE_INDEX: MessageIndex,
+    Opcode.CHUNK_INDEX: ChunkIndex,
+    Opcode.ATTACHMENT: Attachment,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex,
+    Opcode.STATISTICS: Statistics,
+    Opcode.METADATA: Metadata,
+    Opcode.METADATA_INDEX: MetadataIndex,
+    Opcode.SUMMARY_OFFSET: SummaryOffset,
+    Opcode.DATA_END: DataEnd,
+}
+
+
+@dataclass(slots=True)
+class Scan:
+    """What a walk finds; sizes in bytes."""
+
+    data: bytes
+    schemas: dict[int, Any] = field(default_factory=dict)
+    channels: dict[int, Any] = field(default_factory=dict)
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    blocks: list[tuple[Any, bool]] = field(default_factory=list)  # Chunk or Message, verified
+    loose: list[Any] = field(default_factory=list)  # messages outside of chunks
+    library: str = LIBRARY  # who wrote the file; ours until its header says otherwise
+    complete: bool = False  # footer and closing magic are in place
+    damaged_places: int = 0
+    bytes_dropped: int = 0
+    _certain: set[tuple[type, int]] = field(default_factory=set)
+
+    def messages(self) -> Iterator[tuple[Any, bool]]:
+        """(mcap Message, covered by a checksum) in the order of the file.
+
+        Messages outside of chunks count only in files of writers that make no chunks: elsewhere
+        they are a damaged record of another kind.
+        """
+        if not self.blocks and not self.library.startswith(LIBRARY):
+            yield from ((message, False) for message in self.loose)
+        for block, verified in self.blocks:
+            if isinstance(block, Message):
+                yield block, verified
+                continue
+            for record in records_inside(unpack(block)):
+                if isinstance(record, Message):
+                    yield record, verified
+
+    def define(self, record: Any, verified: bool) -> None:
+        """Note a schema or channel; a copy under a checksum wins over others."""
+        table = self.schemas if isinstance(record, Schema) else self.channels
+        key = (type(record), record.id)
+        if record.id not in table or (verified and key not in self._certain):
+            table[record.id] = record
+        if verified:
+            self._certain.add(key)
+
+
+def _record(data: bytes, opcode: int, start: int, length: int) -> Any:
+    """The record whose body is ``data[start : start + length]``, or None where it is not sound."""
+    body = data[start : start + length]
+    stream = ReadDataStream(BytesIO(body))
+    try:
+        if opcode == Opcode.MESSAGE:
+            return Message.read(stream, length) if length > 22 else None
+        kind = _KINDS.get(opcode)
+        if kind is None:
+            return None
+        record = kind.read(stream)
+        again = RecordBuilder()
+        record.write(again)
+    except Exception:  # damaged bytes raise nearly anything
+        return None
+    return record if again.end()[_HEAD.size :] == body else None
+
+
+def unpack(chunk: Any) -> bytes:
+    """Records of a chunk, uncompressed.
+
+    Raises
+    ------
+    ValueError  unknown compression, broken stream, wrong size or wrong CRC (0: the chunk has none)
+    """
+    try:
+        if chunk.compression == "zstd":
+            raw = zstandard.ZstdDecompressor().decompressobj().decompress(chunk.data)
+        elif chunk.compression == "lz4":
+            raw = lz4.frame.decompress(chunk.data)
+        elif chunk.compression == "":
+            raw = chunk.data
+        else:
+            raise ValueError(f"unknown compression {chunk.compression!r}")
+    except Exception as error:  # damaged bytes raise nearly anything
+        raise ValueError(f"chunk cannot be uncompressed: {error}") from error
+    if len(raw) != chunk.uncompressed_size:
+        raise ValueError(f"chunk holds {len(raw)} bytes, not {chunk.uncompressed_size}")
+    if chunk.uncompressed_crc and zlib.crc32(raw) != chunk.uncompressed_crc:
+        raise ValueError("chunk has a wrong CRC")
+    return bytes(raw)
+
+
+def records_inside(raw: bytes) -> Iterator[Any]:
+    """Schemas, channels and messages of an unpacked chunk, up to the first that is not sound."""
+    position = 0
+    while position + _HEAD.size <= len(raw):
+        opcode, length = _HEAD.unpack_from(raw, position)
+        position += _HEAD.size
+        if position + length > len(raw):
+            return
+        record = _record(raw, opcode, position, length)
+        if record is None:
+            return
+        yield record
+        position += length
+
+
+def _sound_chunk(data: bytes, position: int) -> bool:
+    if position + _HEAD.size > len(data):
+        return False
+    opcode, length = _HEAD.unpack_from(data, position)
+    start = position + _HEAD.size
+    if opcode != Opcode.CHUNK or start + length > len(data):
+        return False
+    chunk = _record(data, opcode, start, length)
+    return chunk is not None and bool(chunk.uncompressed_crc) and _unpacks(chunk)
+
+
+def _unpacks(chunk: Any) -> bool:
+    try:
+        unpack(chunk)
+    except ValueError:
+        return False
+    return True
+
+
+def _next_chunk(data: bytes, position: int) -> int:
+    """Offset of the next sound chunk at or after ``position``; the end of the data if none."""
+    mark = bytes([Opcode.CHUNK])
+    while (position := data.find(mark, position)) >= 0:
+        if _sound_chunk(data, position):
+            return position
+        position += 1
+    return len(data)
+
+
+def scan(data: bytes) -> Scan:
+    """Everything sound in the bytes of an MCAP file; never raises for what they hold."""
+    found = Scan(data)
+    position = len(MCAP0_MAGIC) if data.startswith(MCAP0_MAGIC) else 0
+    while position < len(data):
+        if found.complete and data[position:] == MCAP0_MAGIC:
+            return found
+        size = 0 if found.complete else _take(found, position)
+        if size == 0:
+            found.complete = False
+            following = _next_chunk(data, position + 1)
+            found.damaged_places += 1
+            found.bytes_dropped += following - position
+            position = following
+        position += size
+    found.complete = False
+    return found
+
+
+def _take(found: Scan, position: int) -> int:
+    """Note the record at ``position``; its whole size, or 0 where it is not sound."""
+    data = found.data
+    if position + _HEAD.size > len(data):
+        return 0
+    opcode, length = _HEAD.unpack_from(data, position)
+    start = position + _HEAD.size
+    if start + length > len(data):
+        if opcode == Opcode.CHUNK:
+            _take_cut_chunk(found, start, length)
+        return 0
+    record = _record(data, opcode, start, length)
+    if record is None:
+        return 0
+    if isinstance(record, Chunk):
+        if not _take_chunk(found, record):
+            return 0
+    elif isinstance(record, Message):
+        found.loose.append(record)
+    elif isinstance(record, Header):
+        found.library = record.library
+    elif isinstance(record, (Schema, Channel)):
+        found.define(record, verified=False)
+    elif isinstance(record, Metadata):
+        found.metadata.setdefault(record.name, record.metadata)
+    elif isinstance(record, Attachment) and record.name == DEFINITION_ATTACHMENT:
+        _take_definition(found, record.data)
+    found.complete = isinstance(record, Footer)
+    return _HEAD.size + int(length)
+
+
+def _take_definition(found: Scan, compressed: bytes) -> None:
+    """A copy of a topic's schema and channel; the attachment's CRC was checked with the record."""
+    with suppress(zstandard.ZstdError):
+        for record in records_inside(zstandard.ZstdDecompressor().decompress(compressed)):
+            found.define(record, verified=True)
+
+
+def _take_chunk(found: Scan, chunk: Any) -> bool:
+    try:
+        raw = unpack(chunk)
+    except ValueError:
+        return False
+    verified = bool(chunk.uncompressed_crc)
+    for record in records_inside(raw):
+        if isinstance(record, (Schema, Channel)):
+            found.define(record, verified)
+    found.blocks.append((chunk, verified))
+    return True
+
+
+def _take_cut_chunk(found: Scan, start: int, length: int) -> None:
+    """Keep the whole messages of a last, uncompressed chunk that the end of the file cuts."""
+    fixed = struct.Struct("<QQQII")
+    body = found.data[start:]
+    if len(body) < fixed.size + 8:
+        return
+    size, compression = fixed.unpack_from(body)[2], fixed.unpack_from(body)[4]
+    (stored,) = struct.unpack_from("<Q", body, fixed.size)
+    if compression != 0 or stored != size or length != fixed.size + 8 + size:
+        return
+    for record in records_inside(body[fixed.size + 8 :]):
+        if isinstance(record, (Schema, Channel)):
+            found.define(record, verified=False)
+        elif isinstance(record, Message):
+            found.blocks.append((record, False))
+
+
+def summary_is_sound(file: Path) -> bool:
+    """False where the closing magic, the footer or the summary's CRC (if it has one) is wrong."""
+    size, footer_size = file.stat().st_size, _HEAD.size + 20
+    with file.open("rb") as stream:
+        stream.seek(max(0, size - footer_size - len(MCAP0_MAGIC)))
+        tail = stream.read()
+        if len(tail) < footer_size + len(MCAP0_MAGIC) or not tail.endswith(MCAP0_MAGIC):
+            return False
+        if _HEAD.unpack_from(tail) != (Opcode.FOOTER, 20):
+            return False
+        footer = _record(tail, Opcode.FOOTER, _HEAD.size, 20)
+        if footer.summary_crc == 0:
+            return True
+        end = size - len(MCAP0_MAGIC) - 4
+        if not footer.summary_start < end:
+            return False
+        stream.seek(footer.summary_start)
+        summary = stream.read(end - footer.summary_start)
+    return bool(zlib.crc32(summary) == footer.summary_crc)

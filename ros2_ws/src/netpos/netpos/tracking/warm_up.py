@@ -1,0 +1,37 @@
+"""Compile the tracker's kernels before the first measurement arrives."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netpos.messages.values import Field, GroundSpeed, InitialPose, RsuInfo, RsuMeasurement
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.tracker import Tracker
+
+
+def warm_up() -> None:
+    """Run a tiny track through every kernel: first fix, prediction, gate, update."""
+    tracker = Tracker(TrackerConfig(hold_s=0.0, manoeuvre_speed_sd_mps=1.0))
+    for name, x in (("a", 0.0), ("b", 40.0)):
+        tracker.add_rsu(RsuInfo(rsu_id=name, position=np.array([x, 0.0, 0.0])))
+    position = np.array([10.0, 10.0, 0.0])
+    for k in range(1, 5):
+        for name, x in (("a", 0.0), ("b", 40.0)):
+            d = position - np.array([x, 0.0, 0.0])
+            m = RsuMeasurement(
+                stamp_ns=k * 100_000_000,
+                rsu_id=name,
+                vue_id="warm_up",
+                fields=Field.AZIMUTH | Field.RANGE,
+                azimuth_rad=float(np.arctan2(d[1], d[0])) + (1.0 if k == 4 else 0.0),
+                azimuth_var=1e-4,
+                range_m=float(np.hypot(d[0], d[1])),
+                range_var=0.01,
+            )
+            tracker.add(m)
+            tracker.process()
+    speed = GroundSpeed(stamp_ns=500_000_000, vue_id="warm_up", speed_mps=0.1, speed_var=0.01)
+    pose = InitialPose(stamp_ns=600_000_000, vue_id="warm_up", position=position, cov=np.eye(3))
+    for item in (speed, pose):
+        tracker.add(item)
+        tracker.process()

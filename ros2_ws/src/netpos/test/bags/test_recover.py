@@ -1,0 +1,269 @@
+"""What is left after a kill or a bad disk: saved, proven, never invented."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from netpos.bags import BagError, BagReader, BagWriter, codec
+from netpos.bags.qos import is_latched
+from netpos.bags.recover import recover
+from netpos.bags.types import definition
+
+CLOCK = "rosgraph_msgs/msg/Clock"
+N = 240
+
+
+def write(folder: Path, n: int = N) -> Path:
+    """n clocks on two topics, six chunks."""
+    with BagWriter(folder, metadata={"seed": "3"}) as bag:
+        for i in range(n):
+            bag.write("/rsu/info" if i % 2 else "/clock", codec().clock_to_msg(i * i), i)
+            if i % (n // 6) == n // 6 - 1:
+                bag.flush()
+    return folder / f"{folder.name}_0.mcap"
+
+
+def content(path: Path) -> Counter[tuple[str, int, bytes]]:
+    with BagReader(path) as reader:
+        return Counter((e.topic, e.log_time_ns, e.cdr) for e in reader.messages())
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, Counter]:
+    file = write(tmp_path_factory.mktemp("bag") / "run")
+    return file.read_bytes(), content(file)
+
+
+def damaged(tmp_path: Path, data: bytes) -> Path:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "run_0.mcap").write_bytes(data)
+    return tmp_path / "run"
+
+
+def chunk_offsets(data: bytes, tmp_path: Path) -> list[tuple[int, int]]:
+    """(start, length) of each chunk, from the index."""
+    file = tmp_path / "index.mcap"
+    file.write_bytes(data)
+    with file.open("rb") as stream:
+        indexes = make_reader(stream).get_summary().chunk_indexes
+    return [(c.chunk_start_offset, c.chunk_length) for c in indexes]
+
+
+def test_cut_in_the_data_keeps_every_whole_chunk(
+    tmp_path: Path, original: tuple[bytes, Counter]
+) -> None:
+    data, messages = original
+    start, length = chunk_offsets(data, tmp_path)[3]
+    report = recover(damaged(tmp_path, data[: start + length // 2]))
+    assert report.output == tmp_path / "run_recovered"
+    assert report.messages == N // 6 * 3
+    assert report.counts == {"/clock": N // 4, "/rsu/info": N // 4}
+    assert (report.start_ns, report.end_ns) == (0, N // 2 - 1)
+    assert (report.damaged_places, report.bytes_dropped) == (1, length // 2)
+    assert report.unverified == report.unknown == 0
+    saved = content(report.output)
+    assert saved == Counter({key: 1 for key in messages if key[1] < N // 2})
+    with BagReader(report.output) as reader:
+        assert reader.metadata == {"recovered_from": "run", "seed": "3"}
+        assert is_latched(reader.topics["/rsu/info"].qos)
+        assert not is_latched(reader.topics["/clock"].qos)
+    assert "read back and equal" in str(report)
+
+
+def test_damaged_chunk_in_the_middle_is_jumped(
+    tmp_path: Path, original: tuple[bytes, Counter]
+) -> None:
+    data, messages = original
+    start, length = chunk_offsets(data, tmp_path)[2]
+    bad = bytearray(data)
+    bad[start + length // 2] ^= 0xFF
+    report = recover(damaged(tmp_path, bytes(bad)))
+    gone = range(N // 6 * 2, N // 6 * 3)
+    assert content(report.output) == Counter({k: 1 for k in messages if k[1] not in gone})
+    assert report.damaged_places == 1
+    assert report.bytes_dropped >= length
+
+
+def test_first_chunk_and_index_lost(tmp_path: Path, original: tuple[bytes, Counter]) -> None:
+    """The first chunk holds the schemas; the attachments repeat them."""
+    data, messages = original
+    offsets = chunk_offsets(data, tmp_path)
+    bad = bytearray(data[: sum(offsets[-1])])
+    start, length = offsets[0]
+    bad[start : start + length] = bytes(length)
+    report = recover(damaged(tmp_path, bytes(bad)))
+    assert content(report.output) == Counter({k: 1 for k in messages if k[1] >= N // 6})
+
+
+def test_garbage_after_the_end(tmp_path: Path, original: tuple[bytes, Counter]) -> None:
+    data, messages = original
+    report = recover(damaged(tmp_path, data + b"\x06" * 999))
+    assert content(report.output) == messages
+    assert report.bytes_dropped > 0
+
+
+def test_a_fine_bag_needs_nothing(tmp_path: Path) -> None:
+    write(tmp_path / "run")
+    before = {f: f.read_bytes() for f in (tmp_path / "run").iterdir()}
+    report = recover(tmp_path / "run")
+    assert report.output is None
+    assert report.messages == N
+    assert "nothing to recover" in str(report)
+    assert {f: f.read_bytes() for f in (tmp_path / "run").iterdir()} == before
+    assert not (tmp_path / "run_recovered").exists()
+
+
+def test_lost_metadata_file_is_made_anew(tmp_path: Path) -> None:
+    file = write(tmp_path / "run")
+    (tmp_path / "run" / "metadata.yaml").unlink()
+    expected = content(file)
+    report = recover(tmp_path / "run")
+    assert content(report.output) == expected
+    assert report.bytes_dropped == 0
+
+
+@pytest.mark.parametrize("data", [b"", b"\x89MCAP0\r\n", b"\0" * 5000, b"not a bag"])
+def test_nothing_to_save_is_an_error_and_leaves_nothing(tmp_path: Path, data: bytes) -> None:
+    folder = damaged(tmp_path, data)
+    with pytest.raises(BagError, match="nothing could be saved"):
+        recover(folder)
+    assert not (tmp_path / "run_recovered").exists()
+
+
+def test_missing_paths(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match="does not exist"):
+        recover(tmp_path / "nowhere")
+    with pytest.raises(BagError, match=r"no \.mcap file"):
+        recover(tmp_path)
+
+
+def test_never_overwrites(tmp_path: Path, original: tuple[bytes, Counter]) -> None:
+    folder = damaged(tmp_path, original[0][:-50])
+    (tmp_path / "run_recovered").mkdir()
+    (tmp_path / "run_recovered" / "mine").write_text("x")
+    with pytest.raises(FileExistsError, match="not overwritten"):
+        recover(folder)
+    assert [f.name for f in (tmp_path / "run_recovered").iterdir()] == ["mine"]
+    assert (folder / "run_0.mcap").read_bytes() == original[0][:-50]
+
+
+CDR = b"\0\1\0\0" + bytes(8)
+
+
+def foreign(tmp_path: Path, compression: CompressionType, *, chunked: bool) -> bytes:
+    """20 clocks as another library writes them, killed before the end."""
+    file = tmp_path / "foreign.mcap"
+    with file.open("wb") as stream:
+        writer = Writer(stream, compression=compression, use_chunking=chunked)
+        writer.start(profile="ros2", library="other")
+        schema = writer.register_schema(CLOCK, "ros2msg", definition(CLOCK).encode())
+        channel = writer.register_channel("/clock", "cdr", schema)
+        for i in range(20):
+            writer.add_message(channel, i, CDR, i)
+        writer.flush()
+    return file.read_bytes()
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+def test_uncompressed_messages_before_a_cut_are_kept_but_marked(
+    tmp_path: Path, chunked: bool
+) -> None:
+    data = foreign(tmp_path, CompressionType.NONE, chunked=chunked)
+    report = recover(damaged(tmp_path, data[: data.rindex(CDR) + 6]))
+    assert sorted(ns for _, ns, _ in content(report.output)) == list(range(19))
+    assert report.unverified == 19
+    assert "no checksum" in str(report)
+
+
+@pytest.mark.parametrize("compression", [CompressionType.LZ4, CompressionType.ZSTD])
+def test_cut_compressed_chunk_of_another_writer(
+    tmp_path: Path, compression: CompressionType
+) -> None:
+    data = foreign(tmp_path, compression, chunked=True)
+    folder = damaged(tmp_path, data)
+    assert sorted(ns for _, ns, _ in content(recover(folder).output)) == list(range(20))
+    shutil.rmtree(tmp_path / "run_recovered")
+    (folder / "run_0.mcap").write_bytes(data[:250])
+    with pytest.raises(BagError, match="nothing could be saved"):
+        recover(folder)
+
+
+@settings(max_examples=150, deadline=None)
+@given(choose=st.data())
+def test_any_cut_and_any_damage_invents_nothing(
+    original: tuple[bytes, Counter], choose: st.DataObject
+) -> None:
+    data, messages = original
+    bad = bytearray(data[: choose.draw(st.integers(0, len(data)))])
+    for _ in range(choose.draw(st.integers(0, 4)) if bad else 0):
+        place = choose.draw(st.integers(0, len(bad) - 1))
+        bad[place] = choose.draw(st.integers(0, 255))
+    root = Path(tempfile.mkdtemp())
+    try:
+        report = recover(damaged(root, bytes(bad)))
+        assert not content(report.output or root / "run" / "run_0.mcap") - messages
+        assert report.unverified == 0
+    except BagError as error:
+        assert "nothing could be saved" in str(error)  # noqa: PT017
+    finally:
+        shutil.rmtree(root)
+
+
+def test_every_cut_of_the_last_records(tmp_path: Path, original: tuple[bytes, Counter]) -> None:
+    """Cuts in the summary and footer lose no message."""
+    data, messages = original
+    end = sum(chunk_offsets(data, tmp_path)[-1])
+    for cut in [*range(end, len(data) - 1, 97), len(data) - 1]:
+        folder = damaged(tmp_path, data[:cut])
+        assert content(recover(folder).output) == messages
+        shutil.rmtree(folder)
+        shutil.rmtree(tmp_path / "run_recovered")
+
+
+WRITER = """
+import sys, time
+from pathlib import Path
+from netpos.bags import BagWriter, codec
+bag = BagWriter(Path(sys.argv[1]))
+flushed = time.monotonic()
+print("ready", flush=True)
+while True:
+    now = time.time_ns()
+    bag.write("/clock", codec().clock_to_msg(now), now)
+    if time.monotonic() - flushed > 0.25:
+        bag.flush()
+        flushed = time.monotonic()
+    time.sleep(0.002)
+"""
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_killed_writer_loses_at_most_a_second(tmp_path: Path, seed: int) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(tmp_path / "run")], stdout=subprocess.PIPE
+    )
+    assert process.stdout is not None
+    process.stdout.readline()
+    time.sleep(random.Random(seed).uniform(1.0, 2.0))
+    killed_ns = time.time_ns()
+    process.kill()
+    process.wait()
+    process.stdout.close()
+    report = recover(tmp_path / "run")
+    assert killed_ns - report.end_ns < 1_000_000_000
+    assert report.messages > 50
+    for _, log_time_ns, cdr in content(report.output):
+        stamp = int.from_bytes(cdr[4:8], "little") * 10**9 + int.from_bytes(cdr[8:12], "little")
+        assert stamp == log_time_ns

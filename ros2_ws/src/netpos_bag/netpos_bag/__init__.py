@@ -1,0 +1,1 @@
+"""Record and play bags of a running graph."""

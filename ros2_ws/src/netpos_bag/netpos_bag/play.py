@@ -1,0 +1,136 @@
+"""Play a bag into the running graph: ``ros2 run netpos_bag play BAG``."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from typing import Any
+
+import rclpy
+from netpos.bags import BagEntry, BagReader
+from netpos.messages.topics import CLOCK
+from netpos_node import message_class
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+from netpos_bag.conversions import clock_cdr, profile_to_play
+from netpos_bag.parameters import PlayConfig, play_config, play_flags
+from netpos_bag.playback import Plan
+
+SETTLE_S = 0.3  # the set of subscribers has to stay the same for so long
+ACK_S = 5.0  # Fast DDS asks its readers every 3 s
+LINGER_S = 0.5  # latched messages stay available for so long after the end
+
+
+class PlayNode(Node):
+    """Publishes a bag in log order from one thread."""
+
+    def __init__(self, flags: dict[str, Any]) -> None:
+        super().__init__("netpos_play")
+        self.config: PlayConfig = play_config(self, flags)
+        self.bag = BagReader(self.config.bag)
+        self.plan = Plan.make(self.bag, self.config)
+        self.outlets = {topic: self._outlet(topic) for topic in self.plan.topics}
+        self.counts = dict.fromkeys(self.outlets, 0)
+        clock_class = message_class("rosgraph_msgs/msg/Clock")
+        self._ticker = self.create_publisher(clock_class, CLOCK, 10)
+        self.max_lag_s = 0.0
+
+    def _outlet(self, topic: str) -> Publisher:
+        info = self.bag.topics[topic]
+        profile = profile_to_play(info.qos)
+        return self.create_publisher(message_class(info.type_name), topic, profile)
+
+    def _publish(self, entry: BagEntry) -> None:
+        self.outlets[entry.topic].publish(entry.cdr)
+        self.counts[entry.topic] += 1
+
+    def _subscribers(self) -> dict[str, int]:
+        return {t: outlet.get_subscription_count() for t, outlet in self.outlets.items()}
+
+    def wait_for_subscribers(self) -> None:
+        """Wait for the named topics to have a subscriber, then for the graph to be at rest."""
+        named = [t for t in self.config.wait_for_subscribers if t in self.outlets]
+        end = time.monotonic() + self.config.wait_timeout
+        seen, since = self._subscribers(), time.monotonic()
+        while time.monotonic() < end:
+            now = self._subscribers()
+            if now != seen:
+                seen, since = now, time.monotonic()
+            if all(seen[topic] for topic in named) and time.monotonic() - since >= SETTLE_S:
+                return
+            time.sleep(0.02)
+        missing = [topic for topic in named if not seen[topic]]
+        if missing:
+            self.get_logger().warning(
+                f"nobody subscribes to {', '.join(missing)} after {self.config.wait_timeout} s; "
+                "playing all the same"
+            )
+
+    def play(self) -> None:
+        """Once from the start to the end."""
+        self._ticker.publish(clock_cdr(self.plan.start_ns))
+        for entry in self.plan.leading():
+            self._publish(entry)
+        self.wait_for_subscribers()
+        begin = time.monotonic()
+        for log_time_ns, entry in self.plan.events():
+            due = begin + (log_time_ns - self.plan.start_ns) / 1e9 / self.config.rate
+            late = time.monotonic() - due
+            if late < 0:
+                time.sleep(-late)
+            else:
+                self.max_lag_s = max(self.max_lag_s, late)
+            if entry is None:
+                self._ticker.publish(clock_cdr(log_time_ns))
+            else:
+                self._publish(entry)
+
+    def finish(self) -> None:
+        """Leave when all is acknowledged."""
+        end = time.monotonic() + ACK_S
+        for topic, outlet in self.outlets.items():
+            left = Duration(seconds=max(0.1, end - time.monotonic()))
+            if not outlet.wait_for_all_acked(left):
+                self.get_logger().warning(f"{topic}: a subscriber did not acknowledge everything")
+        time.sleep(LINGER_S)
+
+    def report(self) -> str:
+        """Counts per topic and the worst lag."""
+        total = sum(self.counts.values())
+        lines = [
+            f"{self.config.bag}: {total} messages published, at most {self.max_lag_s:.3f} s late"
+        ]
+        return "\n".join(lines + [f"  {topic}: {count}" for topic, count in self.counts.items()])
+
+
+def main() -> None:
+    """Play to the end (or until SIGINT, SIGTERM); exit 0, or 2 where options or bag are wrong."""
+    flags = play_flags(remove_ros_args(sys.argv)[1:])
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = PlayNode(flags)
+    except (ValueError, OSError) as error:
+        rclpy.try_shutdown()
+        print(f"play: {error}", file=sys.stderr)
+        sys.exit(2)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        node.play()
+        while node.config.loop:
+            node.play()
+        node.finish()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        print(node.report(), flush=True)
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()
