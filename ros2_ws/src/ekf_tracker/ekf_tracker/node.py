@@ -73,7 +73,7 @@ class EkfTrackerNode(Node):
         self._inputs.append((subscription, handler))
 
     def _take_all(self, first_handler: Callable[[Any], None], first: Any) -> None:
-        """Hand over everything that has arrived, so that ready topics cannot overtake each other."""
+        """Hand over all that has arrived, so that ready topics cannot overtake each other."""
         self._heard_since_tick = True
         for subscription, handler in self._inputs:
             if handler == first_handler and first is not None:

@@ -5,8 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from netpos.filters.measurement import GATE_VARIANCE, GROUP, VARIANCE, curvature_variance,
-linearise
+from netpos.filters.measurement import (
+    GATE_VARIANCE,
+    GROUP,
+    VARIANCE,
+    curvature_variance,
+    linearise,
+)
 from netpos.messages.values import Array
 
 
@@ -69,7 +74,9 @@ def fuse(
 
 
 @njit(cache=True)
-def misfit(mean: Array, cov: Array, rows: Array, variance: Array, height_m: float, x: Array) -> float:
+def misfit(
+    mean: Array, cov: Array, rows: Array, variance: Array, height_m: float, x: Array
+) -> float:
     """Twice the negative log posterior of ``x`` (n,) but for a constant: prior and measurement
     terms.
 
@@ -91,7 +98,8 @@ def iterate(
 
     One iteration is the extended Kalman filter; more are Gauss-Newton steps to the most probable
     state
-    (Bell and Cathey 1993), halved while they overshoot, ended when they move less than 1 % of the sd.
+    (Bell and Cathey 1993), halved while they overshoot, ended when they move less than 1 % of the sd
+    or no longer downhill: the result is never less probable than the prior mean.
     """
     innovation, H = linearise(rows, mean, height_m)
     x, P = fuse(mean, cov, innovation, H, variance)
@@ -107,9 +115,8 @@ def iterate(
             halvings += 1
         if cost > last_cost:
             return last, P
-        if halvings == 0 and (np.abs(x - last) < 0.01 * np.sqrt(np.diag(P))).all():
-            break
-        if remaining == 0:
+        small = (np.abs(x - last) < 0.01 * np.sqrt(np.diag(P))).all()
+        if remaining == 0 or (halvings == 0 and small):
             break
         last, last_cost = x, cost
         innovation, H = linearise(rows, x, height_m)

@@ -10,7 +10,6 @@ from typing import Any
 
 from netpos.filters.motion import ProcessNoise
 
-
 FILTER_ITERATIONS = {"ekf": 1, "iekf": 8}
 
 
@@ -73,8 +72,7 @@ class TrackerConfig:
         metadata={
             "low": 1,
             "high": 10000,
-            "text": "epochs rejected in a row before the velocity is opened to
-            initial_speed_sd_mps",
+            "text": "epochs rejected in a row before the velocity opens to its initial sd",
         },
     )
     max_rejected_epochs: int = field(

@@ -48,7 +48,7 @@ def replay_bag(
         config = TrackerConfig.from_mapping(parameters)
         if topics.RSU_MEASUREMENTS not in source.topics:
             raise BagError(
-                f"{bag_in} has no {topics.RSU_MEASUREMENTS}: record that topic to re-estimate a run"
+                f"{bag_in} has no {topics.RSU_MEASUREMENTS}: record that topic to replay"
             )
         metadata = {**source.metadata, TRACKER_METADATA: yaml.safe_dump(asdict(config))}
         tracker = Tracker(config)

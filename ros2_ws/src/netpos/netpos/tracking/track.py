@@ -199,7 +199,7 @@ class Track:
         )
 
     def _opened(self, estimate: _Estimate, sd: float) -> _Estimate:
-        """The estimate as if the velocity had changed by ``sd`` [m/s] after the last measurement."""
+        """The estimate as if the velocity had changed by ``sd`` [m/s] since the last update."""
         elapsed = (estimate.stamp_ns - self._last_accepted_ns) * 1e-9
         cov = estimate.cov.copy()
         for p in range(2):

@@ -6,7 +6,8 @@ anchor. Truth lines: epoch ms, unused, x cm, y cm at the corners of the walk.
 
 Signs. The authors count azimuth clockwise seen from above (bearing in the room = facing -
 azimuth), an RSU counter-clockwise: the sign turns. Azimuth is the angle to the array's own axis
-(a cone angle): its sine is the direction cosine, whatever the tag's height. Elevation keeps its sign: the tag is below the
+(a cone angle): its sine is the direction cosine, whatever the tag's height.
+Elevation keeps its sign: the tag is below the
 arrays, and as written the angles agree with atan2(1.13 m - 2.30 m, distance) within 1 to -8 deg in
 the mean; with the sign turned they are 29 to 41 deg off.
 """
