@@ -56,6 +56,7 @@ class PlayConfig:
     exclude_topics: tuple[str, ...] = ()
     input_only: bool = False  # leave out what the tracker publishes
     wait_for_subscribers: tuple[str, ...] = ("/rsu/measurements",)
+    subscribers: int = 1  # that each of them shall have
     wait_timeout: float = 10.0  # s
     clock_hz: float = 100.0  # /clock messages per second of real time
 
@@ -66,6 +67,7 @@ class PlayConfig:
             ("rate", 0),
             ("clock_hz", 0),
             ("start_offset", -1),
+            ("subscribers", -1),
             ("wait_timeout", -1),
         ):
             value = getattr(self, name)
@@ -126,6 +128,9 @@ def play_flags(arguments: Sequence[str]) -> dict[str, Any]:
         "--wait-for-subscribers",
         nargs="*",
         help="wait until these topics have a subscriber (/rsu/measurements, if it is played)",
+    )
+    parser.add_argument(
+        "--subscribers", type=int, help="how many subscribers each of them shall have (1)"
     )
     parser.add_argument("--wait-timeout", type=float, help="wait so many seconds at most (10)")
     parser.add_argument("--clock-hz", type=float, help="/clock messages per real second (100)")

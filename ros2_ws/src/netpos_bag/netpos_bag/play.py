@@ -10,7 +10,7 @@ from typing import Any
 import rclpy
 from netpos.bags import BagEntry, BagReader
 from netpos.messages.topics import CLOCK
-from netpos_node import message_class
+from netpos_node import message_class, wait_until_heard
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -21,7 +21,6 @@ from netpos_bag.conversions import clock_cdr, profile_to_play
 from netpos_bag.parameters import PlayConfig, play_config, play_flags
 from netpos_bag.playback import Plan
 
-SETTLE_S = 0.3  # the set of subscribers has to stay the same for so long
 ACK_S = 5.0  # Fast DDS asks its readers every 3 s
 LINGER_S = 0.5  # latched messages stay available for so long after the end
 
@@ -49,25 +48,17 @@ class PlayNode(Node):
         self.outlets[entry.topic].publish(entry.cdr)
         self.counts[entry.topic] += 1
 
-    def _subscribers(self) -> dict[str, int]:
-        return {t: outlet.get_subscription_count() for t, outlet in self.outlets.items()}
-
     def wait_for_subscribers(self) -> None:
         """Wait for the named topics to have a subscriber, then for the graph to be at rest."""
-        named = [t for t in self.config.wait_for_subscribers if t in self.outlets]
-        end = time.monotonic() + self.config.wait_timeout
-        seen, since = self._subscribers(), time.monotonic()
-        while time.monotonic() < end:
-            now = self._subscribers()
-            if now != seen:
-                seen, since = now, time.monotonic()
-            if all(seen[topic] for topic in named) and time.monotonic() - since >= SETTLE_S:
-                return
-            time.sleep(0.02)
-        missing = [topic for topic in named if not seen[topic]]
+        named = {
+            topic: self.config.subscribers
+            for topic in self.config.wait_for_subscribers
+            if topic in self.outlets
+        }
+        missing = wait_until_heard(self.outlets, named, self.config.wait_timeout)
         if missing:
             self.get_logger().warning(
-                f"nobody subscribes to {', '.join(missing)} after {self.config.wait_timeout} s; "
+                f"too few subscribers to {', '.join(missing)} after {self.config.wait_timeout} s; "
                 "playing all the same"
             )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any, TypeVar
@@ -15,6 +16,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 Config = TypeVar("Config")
@@ -57,6 +59,34 @@ def run(factory: Callable[[], Node], spin: Callable[[Node], None] = rclpy.spin) 
         pass
     finally:
         rclpy.try_shutdown()
+
+
+def wait_until_heard(
+    publishers: Mapping[str, Publisher],
+    required: Mapping[str, int],
+    timeout_s: float,
+    settle_s: float = 1.0,
+) -> list[str]:
+    """Wait until topics have the ``required`` subscribers and nobody new subscribes to any topic.
+
+    Two nodes may take seconds to discover each other, whoever else they have found, and what a
+    stream carries before that is lost: the number of subscribers is what tells. A recorder finds
+    topics one after the other: ``settle_s`` of rest tells that it has found all. Returns the
+    topics that are short of subscribers after ``timeout_s``. Discovery needs no spinning.
+    """
+    started_s = changed_s = time.monotonic()
+    counts: dict[str, int] = {}
+    while True:
+        now_s, before = time.monotonic(), counts
+        counts = {topic: pub.get_subscription_count() for topic, pub in publishers.items()}
+        if counts != before:
+            changed_s = now_s
+        unheard = [topic for topic, wanted in required.items() if counts[topic] < wanted]
+        if not unheard and now_s - changed_s >= settle_s:
+            return []
+        if now_s - started_s >= timeout_s + settle_s:
+            return unheard
+        time.sleep(0.02)
 
 
 def declare(node: Node, name: str, default: Any, text: str) -> Any:

@@ -6,11 +6,13 @@ from typing import Any
 
 from netpos.messages.topics import BEACON, RSU_INFO, RSU_MEASUREMENTS, of_vue
 from netpos_msgs.msg import Beacon, RsuInfo, RsuMeasurement
-from netpos_node import LATCHED, STREAM, run
+from netpos_node import LATCHED, STREAM, run, wait_until_heard
 from rclpy.node import Node
 
 from rsu_sensor.conversions import beacon_from_msg, measurement_to_msg, rsu_info_to_msg
 from rsu_sensor.parameters import declare_parameters
+
+_PATIENCE_S = 30.0
 
 
 class RsuSensorNode(Node):
@@ -26,6 +28,7 @@ class RsuSensorNode(Node):
         for rsu in self._settings.simulation.rsus:
             if rsu.rsu_id in self._settings.rsu_ids:
                 self._info_pub.publish(rsu_info_to_msg(rsu))
+        self._wait_for_subscribers()
         for vue_id in self._settings.scenario.vue_ids:
             topic = of_vue(vue_id, BEACON)
             self.create_subscription(Beacon, topic, self._on_beacon, STREAM)
@@ -33,6 +36,15 @@ class RsuSensorNode(Node):
             f"{self._settings.scenario.name}: {len(self._settings.rsu_ids)} RSUs listen to "
             f"{', '.join(self._settings.scenario.vue_ids)}"
         )
+
+    def _wait_for_subscribers(self) -> None:
+        wanted = {RSU_MEASUREMENTS: self._settings.subscribers}
+        publishers = {RSU_MEASUREMENTS: self._measurement_pub}
+        if wait_until_heard(publishers, wanted, _PATIENCE_S, settle_s=0.0):
+            self.get_logger().warning(
+                f"fewer than {self._settings.subscribers} subscribers to {RSU_MEASUREMENTS}; "
+                "measuring all the same"
+            )
 
     def _on_beacon(self, msg: Any) -> None:
         try:

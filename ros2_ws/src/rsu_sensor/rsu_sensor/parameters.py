@@ -15,6 +15,7 @@ class RsuParameters:
 
     simulation: Simulation
     rsu_ids: frozenset[str]
+    subscribers: int
 
     @property
     def scenario(self) -> Scenario:
@@ -41,4 +42,9 @@ def declare_parameters(node: Node) -> RsuParameters:
     seed = declare(node, "seed", -1, "seed of all draws; -1: the scenario's")
     wanted = declare(node, "rsus", [""], "ids of the RSUs this process hosts; empty: all")
     simulation = Simulation(load_scenario(name, None if seed == -1 else seed))
-    return RsuParameters(simulation=simulation, rsu_ids=hosted(simulation, list(wanted)))
+    text = "listen to beacons once the measurements have so many subscribers (or after 30 s)"
+    return RsuParameters(
+        simulation=simulation,
+        rsu_ids=hosted(simulation, list(wanted)),
+        subscribers=declare(node, "subscribers", 0, text),
+    )

@@ -7,10 +7,10 @@ from contextlib import suppress
 from threading import Thread
 from typing import Any
 
-from netpos.messages.topics import BEACON, CLOCK, split
+from netpos.messages.topics import BEACON, CLOCK, INITIAL_POSE, split
 from netpos.scenario import Simulation
 from netpos.scenario.offline import timeline
-from netpos_node import STREAM, run
+from netpos_node import STREAM, run, wait_until_heard
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -19,6 +19,7 @@ from vue_sim.conversions import publication, publications
 from vue_sim.parameters import declare_parameters
 
 _CLOCK_DEPTH = 10
+_INPUTS = (BEACON, INITIAL_POSE)  # what others need from the first message on
 _POLL_S = 0.02
 _DELIVERY_S = 5
 
@@ -60,26 +61,16 @@ class VueSimNode(Node):
 
     def _wait_for_subscribers(self) -> None:
         """Until all beacons are heard and for a while nobody new has subscribed to anything."""
-        started_s = changed_s = time.monotonic()
-        counts: dict[str, int] = {}
-        while self.context.ok():
-            now_s, before = time.monotonic(), counts
-            counts = self._subscriber_counts()
-            if counts != before:
-                changed_s = now_s
-            unheard = [t for t, n in counts.items() if split(t)[1] == BEACON and n == 0]
-            if not unheard and now_s - changed_s >= self._settings.settle_s:
-                return
-            if unheard and now_s - started_s >= self._settings.wait_for_subscribers_s:
-                self.get_logger().warning(
-                    f"nobody subscribes to {', '.join(unheard)}; is rsu_sensor running? "
-                    "Starting anyway"
-                )
-                return
-            time.sleep(_POLL_S)
-
-    def _subscriber_counts(self) -> dict[str, int]:
-        return {topic: pub.get_subscription_count() for topic, pub in self._pubs.items()}
+        settings = self._settings
+        inputs = {t: settings.subscribers for t in self._pubs if split(t)[1] in _INPUTS}
+        unheard = wait_until_heard(
+            self._pubs, inputs, settings.wait_for_subscribers_s, settings.settle_s
+        )
+        if unheard:
+            self.get_logger().warning(
+                f"{', '.join(unheard)}: fewer than {settings.subscribers} subscribers; are "
+                "rsu_sensor and ekf_tracker running? Starting anyway"
+            )
 
 
 def _sleep_until(due_s: float) -> None:

@@ -16,6 +16,7 @@ class SimulatorParameters:
     scenario: Scenario
     rate: float
     clock_hz: float
+    subscribers: int
     wait_for_subscribers_s: float
     settle_s: float
     shutdown_at_end: bool
@@ -27,6 +28,8 @@ class SimulatorParameters:
             raise ValueError(
                 f"parameter clock_hz must be above 0 and at most 10000, got {self.clock_hz}"
             )
+        if self.subscribers < 0:
+            raise ValueError(f"parameter subscribers must be >= 0, got {self.subscribers}")
         for name in ("wait_for_subscribers_s", "settle_s"):
             if not 0 <= getattr(self, name) <= 3600:
                 raise ValueError(
@@ -42,11 +45,14 @@ def declare_parameters(node: Node) -> SimulatorParameters:
         scenario=load_scenario(name, None if seed == -1 else seed),
         rate=declare(node, "rate", 1.0, "speed against real time"),
         clock_hz=declare(node, "clock_hz", 100.0, "/clock messages per simulated second"),
+        subscribers=declare(
+            node, "subscribers", 1, "wait until beacon and initialpose have so many subscribers"
+        ),
         wait_for_subscribers_s=declare(
-            node, "wait_for_subscribers_s", 30.0, "longest wait for someone to hear the beacons"
+            node, "wait_for_subscribers_s", 30.0, "longest wait for these subscribers"
         ),
         settle_s=declare(
-            node, "settle_s", 2.0, "start once no subscriber (a recorder) has come for so long"
+            node, "settle_s", 1.0, "start once no subscriber (a recorder) has come for so long"
         ),
         shutdown_at_end=declare(
             node, "shutdown_at_end", True, "end the process with the scenario"

@@ -53,6 +53,18 @@ def ellipse_axes(
     return lengths[:, 1], lengths[:, 0], np.rad2deg(np.arctan2(major[:, 1], major[:, 0]))
 
 
+def magnification(lengths: Array, extent_m: float) -> int:
+    """How much to enlarge ellipses whose median length (n,) m would be lost on a map of an extent.
+
+    1 where they show: at a fiftieth of the extent; else the next of 2, 5, 10, 20, ... that makes
+    them so.
+    """
+    median = float(np.median(lengths))
+    needed = 0.02 * extent_m / median if median > 0.0 else 1.0
+    steps = [digit * 10**power for power in range(4) for digit in (1, 2, 5)]
+    return next((step for step in steps if step >= needed), steps[-1])
+
+
 def _heard(evaluation: Evaluation) -> set[str]:
     return {
         source
@@ -134,7 +146,9 @@ def _draw_rsus(axes: Axes, evaluation: Evaluation, heard: set[str]) -> list[Line
     return handles
 
 
-def _draw_track(axes: Axes, name: str, vue: VueEvaluation, colour: str) -> list[Line2D]:
+def _draw_track(
+    axes: Axes, name: str, vue: VueEvaluation, colour: str, extent_m: float
+) -> list[Line2D]:
     truth, estimate = vue.run.truth.position, vue.scored.pairs.estimate
     handles = axes.plot(*truth[:, :2].T, color="black", lw=1.2, ls=(0, (4, 2)), zorder=2)
     handles[0].set_label("ground truth")
@@ -156,10 +170,11 @@ def _draw_track(axes: Axes, name: str, vue: VueEvaluation, colour: str) -> list[
     if not cov.any():
         return handles
     major, minor, angle = ellipse_axes(cov)
+    enlarged = magnification(major, extent_m)
     axes.add_collection(
         EllipseCollection(
-            major,
-            minor,
+            enlarged * major,
+            enlarged * minor,
             angle,
             units="xy",
             offsets=shown.position[:, :2],
@@ -179,7 +194,7 @@ def _draw_track(axes: Axes, name: str, vue: VueEvaluation, colour: str) -> list[
             ms=9,
             mfc=colour + "1C",
             mec=colour + "A0",
-            label="95 % ellipse",
+            label="95 % ellipse" if enlarged == 1 else f"95 % ellipse × {enlarged}",
         )
     )
     return handles
@@ -187,13 +202,14 @@ def _draw_track(axes: Axes, name: str, vue: VueEvaluation, colour: str) -> list[
 
 def draw_map(evaluation: Evaluation) -> Figure:
     """Plan view in map axes: buildings, RSUs, true and estimated tracks, 95 % ellipses evenly
-    along each track.
+    along each track, enlarged (the legend says by how much) where they would be lost.
 
     A hollow dot marks the first estimate. Estimates outside the view are counted below it.
     """
     heard = _heard(evaluation)
     low, high = _view(evaluation, heard)
     width, height = high - low
+    extent = float(max(width, height))
     scale = min(8.5 / width, 7.5 / height)
     figure = Figure(figsize=(width * scale + 1.0, height * scale + 1.0))
     axes = figure.add_subplot()
@@ -204,7 +220,7 @@ def draw_map(evaluation: Evaluation) -> Figure:
     handles: list[Line2D | Patch] = []
     outside = 0
     for index, (name, vue) in enumerate(evaluation.vues.items()):
-        handles += _draw_track(axes, name, vue, TRACK_COLOURS[index % len(TRACK_COLOURS)])
+        handles += _draw_track(axes, name, vue, TRACK_COLOURS[index % len(TRACK_COLOURS)], extent)
         xy = vue.scored.pairs.estimate.position[:, :2]
         outside += int(np.count_nonzero(~((low <= xy) & (xy <= high)).all(axis=1)))
     handles += _draw_rsus(axes, evaluation, heard)

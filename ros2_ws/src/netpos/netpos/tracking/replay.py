@@ -44,7 +44,7 @@ def replay_bag(
     bad parameter, ``FileExistsError`` where ``bag_out`` exists.
     """
     with BagReader(bag_in) as source:
-        parameters = {**bag_settings(source.metadata), **(overrides or {})}
+        parameters = {**bag_settings(source.metadata).parameters, **(overrides or {})}
         config = TrackerConfig.from_mapping(parameters)
         if topics.RSU_MEASUREMENTS not in source.topics:
             raise BagError(

@@ -23,26 +23,37 @@ class TrackerSettings:
     vue_ids: tuple[str, ...] = ("vue_1",)
 
 
-def bag_settings(metadata: Mapping[str, str]) -> Mapping[str, Any]:
-    """Tracker parameters in the metadata of a bag; empty where it carries none."""
-    loaded = yaml.safe_load(metadata.get(TRACKER_METADATA, "{}")) or {}
+DEFAULTS = TrackerSettings()
+
+
+def bag_settings(metadata: Mapping[str, str]) -> TrackerSettings:
+    """Settings a bag carries: its own parameters, else those of the scenario it was made from.
+
+    Raises ``ValueError`` where the scenario it names is not to be found.
+    """
+    if TRACKER_METADATA not in metadata:
+        return _scenario_settings(metadata["scenario"]) if "scenario" in metadata else DEFAULTS
+    loaded = yaml.safe_load(metadata[TRACKER_METADATA]) or {}
     if not isinstance(loaded, dict):
         raise ValueError(f"the bag's {TRACKER_METADATA!r} metadata is not a mapping of parameters")
-    return loaded
+    return TrackerSettings(loaded)
 
 
 def settings_from(source: str) -> TrackerSettings:
-    """Settings of a scenario (name or YAML file) or of a bag (folder); defaults for an empty
-    source.
+    """Settings of a scenario (name or YAML file) or of a bag (folder); defaults for no source.
 
     Raises ``ValueError`` naming what is wrong with the source.
     """
     if not source:
-        return TrackerSettings()
+        return DEFAULTS
     if Path(source).is_dir():
         with BagReader(Path(source)) as bag:
-            return TrackerSettings(bag_settings(bag.metadata))
-    from netpos.scenario import load_scenario  # noqa: PLC0415 - a bag needs no scenario
+            return bag_settings(bag.metadata)
+    return _scenario_settings(source)
+
+
+def _scenario_settings(source: str) -> TrackerSettings:
+    from netpos.scenario import load_scenario  # noqa: PLC0415 - a bag of a real run needs none
 
     scenario = load_scenario(source)
     return TrackerSettings(dict(scenario.tracker), tuple(scenario.vue_ids))
