@@ -46,6 +46,23 @@ def uwb_anchors(
     _report(bag, counts)
 
 
+def _imu_command(recording_format: str, what: str) -> None:
+    @importers.command(recording_format, help=what)
+    def command(path: Annotated[Path, typer.Argument(help="The recording.")], bag: Bag) -> None:
+        from netpos.bags.importers.imu import import_imu  # noqa: PLC0415
+
+        for topic, count in sorted(
+            import_imu(path, bag, recording_format=recording_format).items()
+        ):
+            typer.echo(f"  {topic}: {count}")
+        typer.echo(f"wrote {bag}; play it into a running pdr_node: ros2 run netpos_bag play {bag}")
+
+
+_imu_command("waist-imu", "IMU and magnetometer at the waist (data.mat).")
+_imu_command("steps-phone", "Phone accelerometer (csv).")
+_imu_command("pdr-phone", "Phone IMU and magnetometer (txt).")
+
+
 def _report(bag: Path, counts: Mapping[str, int]) -> None:
     for topic, count in sorted(counts.items()):
         typer.echo(f"  {topic}: {count}")

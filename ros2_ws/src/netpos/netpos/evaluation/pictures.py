@@ -61,7 +61,7 @@ def magnification(lengths: Array, extent_m: float) -> int:
     """
     median = float(np.median(lengths))
     needed = 0.02 * extent_m / median if median > 0.0 else 1.0
-    steps = [digit * 10**power for power in range(4) for digit in (1, 2, 5)]
+    steps: list[int] = [digit * 10**power for power in range(4) for digit in (1, 2, 5)]
     return next((step for step in steps if step >= needed), steps[-1])
 
 

@@ -69,6 +69,15 @@ def _embed(cov: Array) -> Array:
     return full.reshape(-1)
 
 
+def _imu_covariance(variance: float) -> Array:
+    """Flat (3, 3) of equal variances; -1 (not measured, REP-145) only in the first element."""
+    cov = np.zeros(9)
+    cov[0::4] = variance
+    if variance < 0.0:
+        cov[4] = cov[8] = 0.0
+    return cov
+
+
 class Codec:
     """Builds and reads the messages of netpos; ``resolve`` maps a type name to its class."""
 
@@ -330,16 +339,14 @@ class Codec:
 
     def imu_to_msg(self, imu: ImuSample) -> Any:
         """sensor_msgs/Imu without orientation (covariance[0] = -1, REP-145)."""
-        no_orientation = np.zeros(9)
-        no_orientation[0] = -1.0
         return self._resolve("sensor_msgs/msg/Imu")(
             header=self.header(imu.stamp_ns, base_link(imu.vue_id)),
             orientation=self._to_quaternion(np.array([0.0, 0.0, 0.0, 1.0])),
-            orientation_covariance=no_orientation,
+            orientation_covariance=_imu_covariance(-1.0),
             angular_velocity=self._to_vector(imu.angular_velocity),
-            angular_velocity_covariance=_flat(np.eye(3) * imu.angular_velocity_var),
+            angular_velocity_covariance=_imu_covariance(imu.angular_velocity_var),
             linear_acceleration=self._to_vector(imu.specific_force),
-            linear_acceleration_covariance=_flat(np.eye(3) * imu.specific_force_var),
+            linear_acceleration_covariance=_imu_covariance(imu.specific_force_var),
         )
 
     @staticmethod
