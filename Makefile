@@ -1,6 +1,7 @@
 # netpos: make setup | demo | test | lint | bench | clean
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
+SHELL_FILES := env.sh $(wildcard scripts/*.sh) scripts/ros2_standin/ros2 $(wildcard docker/*.sh) .ci/run
 
 .PHONY: help setup demo test test-unit test-integration lint bench clean
 
@@ -21,8 +22,8 @@ test-unit: setup ## the library and the nodes' conversions, without a running gr
 test-integration: setup ## the real processes, started with ros2 run
 	@. ./env.sh && python -m pytest -q tests
 
-lint: setup ## ruff, mypy
-	@. ./env.sh && ruff check . && ruff format --check . && mypy
+lint: setup ## ruff, mypy, shellcheck
+	@. ./env.sh && ruff check . && ruff format --check . && mypy && shellcheck -x $(SHELL_FILES)
 
 bench: setup ## speed as ratios measured in one run
 	@. ./env.sh && netpos bench

@@ -1,6 +1,7 @@
 """Point the CMake files of the ROS wheels at this interpreter.
 
-The wheels carry the include folders of the Python and NumPy they were built with; CMake stops at folders that are not there.
+The wheels carry the include folders of the Python and NumPy they were built with; CMake stops at
+folders that are not there.
 """
 
 from __future__ import annotations

@@ -96,7 +96,7 @@ class EkfTrackerNode(Node):
             self.get_logger().error(str(error))
 
     def _on_measurement(self, msg: Any) -> None:
-        if msg.vue_id not in self._outputs:
+        if msg.vue_id not in self._outputs and topics.is_vue_id(msg.vue_id):
             self._add_device(msg.vue_id)
         self._add(CODEC.measurement_from_msg(msg))
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
+from netpos.messages.topics import is_vue_id
 from netpos.tracking import TrackerConfig
 from netpos.tracking.settings import settings_from
 from netpos_node import declare, declare_config
@@ -23,9 +24,14 @@ def declare_parameters(node: Node) -> TrackerParameters:
     """Declare and read all parameters; a scenario or a bag gives defaults, explicit values win."""
     text = "scenario (name or YAML) or bag whose tracker parameters and devices are the defaults"
     settings = settings_from(declare(node, "scenario", "", text))
+    defaults = TrackerConfig.from_mapping(settings.parameters)
     text = "devices whose topics exist from the start; others appear when first heard"
+    vue_ids = tuple(declare(node, "vues", list(settings.vue_ids), text))
+    for vue_id in vue_ids:
+        if not is_vue_id(vue_id):
+            raise ValueError(f"vues: {vue_id!r} is no device name; use letters, digits and _")
     return TrackerParameters(
-        vue_ids=tuple(declare(node, "vues", list(settings.vue_ids), text)),
+        vue_ids=vue_ids,
         publish_tf=declare(node, "publish_tf", True, "publish map -> base_link on /tf"),
-        config=declare_config(node, TrackerConfig, settings.parameters),
+        config=declare_config(node, TrackerConfig, asdict(defaults)),
     )

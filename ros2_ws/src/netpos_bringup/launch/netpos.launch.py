@@ -28,7 +28,9 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("scenario", description="name of a scenario, or a YAML file"),
             DeclareLaunchArgument("seed", default_value="-1", description="-1: the scenario's"),
             DeclareLaunchArgument("rate", default_value="1.0", description="against real time"),
-            DeclareLaunchArgument("bag", default_value="", description="folder of a new recording"),
+            DeclareLaunchArgument(
+                "bag", default_value="", description="folder of a new recording"
+            ),
             Node(
                 package="netpos_bag",
                 executable="record",

@@ -74,6 +74,28 @@ def fuse(
 
 
 @njit(cache=True)
+def distance2(cov: Array, d: Array) -> float:
+    """Squared Mahalanobis distance of ``d`` (n,) by elimination.
+
+    What is known exactly (a pivot of no more than rounding) is left out, so that ``cov`` (n, n)
+    may be singular.
+    """
+    A, y = cov.copy(), d.copy()
+    total = 0.0
+    for j in range(d.size):
+        pivot = A[j, j]
+        if pivot <= 1e-14 * cov[j, j]:
+            continue
+        total += y[j] * y[j] / pivot
+        for i in range(j + 1, d.size):
+            factor = A[i, j] / pivot
+            y[i] -= factor * y[j]
+            for k in range(j + 1, d.size):
+                A[i, k] -= factor * A[j, k]
+    return total
+
+
+@njit(cache=True)
 def misfit(
     mean: Array, cov: Array, rows: Array, variance: Array, height_m: float, x: Array
 ) -> float:
@@ -84,9 +106,8 @@ def misfit(
     freedom
     per row; unlike the NIS it stays so where the model bends over the width of the prior.
     """
-    whitened = np.linalg.solve(np.linalg.cholesky(cov), x - mean)
     innovation, _ = linearise(rows, x, height_m)
-    return float((whitened * whitened).sum() + (innovation * innovation / variance).sum())
+    return distance2(cov, x - mean) + float((innovation * innovation / variance).sum())
 
 
 @njit(cache=True)
@@ -97,9 +118,8 @@ def iterate(
     the last result.
 
     One iteration is the extended Kalman filter; more are Gauss-Newton steps to the most probable
-    state
-    (Bell and Cathey 1993), halved while they overshoot, ended when they move less than 1 % of the sd
-    or no longer downhill: the result is never less probable than the prior mean.
+    state (Bell and Cathey 1993), halved while they overshoot, ended when they move less than 1 %
+    of the sd or no longer downhill: the result is never less probable than the prior mean.
     """
     innovation, H = linearise(rows, mean, height_m)
     x, P = fuse(mean, cov, innovation, H, variance)

@@ -25,6 +25,11 @@ TRACK_STATUS = "track_status"
 TRACKER_OUTPUTS = (ODOMETRY, CLOCK_STATE, TRACK_STATUS)
 
 
+def is_vue_id(text: str) -> bool:
+    """Whether a text can name a device: letters, digits and underscores, no digit first."""
+    return text.isascii() and text.isidentifier()
+
+
 def of_vue(vue_id: str, name: str) -> str:
     """Topic of a device: ``/vue_1/beacon``."""
     return f"/{vue_id}/{name}"

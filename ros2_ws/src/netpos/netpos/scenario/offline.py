@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import yaml
+
 from netpos.bags import BagWriter, codec
 from netpos.messages.topics import CLOCK
 from netpos.messages.values import Beacon
@@ -29,7 +31,11 @@ def simulate_to_bag(
     """
     convert = codec()
     count = 0
-    metadata = {"scenario": scenario.name, "seed": str(scenario.seed)}
+    metadata = {
+        "scenario": scenario.name,
+        "seed": str(scenario.seed),
+        "tracker": yaml.safe_dump(dict(scenario.tracker)),  # the name alone may not be found again
+    }
     with BagWriter(bag_path, metadata=metadata) as bag:
         for item in timeline(Simulation(scenario), clock_hz, measured=True):
             if isinstance(item, int):

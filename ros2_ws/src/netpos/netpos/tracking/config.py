@@ -127,7 +127,10 @@ def _typed(name: str, default: Any, value: Any) -> Any:
             return str(value).lower() == "true"
         raise ValueError(f"{name} must be true or false, got {value!r}")
     try:
-        return type(default)(value)
+        typed = type(default)(value)
+        if isinstance(default, int) and typed != float(value):
+            raise ValueError(value)
+        return typed
     except (TypeError, ValueError):
         raise ValueError(
             f"{name} must be of type {type(default).__name__}, got {value!r}"

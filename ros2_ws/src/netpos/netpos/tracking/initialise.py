@@ -83,7 +83,7 @@ def _solve(
     damping = 1e-3
     cost, b, A = _normal_equations(state, *problem)
     for _ in range(_ITERATIONS):
-        step = np.linalg.solve(A + damping * np.diag(np.diag(A)), b)
+        step = _inverse(A + damping * np.diag(np.diag(A))) @ b
         new_cost, new_b, new_A = _normal_equations(state + step, *problem)
         if new_cost < cost:
             done = cost - new_cost < 1e-6 * (1.0 + cost)
@@ -95,7 +95,16 @@ def _solve(
             damping *= 10.0
             if damping > 1e8:
                 break
-    return cost, state, np.linalg.inv(A)
+    return cost, state, _inverse(A)
+
+
+def _inverse(A: Array) -> Array:
+    """Inverse of a positive definite matrix whose units differ by many orders of magnitude."""
+    scale = 1.0 / np.sqrt(np.diag(A))
+    scaling = np.outer(scale, scale)
+    # 1e-14 is rounding: it keeps inv from calling singular what is only ill-conditioned.
+    inverse: Array = np.linalg.inv(A * scaling + 1e-14 * np.eye(len(A))) * scaling
+    return inverse
 
 
 class Initialiser:
@@ -177,6 +186,12 @@ class Initialiser:
             if not rsu.in_front(dx, dy) or dx * dx + dy * dy + dz * dz < _NEAREST_M**2:
                 return False
         return True
+
+
+def _is_sound(fit: tuple[float, Array, Array]) -> bool:
+    """Whether the fit is finite and its position covariance survived rounding."""
+    cost, _, cov = fit
+    return bool(math.isfinite(cost) and np.linalg.eigvalsh(cov[:2, :2])[0] > 0.0)
 
 
 def _has_rival(fits: list[tuple[float, Array, Array]]) -> bool:

@@ -53,6 +53,10 @@ class Epoch:
         expected = max(m.expected for m in measured)
         return 0 < expected <= len(measured)
 
+    def only_a_pose(self) -> bool:
+        """Nothing but an initial pose: measurements of its stamp may be under way."""
+        return all(isinstance(item, InitialPose) for item in self.items.values())
+
 
 class Sequencer:
     """Collects the items of one device and releases epochs in stamp order."""
@@ -110,4 +114,4 @@ class Sequencer:
         live = [c for c, w in self._watermark.items() if w >= newest - _LIVE_NS]
         reached = all(self._watermark[c] >= epoch.stamp_ns for c in live if c != "initial_pose")
         closed = epoch.rsu_complete() or self._watermark.get(RSU, 0) > epoch.stamp_ns
-        return reached and closed
+        return reached and closed and (newest > epoch.stamp_ns or not epoch.only_a_pose())

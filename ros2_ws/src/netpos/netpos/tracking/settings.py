@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 
 from netpos.bags import BagReader
+from netpos.messages import topics
 
 # Name of the metadata entry of a bag that holds parameters for its measurements, as YAML.
 TRACKER_METADATA = "tracker"
@@ -40,15 +41,18 @@ def bag_settings(metadata: Mapping[str, str]) -> TrackerSettings:
 
 
 def settings_from(source: str) -> TrackerSettings:
-    """Settings of a scenario (name or YAML file) or of a bag (folder); defaults for no source.
+    """Settings of a scenario (name or YAML file) or of a bag (folder or .mcap file); defaults for
+    no source. The devices of a bag are those its topics name.
 
     Raises ``ValueError`` naming what is wrong with the source.
     """
     if not source:
         return DEFAULTS
-    if Path(source).is_dir():
+    if Path(source).is_dir() or source.endswith(".mcap"):
         with BagReader(Path(source)) as bag:
-            return bag_settings(bag.metadata)
+            vue_ids = sorted({topics.split(topic)[0] for topic in bag.topics} - {""})
+            parameters = bag_settings(bag.metadata).parameters
+            return TrackerSettings(parameters, tuple(vue_ids) or DEFAULTS.vue_ids)
     return _scenario_settings(source)
 
 

@@ -175,7 +175,9 @@ class Track:
         if not accepted.any():
             cov = self._predict(stamp_ns).cov
         self._estimate = _Estimate(stamp_ns, mean, cov)
-        self.rejected["gate"] += int(len(batch.items) - accepted.sum())
+        refused = int(len(batch.items) - accepted.sum())
+        if refused:
+            self.rejected["gate"] += refused
         if not accepted.any():
             self._rejected_in_row += 1
             if self._rejected_in_row >= self._config.max_rejected_epochs:

@@ -6,7 +6,9 @@ import math
 
 import numpy as np
 
+from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages.codec import MAP_FRAME
+from netpos.messages.topics import is_vue_id
 from netpos.messages.values import (
     Array,
     Field,
@@ -18,28 +20,36 @@ from netpos.messages.values import (
 )
 
 _SCALARS = (
-    (Field.AZIMUTH, "azimuth_rad", "azimuth_var"),
-    (Field.ELEVATION, "elevation_rad", "elevation_var"),
-    (Field.TOA, "toa_s", "toa_var"),
-    (Field.RANGE, "range_m", "range_var"),
-    (Field.PHASE, "phase_difference_rad", "phase_difference_var"),
+    (Field.AZIMUTH, "azimuth_rad", "azimuth_var", 1.0),
+    (Field.ELEVATION, "elevation_rad", "elevation_var", 1.0),
+    (Field.TOA, "toa_s", "toa_var", SPEED_OF_LIGHT_MPS),
+    (Field.RANGE, "range_m", "range_var", 1.0),
+    (Field.PHASE, "phase_difference_rad", "phase_difference_var", 1.0),
 )
-_KNOWN = sum(flag for flag, _, _ in _SCALARS) | Field.POSITION
+_FUSED = Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE | Field.POSITION
+_KNOWN = _FUSED | Field.PHASE
 _LARGEST = 1e9
+# Standard deviations (m, rad, m/s) beyond which double precision cannot fuse with metres.
+_SD_MIN, _SD_MAX = 1e-6, 1e6
+_CONDITION_MIN = 1e-12  # smallest over largest eigenvalue; below it a Cholesky factor is rounding
 
 
 def measurement_fault(m: RsuMeasurement) -> str | None:
     """Reason to refuse an RSU measurement whatever the track thinks of it."""
+    if not is_vue_id(m.vue_id):
+        return "vue_id"
     if m.stamp_ns <= 0:
         return "zero_stamp"
-    if not m.fields & _KNOWN or m.fields & ~_KNOWN:
+    if not m.fields or int(m.fields) & ~int(_KNOWN):
         return "no_fields" if not m.fields else "unknown_fields"
-    for flag, name, var_name in _SCALARS:
+    if not m.fields & _FUSED:
+        return "unsupported_fields"
+    for flag, name, var_name, scale in _SCALARS:
         if m.fields & flag:
             value, variance = getattr(m, name), getattr(m, var_name)
             if not (math.isfinite(value) and abs(value) < _LARGEST and math.isfinite(variance)):
                 return "not_finite"
-            if variance <= 0.0:
+            if not _variance_in_range(scale * scale * variance):
                 return "variance"
     if m.fields & Field.RANGE and m.range_m < 0.0:
         return "negative_range"
@@ -61,7 +71,9 @@ def speed_fault(v: GroundSpeed) -> str | None:
         return "zero_stamp"
     if not (math.isfinite(v.speed_mps) and math.isfinite(v.speed_var)):
         return "not_finite"
-    return "variance" if v.speed_var <= 0.0 else None
+    if abs(v.speed_mps) >= _LARGEST:
+        return "not_finite"
+    return None if _variance_in_range(v.speed_var) else "variance"
 
 
 def pose_fault(p: InitialPose) -> str | None:
@@ -78,10 +90,15 @@ def rsu_fault(info: RsuInfo) -> str | None:
     if abs(float(np.linalg.norm(info.quaternion)) - 1.0) > 1e-3:
         return f"orientation of {info.rsu_id} is not a unit quaternion"
     biases = (info.azimuth_bias_sd_rad, info.elevation_bias_sd_rad, info.range_bias_sd_m)
-    if not all(math.isfinite(sd) and sd >= 0.0 for sd in biases):
+    common = info.common_range_bias_sd_m
+    if not all(0.0 <= sd < _LARGEST for sd in (*biases, common)):
         return f"bias sd of {info.rsu_id} must be finite and >= 0"
     if any(biases) and not info.bias_correlation_time_s > 0.0:
         return f"bias_correlation_time of {info.rsu_id} must be > 0 s where it has a bias"
+    if common and not info.common_bias_correlation_time_s > 0.0:
+        return f"common_bias_correlation_time of {info.rsu_id} must be > 0 s where it has a bias"
+    if not 0.0 <= info.noise_correlation_time_s < _LARGEST:
+        return f"noise_correlation_time of {info.rsu_id} must be finite and >= 0 s"
     return None
 
 
@@ -90,6 +107,13 @@ def _gaussian_fault(value: Array, cov: Array) -> str | None:
         return "not_finite"
     if (np.abs(value) >= _LARGEST).any():
         return "not_finite"
-    if not np.allclose(cov, cov.T, rtol=1e-6, atol=0.0) or np.linalg.eigvalsh(cov)[0] <= 0.0:
+    if not np.allclose(cov, cov.T, rtol=1e-6, atol=0.0):
         return "variance"
-    return None
+    smallest, largest = np.linalg.eigvalsh(cov)
+    definite = smallest > _CONDITION_MIN * largest
+    sound = definite and _variance_in_range(smallest) and _variance_in_range(largest)
+    return None if sound else "variance"
+
+
+def _variance_in_range(variance: float) -> bool:
+    return bool(_SD_MIN**2 <= variance <= _SD_MAX**2)

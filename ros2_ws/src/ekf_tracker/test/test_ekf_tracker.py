@@ -1,0 +1,401 @@
+"""Tracker node, built in this process and fed by its callbacks; nothing sleeps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
+from ekf_tracker.conversions import diagnostics_to_msg
+from ekf_tracker.node import EkfTrackerNode
+from netpos.bags import BagWriter, codec
+from netpos.messages.values import (
+    Field,
+    InitialPose,
+    RsuInfo,
+    RsuMeasurement,
+    TrackState,
+    TrackStatus,
+    Velocity,
+)
+from netpos_node import CODEC
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.time import Time
+from std_srvs.srv import SetBool, Trigger
+
+DOMAIN = 36
+T0 = 1_000_000_000
+PLACES = {"a": (0.0, 10.0), "b": (60.0, -10.0), "c": (120.0, 10.0)}
+
+
+class Kept:
+    """A publisher that keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.messages: list[Any] = []
+
+    def publish(self, msg: Any) -> None:
+        self.messages.append(msg)
+
+
+@pytest.fixture
+def make() -> Iterator[Any]:
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    nodes = []
+
+    def node(**overrides: Any) -> EkfTrackerNode:
+        values = [Parameter(name, value=value) for name, value in overrides.items()]
+        nodes.append(EkfTrackerNode(context=context, parameter_overrides=values))
+        return nodes[-1]
+
+    yield node
+    for one in nodes:
+        one.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def arrive(node: EkfTrackerNode, handler: Any, msg: Any) -> None:
+    """As the subscription does on arrival."""
+    node._take_all(handler, msg)
+
+
+def know_rsus(node: EkfTrackerNode) -> None:
+    for name, (x, y) in PLACES.items():
+        info = RsuInfo(rsu_id=name, position=np.array([x, y, 0.0]))
+        arrive(node, node._on_rsu_info, CODEC.rsu_info_to_msg(info))
+
+
+def measurement(name: str, t_s: float, vue_id: str = "vue_1", **change: Any) -> Any:
+    """What an RSU measures of a device that drives east along y = 0 at 8 m/s."""
+    d = np.array([8.0 * t_s, 0.0]) - PLACES[name]
+    values = {
+        "stamp_ns": T0 + round(t_s * 1e9),
+        "rsu_id": name,
+        "vue_id": vue_id,
+        "expected": 3,
+        "fields": Field.AZIMUTH | Field.TOA,
+        "azimuth_rad": math.atan2(d[1], d[0]),
+        "azimuth_var": 3e-4,
+        "toa_s": float(np.linalg.norm(d)) / 299_792_458.0,
+        "toa_var": 1e-18,
+    }
+    return CODEC.measurement_to_msg(RsuMeasurement(**(values | change)))
+
+
+def drive(node: EkfTrackerNode, epochs: range, vue_id: str = "vue_1") -> None:
+    for k in epochs:
+        for name in PLACES:
+            arrive(node, node._on_measurement, measurement(name, 0.1 * k, vue_id))
+
+
+def keep(node: EkfTrackerNode, vue_id: str = "vue_1") -> tuple[Kept, Kept, Kept]:
+    if vue_id not in node._outputs:
+        node._add_device(vue_id)
+    kept = Kept(), Kept(), Kept()
+    node._outputs[vue_id] = kept  # type: ignore[assignment]
+    return kept
+
+
+def handler_of(node: EkfTrackerNode, topic: str) -> Any:
+    return next(h for s, h in node._inputs if s.topic_name == topic)
+
+
+# the graph
+
+
+def test_topics_types_and_qos(make: Any) -> None:
+    node = make(vues=["car"])
+    published = dict(node.get_publisher_names_and_types_by_node("ekf_tracker", "/"))
+    assert published["/car/odometry"] == ["nav_msgs/msg/Odometry"]
+    assert published["/car/clock_state"] == ["netpos_msgs/msg/ClockState"]
+    assert published["/car/track_status"] == ["netpos_msgs/msg/TrackStatus"]
+    assert published["/diagnostics"] == ["diagnostic_msgs/msg/DiagnosticArray"]
+    assert published["/tf"] == ["tf2_msgs/msg/TFMessage"]
+    read = dict(node.get_subscriber_names_and_types_by_node("ekf_tracker", "/"))
+    assert read["/rsu/info"] == ["netpos_msgs/msg/RsuInfo"]
+    assert read["/rsu/measurements"] == ["netpos_msgs/msg/RsuMeasurement"]
+    assert read["/car/step_velocity"] == ["geometry_msgs/msg/TwistWithCovarianceStamped"]
+    assert read["/car/ground_speed"] == ["geometry_msgs/msg/TwistWithCovarianceStamped"]
+    assert read["/car/initialpose"] == ["geometry_msgs/msg/PoseWithCovarianceStamped"]
+    services = dict(node.get_service_names_and_types_by_node("ekf_tracker", "/"))
+    assert services["/ekf_tracker/reset"] == ["std_srvs/srv/Trigger"]
+    assert services["/ekf_tracker/enable"] == ["std_srvs/srv/SetBool"]
+
+    (latched,) = node.get_subscriptions_info_by_topic("/rsu/info")
+    assert latched.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    assert latched.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+    for topic in ("/rsu/measurements", "/car/step_velocity", "/car/initialpose"):
+        (end,) = node.get_subscriptions_info_by_topic(topic)
+        assert end.qos_profile.durability == DurabilityPolicy.VOLATILE
+        assert end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+    (end,) = node.get_publishers_info_by_topic("/car/odometry")
+    assert end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+
+
+def test_tf_can_be_switched_off(make: Any) -> None:
+    node = make(publish_tf=False)
+    assert "/tf" not in dict(node.get_publisher_names_and_types_by_node("ekf_tracker", "/"))
+    odometry, _, _ = keep(node)
+    know_rsus(node)
+    drive(node, range(3))
+    assert len(odometry.messages) == 3
+
+
+def test_unknown_device_gets_its_topics_when_first_heard(make: Any) -> None:
+    node = make(vues=["vue_1"])
+    know_rsus(node)
+    drive(node, range(2), "vue_9")
+    published = dict(node.get_publisher_names_and_types_by_node("ekf_tracker", "/"))
+    assert {"/vue_1/odometry", "/vue_9/odometry", "/vue_9/track_status"} <= set(published)
+    read = dict(node.get_subscriber_names_and_types_by_node("ekf_tracker", "/"))
+    assert "/vue_9/step_velocity" in read
+    assert node._statuses["vue_9"].state is TrackState.TRACKING
+
+
+@pytest.mark.parametrize("vue_id", ["", "no spaces", "1st", "a//b", "ü", "a/b", "{x}"])
+def test_a_name_that_is_no_topic_is_refused_and_the_node_lives_on(make: Any, vue_id: str) -> None:
+    node = make()
+    know_rsus(node)
+    arrive(node, node._on_measurement, measurement("a", 0.0, vue_id))
+    assert set(node._outputs) == {"vue_1"}
+    assert node._tracker.rejected() == {vue_id: {"vue_id": 1}}
+    odometry, _, _ = keep(node)
+    drive(node, range(3))
+    assert len(odometry.messages) == 3
+
+
+# parameters
+
+
+def test_parameters_reach_the_tracker(make: Any) -> None:
+    node = make(hold_s=0.5, filter="ekf", max_rejected_epochs=7)
+    config = node._tracker.config
+    assert (config.hold_s, config.filter, config.max_rejected_epochs) == (0.5, "ekf", 7)
+    assert node.describe_parameter("hold_s").read_only
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "text"),
+    [
+        ({"hold_s": 11.0}, InvalidParameterValueException, "hold_s"),
+        ({"hold_s": 1}, InvalidParameterTypeException, "hold_s"),
+        ({"max_rejected_epochs": 0}, InvalidParameterValueException, "max_rejected_epochs"),
+        ({"vues": ["vue_1", "a b"]}, ValueError, "vues: 'a b' is no device name"),
+        ({"filter": "ukff"}, ValueError, "filter must be one of"),
+        ({"process_noise": "none"}, ValueError, "process_noise must be one of"),
+    ],
+)
+def test_bad_parameters(make: Any, change: Any, error: Any, text: str) -> None:
+    with pytest.raises(error, match=text):
+        make(**change)
+
+
+def test_a_scenario_that_is_none_is_an_error(make: Any) -> None:
+    with pytest.raises(ValueError, match="no_such_scenario"):
+        make(scenario="no_such_scenario")
+
+
+def test_a_bag_gives_defaults_and_explicit_values_win(make: Any, tmp_path: Path) -> None:
+    """Also where its metadata says 1 for 1.0; a parameter nobody knows is an error."""
+    with BagWriter(tmp_path / "bag", metadata={"tracker": "{hold_s: 1, filter: ekf}"}) as bag:
+        bag.write("/clock", codec().clock_to_msg(T0), T0)
+    config = make(scenario=str(tmp_path / "bag"), filter="iekf")._tracker.config
+    assert (config.hold_s, config.filter) == (1.0, "iekf")
+    with BagWriter(tmp_path / "odd", metadata={"tracker": "{hold: 1}"}) as bag:
+        bag.write("/clock", codec().clock_to_msg(T0), T0)
+    with pytest.raises(ValueError, match="unknown tracker parameter 'hold'"):
+        make(scenario=str(tmp_path / "odd"))
+
+
+# data
+
+
+def test_a_drive_is_published(make: Any) -> None:
+    node = make()
+    odometry, clock, status = keep(node)
+    node._tf_pub = Kept()
+    know_rsus(node)
+    drive(node, range(30))
+    assert len(odometry.messages) == len(clock.messages) == len(status.messages) == 30
+    last = odometry.messages[-1]
+    assert (last.header.frame_id, last.child_frame_id) == ("map", "vue_1/base_link")
+    assert CODEC.odometry_from_msg(last).stamp_ns == T0 + 2_900_000_000
+    assert last.pose.pose.position.x == pytest.approx(23.2, abs=0.3)
+    assert last.twist.twist.linear.x == pytest.approx(8.0, abs=0.5)
+    assert len(node._tf_pub.messages) == 30
+    tf = node._tf_pub.messages[-1].transforms[0]
+    assert tf.transform.translation.x == last.pose.pose.position.x
+    assert status.messages[-1].sources == ["a", "b", "c"]
+    assert abs(clock.messages[-1].offset) < 3e-9
+
+
+def test_velocity_and_pose_of_a_device_reach_its_track(make: Any) -> None:
+    node = make(hold_s=0.0)
+    odometry, clock, status = keep(node)
+    pose = InitialPose(
+        stamp_ns=T0, vue_id="vue_1", position=np.array([5.0, 6.0, 0.0]), cov=np.eye(3)
+    )
+    arrive(node, handler_of(node, "/vue_1/initialpose"), CODEC.initial_pose_to_msg(pose))
+    assert odometry.messages[-1].pose.pose.position.x == 5.0
+    v = Velocity(
+        stamp_ns=T0 + 10**8, vue_id="vue_1", velocity=np.array([2.0, 0.0]), cov=0.01 * np.eye(2)
+    )
+    msg = CODEC.velocity_to_msg(v)
+    arrive(node, handler_of(node, "/vue_1/step_velocity"), msg)
+    assert status.messages[-1].sources == ["step_velocity"]
+    assert odometry.messages[-1].twist.twist.linear.x == pytest.approx(2.0, abs=0.05)
+    msg = CODEC.velocity_to_msg(v)
+    msg.header.stamp = CODEC.time(T0 + 2 * 10**8)
+    arrive(node, handler_of(node, "/vue_1/ground_speed"), msg)
+    assert status.messages[-1].sources == ["ground_speed"]
+    assert clock.messages == []  # no TOA yet
+
+
+def test_refusals_are_counted_not_raised(make: Any) -> None:
+    node = make()
+    know_rsus(node)
+    arrive(node, node._on_measurement, measurement("a", 0.0, rsu_id="nobody"))
+    arrive(node, node._on_measurement, measurement("a", 0.0, azimuth_rad=math.nan))
+    broken = CODEC.rsu_info_to_msg(RsuInfo(rsu_id="x", position=np.full(3, math.nan)))
+    arrive(node, node._on_rsu_info, broken)
+    broken = CODEC.rsu_info_to_msg(RsuInfo(rsu_id="x", position=np.zeros(3)))
+    broken.angle_convention = 9
+    arrive(node, node._on_rsu_info, broken)
+    assert node._tracker.rejected() == {"vue_1": {"unknown_rsu": 1, "not_finite": 1}}
+    assert node._tracker.rsu_count == 3
+
+
+# time and services
+
+
+def test_silence_flushes_what_waits(make: Any) -> None:
+    node = make(hold_s=1.0)
+    _, _, status = keep(node)
+    know_rsus(node)
+    arrive(node, node._on_measurement, measurement("a", 0.0))
+    node._on_silence_tick()  # something was heard since the last tick
+    assert status.messages == []
+    node._on_silence_tick()
+    assert len(status.messages) == 1
+
+
+def test_reset_service(make: Any) -> None:
+    node = make()
+    odometry, _, status = keep(node)
+    know_rsus(node)
+    drive(node, range(3))
+    response = node._on_reset(Trigger.Request(), Trigger.Response())
+    assert response.success
+    assert response.message == "all tracks start anew"
+    arrive(node, node._on_measurement, measurement("a", 0.05, expected=1, fields=Field.TOA))
+    assert status.messages[-1].state == TrackState.WAITING
+    assert len(odometry.messages) == 3
+    assert node._tracker.rsu_count == 3
+
+
+def test_enable_service(make: Any) -> None:
+    node = make()
+    _, _, status = keep(node)
+    know_rsus(node)
+    response = node._on_enable(SetBool.Request(data=False), SetBool.Response())
+    assert (response.success, response.message) == (True, "disabled: measurements are refused")
+    drive(node, range(2))
+    assert status.messages == []
+    assert node._tracker.rejected()["vue_1"]["disabled"] == 6
+    response = node._on_enable(SetBool.Request(data=True), SetBool.Response())
+    assert (response.success, response.message) == (True, "enabled")
+    drive(node, range(2, 4))
+    assert len(status.messages) == 2
+
+
+def test_simulated_clock_that_jumps_back_resets(make: Any) -> None:
+    """Through rclpy's own jump callback; a step forward, or the first stamp, does nothing."""
+    node = make(use_sim_time=True)
+    _, _, status = keep(node)
+    know_rsus(node)
+    clock = node.get_clock()
+    clock.set_ros_time_override(Time(nanoseconds=T0))
+    drive(node, range(3))
+    clock.set_ros_time_override(Time(nanoseconds=T0 + 10**9))
+    drive(node, range(3, 4))
+    assert status.messages[-1].state == TrackState.TRACKING
+    assert status.messages[-1].accepted == 12
+    clock.set_ros_time_override(Time(nanoseconds=T0 + 10**9 - 1))
+    arrive(node, node._on_measurement, measurement("a", 0.0, expected=1, fields=Field.TOA))
+    assert status.messages[-1].state == TrackState.WAITING
+    assert status.messages[-1].rejection_reasons == []  # an old stamp is not late any more
+
+
+# diagnostics
+
+
+def status(state: TrackState, stamp_ns: int, vue_id: str = "vue_1") -> TrackStatus:
+    return TrackStatus(
+        stamp_ns=stamp_ns,
+        vue_id=vue_id,
+        state=state,
+        nis=1.25,
+        nis_dof=4,
+        accepted=9,
+        rejected={"late": 2, "gate": 1},
+        position_sd_m=0.5,
+    )
+
+
+@pytest.mark.parametrize(
+    ("state", "level"),
+    [
+        (TrackState.WAITING, DiagnosticStatus.WARN),
+        (TrackState.INITIALISING, DiagnosticStatus.WARN),
+        (TrackState.TRACKING, DiagnosticStatus.OK),
+        (TrackState.COASTING, DiagnosticStatus.WARN),
+    ],
+)
+def test_diagnostics_of_a_device(state: TrackState, level: bytes) -> None:
+    array = diagnostics_to_msg([status(state, T0)], 2)
+    device, rsus = array.status
+    assert (device.level, device.message) == (level, state.name.lower())
+    assert (device.name, device.hardware_id) == ("ekf_tracker: vue_1", "vue_1")
+    assert {v.key: v.value for v in device.values} == {
+        "position_sd_m": "0.500",
+        "nis": "1.250",
+        "nis_dof": "4",
+        "accepted": "9",
+        "rejected: gate": "1",
+        "rejected: late": "2",
+    }
+    assert (rsus.level, rsus.message) == (DiagnosticStatus.OK, "2 RSUs known")
+
+
+def test_diagnostics_stamp_and_missing_rsus() -> None:
+    array = diagnostics_to_msg(
+        [status(TrackState.TRACKING, T0 + 5), status(TrackState.TRACKING, T0, "vue_2")], 0
+    )
+    assert (array.header.stamp.sec, array.header.stamp.nanosec) == (1, 5)
+    assert [s.name for s in array.status] == [
+        "ekf_tracker: vue_1",
+        "ekf_tracker: vue_2",
+        "ekf_tracker: rsus",
+    ]
+    assert array.status[-1].level == DiagnosticStatus.WARN
+    assert array.status[-1].message == "no /rsu/info received yet"
+
+
+def test_diagnostics_are_published(make: Any) -> None:
+    node = make()
+    node._diagnostics_pub = Kept()
+    node._publish_diagnostics()
+    know_rsus(node)
+    drive(node, range(3))
+    node._publish_diagnostics()
+    first, second = node._diagnostics_pub.messages
+    assert [s.name for s in first.status] == ["ekf_tracker: rsus"]
+    assert [s.message for s in second.status] == ["tracking", "3 RSUs known"]

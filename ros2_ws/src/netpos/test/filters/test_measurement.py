@@ -1,0 +1,518 @@
+"""Measurement rows against closed forms, SciPy rotations and central differences."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from netpos.filters import ekf
+from netpos.filters.measurement import (
+    AXES,
+    BIAS,
+    COMMON,
+    GATE_VARIANCE,
+    GROUP,
+    KIND,
+    ORIGIN,
+    ROW_WIDTH,
+    VALUE,
+    VARIANCE,
+    Coupling,
+    Kind,
+    curvature_variance,
+    linear_rows,
+    linearise,
+    predict_row,
+    rsu_axes,
+    rsu_rows,
+    scalar_values,
+    speed_row,
+    wrap,
+)
+from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
+from scipy.constants import speed_of_light
+from scipy.spatial.transform import Rotation
+
+ANGLE_KINDS = (Kind.AZIMUTH, Kind.ELEVATION)
+DIRECTION_KINDS = (*ANGLE_KINDS, Kind.COSINE_Y, Kind.COSINE_Z)
+ALL_FIELDS = Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE | Field.POSITION
+
+
+def random_info(rng: np.random.Generator, convention: AngleConvention) -> RsuInfo:
+    return RsuInfo(
+        rsu_id="r",
+        position=rng.uniform(-20, 20, 3),
+        quaternion=Rotation.random(random_state=int(rng.integers(1 << 30))).as_quat(),
+        angle_convention=convention,
+    )
+
+
+def random_state(rng: np.random.Generator, n: int = 9) -> Array:
+    scale = np.array([40.0, 40.0, 8.0, 8.0, 100.0, 5.0, *([0.5] * (n - 6))])
+    return rng.normal(size=n) * scale
+
+
+def random_row(rng: np.random.Generator, kind: Kind) -> Array:
+    """A row of an RSU with tilted axes (LINEAR: random H), own bias 6, common bias 8."""
+    row = np.zeros(ROW_WIDTH)
+    row[KIND], row[VALUE], row[VARIANCE], row[GATE_VARIANCE] = kind, 0.3, 1.0, 1.0
+    row[BIAS], row[COMMON] = 6, 8
+    info = random_info(rng, AngleConvention.SPHERICAL)
+    row[ORIGIN:AXES] = info.position
+    row[AXES:] = rsu_axes(info)
+    return row
+
+
+def closed_form(row: Array, x: Array, height_m: float) -> float:
+    """h written with SciPy and NumPy only."""
+    d = np.array([x[0], x[1], height_m]) - row[ORIGIN:AXES]
+    ux, uy, uz = Rotation.from_matrix(row[AXES:].reshape(3, 3)).apply(d)
+    r = float(np.linalg.norm(d))
+    value = {
+        Kind.AZIMUTH: lambda: np.arctan2(uy, ux),
+        Kind.ELEVATION: lambda: np.arcsin(uz / r),
+        Kind.TOA: lambda: r + x[4],
+        Kind.RANGE: lambda: r,
+        Kind.LINEAR: lambda: row[ORIGIN : ORIGIN + 6] @ x[:6],
+        Kind.SPEED: lambda: abs(complex(x[2], x[3])),
+        Kind.COSINE_Y: lambda: uy / r,
+        Kind.COSINE_Z: lambda: uz / r,
+    }[Kind(int(row[KIND]))]()
+    return float(value) + x[6] + x[8]
+
+
+@pytest.mark.parametrize("kind", list(Kind))
+@pytest.mark.parametrize("seed", range(20))
+def test_value_matches_closed_form(kind: Kind, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    row, x, height = random_row(rng, kind), random_state(rng), rng.uniform(-3, 3)
+    h = np.full(9, 99.0)
+    value = predict_row(row, x, height, h)
+    assert value == pytest.approx(closed_form(row, x, height), rel=1e-12, abs=1e-11)
+
+
+@pytest.mark.parametrize("kind", list(Kind))
+@pytest.mark.parametrize("seed", range(20))
+def test_jacobian_matches_central_differences(kind: Kind, seed: int) -> None:
+    rng = np.random.default_rng(100 + seed)
+    row, x, height = random_row(rng, kind), random_state(rng), rng.uniform(-3, 3)
+    h = np.full(9, 99.0)
+    predict_row(row, x, height, h)
+    eps = 1e-5
+    numeric = np.empty(9)
+    for i, unit in enumerate(np.eye(9)):
+        change = closed_form(row, x + eps * unit, height) - closed_form(
+            row, x - eps * unit, height
+        )
+        numeric[i] = (
+            math.remainder(change, 2 * math.pi) / (2 * eps) if kind <= 1 else change / (2 * eps)
+        )
+    np.testing.assert_allclose(h, numeric, rtol=1e-6, atol=2e-8)
+
+
+def test_jacobian_of_the_paper() -> None:
+    """fokin2020:eq.44: DOA rows (-dy/d2, dx/d2, 0 ...), TOA rows (dx/d, dy/d, 0, 0, 1, 0)."""
+    info = RsuInfo(rsu_id="r", position=np.array([1.0, 2.0, 0.0]))
+    m = RsuMeasurement(
+        stamp_ns=1,
+        rsu_id="r",
+        vue_id="v",
+        fields=Field.AZIMUTH | Field.TOA,
+        azimuth_var=1,
+        toa_var=1,
+    )
+    rows = rsu_rows(m, info, rsu_axes(info), 0)
+    _, H = linearise(rows, np.array([4.0, 6.0, 9.0, 9.0, 9.0, 9.0]), 0.0)
+    np.testing.assert_allclose(H[0], [-4 / 25, 3 / 25, 0, 0, 0, 0], rtol=1e-14)
+    np.testing.assert_allclose(H[1], [3 / 5, 4 / 5, 0, 0, 1, 0], rtol=1e-14)
+
+
+def test_unbiased_row_leaves_bias_states_alone() -> None:
+    rng = np.random.default_rng(5)
+    row, x = random_row(rng, Kind.RANGE), random_state(rng)
+    row[BIAS] = row[COMMON] = -1
+    h = np.full(9, 99.0)
+    value = predict_row(row, x, 1.0, h)
+    assert value == pytest.approx(closed_form(row, x, 1.0) - x[6] - x[8])
+    np.testing.assert_array_equal(h[6:], 0.0)
+
+
+@pytest.mark.parametrize("kind", DIRECTION_KINDS)
+def test_directly_above_the_rsu_stays_finite(kind: Kind) -> None:
+    info = RsuInfo(rsu_id="r", position=np.array([1.0, 2.0, 5.0]))
+    row = np.zeros(ROW_WIDTH)
+    row[KIND], row[BIAS], row[COMMON] = kind, -1, -1
+    row[ORIGIN:AXES], row[AXES:] = info.position, rsu_axes(info)
+    h = np.zeros(6)
+    value = predict_row(row, np.array([1.0, 2.0, 0, 0, 0, 0]), 1.0, h)
+    expected = {
+        Kind.AZIMUTH: 0.0,
+        Kind.ELEVATION: -math.pi / 2,
+        Kind.COSINE_Y: 0.0,
+        Kind.COSINE_Z: -1,
+    }
+    assert value == pytest.approx(expected[kind], abs=1e-6)
+    assert np.isfinite(h).all()
+
+
+def test_floors_at_the_rsu_and_at_rest() -> None:
+    """At the RSU itself and at standstill the gradient is 0 or finite, never NaN."""
+    h = np.zeros(6)
+    row = np.zeros(ROW_WIDTH)
+    row[BIAS] = row[COMMON] = -1
+    row[AXES:] = np.eye(3).reshape(-1)
+    row[KIND] = Kind.RANGE
+    assert predict_row(row, np.zeros(6), 0.0, h) == pytest.approx(1e-6)
+    np.testing.assert_array_equal(h, 0.0)
+    row[KIND] = Kind.AZIMUTH
+    # 1e-12 m^2 floor of the squared distance: the gradient at 1 nm is 1e-9 / 1e-12.
+    predict_row(row, np.array([1e-9, 0, 0, 0, 0, 0]), 0.0, h)
+    np.testing.assert_allclose(h, [0, 1e3, 0, 0, 0, 0], rtol=1e-9)
+    row[KIND] = Kind.SPEED
+    assert predict_row(row, np.zeros(6), 0.0, h) == 0.0
+    np.testing.assert_array_equal(h, 0.0)
+    # 1e-6 m/s floor of the speed, in both components.
+    predict_row(row, np.array([0, 0, 1e-7, 2e-7, 0, 0]), 0.0, h)
+    np.testing.assert_allclose(h[2:4], [0.1, 0.2], rtol=1e-9)
+    predict_row(row, np.array([0, 0, 0.3, -0.4, 0, 0]), 0.0, h)
+    np.testing.assert_allclose(h[2:4], [0.6, -0.8], rtol=1e-14)
+
+
+# wrap
+
+
+@pytest.mark.parametrize(
+    ("angle", "wrapped"),
+    [
+        (0.0, 0.0),
+        (math.pi, -math.pi),
+        (-math.pi, -math.pi),
+        (math.pi - 1e-12, math.pi - 1e-12),
+        (-math.pi - 1e-12, math.pi - 1e-12),
+        (1.5 * math.pi, -0.5 * math.pi),
+        (-1.5 * math.pi, 0.5 * math.pi),
+        (5 * math.pi, -math.pi),
+        (-5 * math.pi, -math.pi),
+    ],
+)
+def test_wrap_at_its_boundaries(angle: float, wrapped: float) -> None:
+    assert wrap(angle) == pytest.approx(wrapped, abs=1e-14)
+    assert -math.pi <= wrap(angle) < math.pi
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.floats(-1e12, 1e12))
+def test_wrap_is_the_ieee_remainder(angle: float) -> None:
+    wrapped = wrap(angle)
+    assert -math.pi <= wrapped <= math.pi
+    apart = math.remainder(wrapped - math.remainder(angle, 2 * math.pi), 2 * math.pi)
+    assert abs(apart) <= 1e-15 * abs(angle) + 1e-14
+
+
+@pytest.mark.parametrize("kind", ANGLE_KINDS)
+@pytest.mark.parametrize("side", [1, -1])
+def test_angle_innovation_crosses_pi(kind: Kind, side: int) -> None:
+    """Measured just one side of +-pi, predicted just the other: a small innovation."""
+    row = np.zeros((1, ROW_WIDTH))
+    row[0, [KIND, BIAS, COMMON]] = kind, -1, -1
+    row[0, AXES:] = np.eye(3).reshape(-1)
+    x = np.array([-10.0, -side * 0.1, 0, 0, 0, 0])
+    predicted = predict_row(row[0], x, 0.0, np.empty(6))
+    row[0, VALUE] = predicted + 0.02 + side * 2 * math.pi
+    innovation, _ = linearise(row, x, 0.0)
+    assert innovation[0] == pytest.approx(0.02, abs=1e-12)
+
+
+@pytest.mark.parametrize("kind", [k for k in Kind if k not in ANGLE_KINDS])
+def test_other_innovations_are_not_wrapped(kind: Kind) -> None:
+    rng = np.random.default_rng(3)
+    row, x = random_row(rng, kind), random_state(rng)
+    row[VALUE] = closed_form(row, x, 0.0) + 9.0
+    innovation, _ = linearise(row[None], x, 0.0)
+    assert innovation[0] == pytest.approx(9.0)
+
+
+def test_innovation_is_measured_minus_predicted_for_every_row() -> None:
+    rng = np.random.default_rng(4)
+    x = random_state(rng)
+    rows = np.array([random_row(rng, kind) for kind in Kind])
+    offsets = np.linspace(0.1, 0.8, len(rows))
+    rows[:, VALUE] = [closed_form(r, x, 0.5) + o for r, o in zip(rows, offsets, strict=True)]
+    innovation, H = linearise(rows, x, 0.5)
+    np.testing.assert_allclose(innovation, offsets, atol=1e-11)
+    for row, h in zip(rows, H, strict=True):
+        single = np.empty(9)
+        predict_row(row, x, 0.5, single)
+        np.testing.assert_array_equal(h, single)
+
+
+# curvature
+
+
+def hessian(row: Array, x: Array, height_m: float) -> Array:
+    """Second derivatives by position (2, 2), numerically."""
+    eps, e = 1e-3, np.eye(9)
+
+    def f(p: Array) -> float:
+        return closed_form(row, x + p, height_m)
+
+    return np.array(
+        [
+            [
+                f(eps * (e[i] + e[j]))
+                - f(eps * (e[i] - e[j]))
+                - f(eps * (e[j] - e[i]))
+                + f(-eps * (e[i] + e[j]))
+                for j in range(2)
+            ]
+            for i in range(2)
+        ]
+    ) / (4 * eps**2)
+
+
+def half_trace(row: Array, x: Array, cov: Array, height_m: float) -> float:
+    """Variance of the second-order term of a Gaussian prior."""
+    product = hessian(row, x, height_m) @ cov[:2, :2]
+    return 0.5 * float(np.trace(product @ product))
+
+
+def level_row(kind: Kind, origin: Array) -> Array:
+    row = random_row(np.random.default_rng(0), kind)
+    row[ORIGIN:AXES], row[AXES:] = origin, np.eye(3).reshape(-1)
+    return row
+
+
+@pytest.mark.parametrize("kind", [Kind.RANGE, Kind.TOA])
+@pytest.mark.parametrize("seed", range(5))
+def test_curvature_of_a_level_range_is_exact(kind: Kind, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    row, x = level_row(kind, np.array([1.0, -2.0, 3.0])), random_state(rng)
+    A = rng.normal(size=(9, 9))
+    expected = half_trace(row, x, A @ A.T, 3.0)
+    assert curvature_variance(row, x, A @ A.T, 3.0) == pytest.approx(expected, rel=1e-4)
+
+
+def test_curvature_of_a_range_from_above_is_that_across_the_line_of_sight() -> None:
+    """rho 3, height 4: sideways the range bends with 1/5."""
+    row, x = level_row(Kind.RANGE, np.zeros(3)), np.zeros(9)
+    x[:2] = 0.0, 3.0
+    cov = np.diag([2.0, 1e-9, *np.ones(7)])
+    assert curvature_variance(row, x, cov, -4.0) == pytest.approx(
+        half_trace(row, x, cov, -4.0), rel=1e-4
+    )
+    assert curvature_variance(row, x, cov, -4.0) == pytest.approx(0.5 * (2.0 / 5.0) ** 2, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kind", "target"),
+    [
+        (Kind.AZIMUTH, (3.0, 4.0, 7.0)),
+        (Kind.ELEVATION, (3.0, 4.0, 5.0)),
+        (Kind.COSINE_Y, (5.0, 0.0, 0.0)),
+    ],
+)
+def test_curvature_of_angles_is_exact_for_an_equal_spread_where_they_bend_most(
+    kind: Kind, target: tuple[float, float, float]
+) -> None:
+    row, x = level_row(kind, np.array([1.0, 1.0, 1.0])), np.zeros(9)
+    x[:2] = target[0] + 1.0, target[1] + 1.0
+    cov, height = 0.3 * np.eye(9), target[2] + 1.0
+    assert curvature_variance(row, x, cov, height) == pytest.approx(
+        half_trace(row, x, cov, height), rel=1e-4
+    )
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_curvature_of_azimuth_bounds_the_second_order_term(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    row, x, A = level_row(Kind.AZIMUTH, np.zeros(3)), random_state(rng), rng.normal(size=(9, 9))
+    cov = A @ A.T
+    d2 = x[0] ** 2 + x[1] ** 2
+    assert curvature_variance(row, x, cov, 2.0) >= half_trace(row, x, cov, 2.0) * (1 - 1e-4)
+    frobenius2 = np.linalg.norm(cov[:2, :2]) ** 2
+    assert curvature_variance(row, x, cov, 2.0) == pytest.approx(frobenius2 / 2 / d2**2)
+    slant2 = d2 + 4.0
+    for kind in (Kind.ELEVATION, Kind.COSINE_Y, Kind.COSINE_Z):
+        row[KIND] = kind
+        assert curvature_variance(row, x, cov, 2.0) == pytest.approx(frobenius2 / 2 / slant2**2)
+
+
+def test_curvature_at_the_rsu_is_finite_and_linear_rows_have_none() -> None:
+    cov, x = np.eye(9), np.zeros(9)
+    for kind, floor in ((Kind.AZIMUTH, 1e12), (Kind.COSINE_Y, 1e12), (Kind.ELEVATION, 1e12)):
+        assert curvature_variance(level_row(kind, np.zeros(3)), x, cov, 0.0) == pytest.approx(
+            floor
+        )
+    assert curvature_variance(level_row(Kind.RANGE, np.zeros(3)), x, cov, 0.0) == 0.0
+    x[0] = 1e-4
+    value = curvature_variance(level_row(Kind.RANGE, np.zeros(3)), x, cov, 0.0)
+    assert value == pytest.approx(0.5 * (1e-8 / 1e-6) ** 2 / 1e-6)
+    for kind in (Kind.LINEAR, Kind.SPEED):
+        assert curvature_variance(level_row(kind, np.ones(3)), x, cov, 0.0) == 0.0
+
+
+# from measurements to rows
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_axes_turn_map_vectors_into_the_rsus_axes(seed: int) -> None:
+    info = random_info(np.random.default_rng(seed), AngleConvention.SPHERICAL)
+    d = np.array([3.0, -1.0, 0.5])
+    expected = Rotation.from_quat(info.quaternion).inv().apply(d)
+    np.testing.assert_allclose(rsu_axes(info).reshape(3, 3) @ d, expected, atol=1e-13)
+
+
+def full_measurement(info: RsuInfo, target: Array, clock_m: float) -> RsuMeasurement:
+    """Noise-free measurement of ``target`` written with SciPy, in the convention of the RSU."""
+    d = target - info.position
+    ux, uy, uz = Rotation.from_quat(info.quaternion).inv().apply(d)
+    r = float(np.linalg.norm(d))
+    if info.angle_convention is AngleConvention.CONE:
+        azimuth, elevation = math.asin(uy / r), math.asin(uz / r)
+    else:
+        azimuth, elevation = math.atan2(uy, ux), math.asin(uz / r)
+    return RsuMeasurement(
+        stamp_ns=1,
+        rsu_id=info.rsu_id,
+        vue_id="v",
+        fields=ALL_FIELDS,
+        azimuth_rad=azimuth,
+        azimuth_var=0.01,
+        elevation_rad=elevation,
+        elevation_var=0.02,
+        toa_s=(r + clock_m) / speed_of_light,
+        toa_var=1e-18,
+        range_m=r,
+        range_var=0.25,
+        position=target,
+        position_cov=np.array([[2.0, 0.7, 0.1], [0.7, 1.0, 0.2], [0.1, 0.2, 3.0]]),
+    )
+
+
+@pytest.mark.parametrize("convention", list(AngleConvention))
+@pytest.mark.parametrize("seed", range(10))
+def test_noise_free_measurement_has_no_innovation(convention: AngleConvention, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    info, x = random_info(rng, convention), random_state(rng, 6)
+    m = full_measurement(info, np.array([x[0], x[1], 1.5]), x[4])
+    rows = rsu_rows(m, info, rsu_axes(info), 3)
+    innovation, _ = linearise(rows, x, 1.5)
+    np.testing.assert_allclose(innovation, 0.0, atol=2e-6)
+    assert rows.shape == (6, ROW_WIDTH)
+    assert set(rows[:, GROUP]) == {3.0}
+    assert set(rows[:, BIAS]) == set(rows[:, COMMON]) == {-1.0}
+
+
+def test_spherical_rows_keep_values_and_variances() -> None:
+    info = random_info(np.random.default_rng(1), AngleConvention.SPHERICAL)
+    m = full_measurement(info, np.array([30.0, 20.0, 1.0]), 7.0)
+    c = speed_of_light
+    assert list(scalar_values(m, info.angle_convention)) == [
+        (Kind.AZIMUTH, m.azimuth_rad, 0.01),
+        (Kind.ELEVATION, m.elevation_rad, 0.02),
+        (Kind.TOA, pytest.approx(c * m.toa_s), pytest.approx(c**2 * 1e-18)),
+        (Kind.RANGE, m.range_m, 0.25),
+    ]
+
+
+def test_cone_variance_is_that_of_the_sine() -> None:
+    """sd of sin(a) by sampling; at end-fire the second-order term remains."""
+    rng = np.random.default_rng(2)
+    info = random_info(rng, AngleConvention.CONE)
+    for angle in (0.0, 0.6, -1.2, math.pi / 2):
+        m = RsuMeasurement(
+            stamp_ns=1,
+            rsu_id="r",
+            vue_id="v",
+            fields=Field.AZIMUTH | Field.ELEVATION,
+            azimuth_rad=angle,
+            azimuth_var=4e-4,
+            elevation_rad=-angle,
+            elevation_var=1e-4,
+        )
+        (kind_y, y, var_y), (kind_z, z, var_z) = scalar_values(m, info.angle_convention)
+        assert (kind_y, kind_z) == (Kind.COSINE_Y, Kind.COSINE_Z)
+        assert (y, z) == (pytest.approx(math.sin(angle)), pytest.approx(-math.sin(angle)))
+        sampled = np.sin(angle + 0.02 * rng.normal(size=400_000)).var()
+        assert var_y == pytest.approx(sampled, rel=0.01)
+        assert var_z == pytest.approx(
+            np.sin(angle + 0.01 * rng.normal(size=400_000)).var(), rel=0.01
+        )
+
+
+@pytest.mark.parametrize(
+    ("flag", "kind"),
+    [
+        (Field.AZIMUTH, Kind.AZIMUTH),
+        (Field.ELEVATION, Kind.ELEVATION),
+        (Field.TOA, Kind.TOA),
+        (Field.RANGE, Kind.RANGE),
+        (Field.POSITION, Kind.LINEAR),
+    ],
+)
+def test_only_named_fields_become_rows(flag: Field, kind: Kind) -> None:
+    info = random_info(np.random.default_rng(1), AngleConvention.SPHERICAL)
+    full = full_measurement(info, np.array([30.0, 20.0, 1.0]), 7.0)
+    m = RsuMeasurement(**{n: getattr(full, n) for n in full.__slots__} | {"fields": flag})
+    rows = rsu_rows(m, info, rsu_axes(info), 0)
+    assert set(rows[:, KIND]) == {float(kind)}
+    assert len(rows) == (2 if kind is Kind.LINEAR else 1)
+
+
+def test_coupling_enters_the_rows_of_its_kind_only() -> None:
+    info = random_info(np.random.default_rng(1), AngleConvention.SPHERICAL)
+    m = full_measurement(info, np.array([30.0, 20.0, 1.0]), 7.0)
+    coupling = Coupling({Kind.AZIMUTH: 6}, {Kind.RANGE: 7}, {Kind.RANGE: 5.0, Kind.AZIMUTH: 3.0})
+    rows = rsu_rows(m, info, rsu_axes(info), 0, coupling)
+    np.testing.assert_array_equal(rows[:, BIAS], [6, -1, -1, -1, -1, -1])
+    np.testing.assert_array_equal(rows[:, COMMON], [-1, -1, -1, 7, -1, -1])
+    np.testing.assert_allclose(
+        rows[:4, GATE_VARIANCE], [0.01, 0.02, speed_of_light**2 * 1e-18, 0.25]
+    )
+    np.testing.assert_allclose(rows[:4, VARIANCE], [0.03, 0.02, speed_of_light**2 * 1e-18, 1.25])
+
+
+# linear rows
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_linear_rows_equal_the_update_with_the_full_covariance(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    A, B = rng.normal(size=(3, 3)), rng.normal(size=(6, 6))
+    R, P = A @ A.T + 0.1 * np.eye(3), B @ B.T + 0.1 * np.eye(6)
+    H, z, x = rng.normal(size=(3, 6)), rng.normal(size=3), rng.normal(size=6)
+    rows = linear_rows(z, R, H, 4)
+    no_gate = np.full(5, np.inf)
+    rows[:, GROUP] = 0
+    mean, cov, _, nis, used = ekf.update(x, P, rows, 0.0, no_gate, 1)
+    S = H @ P @ H.T + R
+    K = P @ H.T @ np.linalg.inv(S)
+    np.testing.assert_allclose(mean, x + K @ (z - H @ x), rtol=1e-9)
+    np.testing.assert_allclose(cov, P - K @ S @ K.T, rtol=1e-8, atol=1e-10)
+    assert nis == pytest.approx((z - H @ x) @ np.linalg.solve(S, z - H @ x), rel=1e-9)
+    assert used == 3
+
+
+def test_linear_rows_fill_the_whole_row() -> None:
+    rows = linear_rows(np.array([1.0, 2.0]), np.diag([4.0, 9.0]), np.eye(2, 6, k=2), 5)
+    np.testing.assert_array_equal(rows[:, GROUP], 5)
+    np.testing.assert_array_equal(rows[:, KIND], Kind.LINEAR)
+    np.testing.assert_array_equal(rows[:, [VARIANCE, GATE_VARIANCE]], 1.0)
+    np.testing.assert_array_equal(rows[:, [BIAS, COMMON]], -1.0)
+    np.testing.assert_allclose(rows[:, VALUE], [0.5, 2 / 3])
+    np.testing.assert_allclose(
+        rows[:, ORIGIN : ORIGIN + 6], [[0, 0, 1 / 2, 0, 0, 0], [0, 0, 0, 1 / 3, 0, 0]]
+    )
+
+
+def test_linear_rows_refuse_a_covariance_that_is_none() -> None:
+    with pytest.raises(np.linalg.LinAlgError):
+        linear_rows(np.zeros(2), np.array([[1.0, 2.0], [2.0, 1.0]]), np.eye(2, 6), 0)
+
+
+def test_speed_row() -> None:
+    (row,) = speed_row(3.0, 0.04, 2)
+    assert row.tolist() == [Kind.SPEED, 3.0, 0.04, 0.04, -1, -1, 2, *([0.0] * 12)]

@@ -1,0 +1,337 @@
+"""The first fix from each mixture of measurements, its ambiguities and its covariance."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from netpos.filters.measurement import Kind, linear_rows, rsu_rows, speed_row
+from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.initialise import Initialiser
+from netpos.tracking.rsus import Rsu
+from scipy.constants import speed_of_light
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+T0 = 1_000_000_000
+KNOWN_CLOCK = {"clock_offset_sd_s": 1e-12, "clock_drift_mean": 0.0, "clock_drift_sd": 1e-12}
+
+
+def rsu(x: float, y: float, yaw_deg: float = 0.0, **change: object) -> Rsu:
+    q = Rotation.from_euler("z", yaw_deg, degrees=True).as_quat()
+    values = {"rsu_id": f"{x},{y}", "position": np.array([x, y, 0.0]), "quaternion": q}
+    return Rsu.of(RsuInfo(**(values | change)))  # type: ignore[arg-type]
+
+
+def measure(
+    station: Rsu,
+    state: Array,
+    fields: Field,
+    rng: np.random.Generator | None = None,
+    angle_sd: float = 0.02,
+    range_sd: float = 0.3,
+    group: int = 0,
+    stamp_ns: int = T0,
+) -> Array:
+    """Rows of a measurement of [x, y, vx, vy, clock m, drift m/s]; noise-free without ``rng``."""
+    noise = rng.normal(size=3) if rng is not None else np.zeros(3)
+    d = state[:2] - station.info.position[:2]
+    ux, uy, _ = Rotation.from_quat(station.info.quaternion).inv().apply([*d, 0.0])
+    r = math.hypot(*d)
+    cone = station.info.angle_convention is AngleConvention.CONE
+    azimuth = math.asin(uy / r) if cone else math.atan2(uy, ux)
+    m = RsuMeasurement(
+        stamp_ns=stamp_ns,
+        rsu_id=station.info.rsu_id,
+        vue_id="v",
+        fields=fields,
+        azimuth_rad=azimuth + angle_sd * noise[0],
+        azimuth_var=angle_sd**2,
+        toa_s=(r + state[4] + range_sd * noise[1]) / speed_of_light,
+        toa_var=(range_sd / speed_of_light) ** 2,
+        range_m=r + range_sd * noise[2],
+        range_var=range_sd**2,
+        position=np.array([*state[:2], 0.0]),
+        position_cov=np.eye(3) * range_sd**2,
+    )
+    return rsu_rows(m, station.info, station.axes, group)
+
+
+def solve(
+    config: TrackerConfig,
+    stations: list[Rsu],
+    state: Array,
+    fields: Field,
+    rng: np.random.Generator | None = None,
+) -> tuple[Array, Array] | None:
+    initialiser = Initialiser(config)
+    rows = np.vstack([measure(s, state, fields, rng, group=i) for i, s in enumerate(stations)])
+    initialiser.add(T0, rows, np.zeros(len(rows)), tuple(stations))
+    return initialiser.solve()
+
+
+def at(x: float, y: float, clock: float = 0.0) -> Array:
+    return np.array([x, y, 0.0, 0.0, clock, 0.0])
+
+
+# mixtures
+
+
+@pytest.mark.parametrize("target", [(20.0, 30.0), (-40.0, 20.0), (55.0, -25.0), (10.0, 3.0)])
+def test_two_directions(target: tuple[float, float]) -> None:
+    config = TrackerConfig(initial_position_sd_max_m=20.0)
+    solution = solve(config, [rsu(0, 0), rsu(30, 5, 70)], at(*target), Field.AZIMUTH)
+    assert solution is not None
+    mean, cov = solution
+    # the 150 m prior around the RSUs pulls by a few cm
+    assert math.hypot(*(mean[:2] - target)) < 0.1 * math.sqrt(cov[0, 0] + cov[1, 1])
+
+
+@pytest.mark.parametrize("target", [(20.0, 30.0), (-40.0, -10.0), (-3.0, 25.0)])
+def test_direction_and_time_with_a_known_clock(target: tuple[float, float]) -> None:
+    config = TrackerConfig(**KNOWN_CLOCK)
+    solution = solve(config, [rsu(0, 0, -30)], at(*target), Field.AZIMUTH | Field.TOA)
+    assert solution is not None
+    mean, cov = solution
+    np.testing.assert_allclose(mean[:2], target, atol=0.05)
+    d = np.array(target) / np.linalg.norm(target)
+    assert d @ cov[:2, :2] @ d == pytest.approx(0.3**2, rel=0.01)  # along: the range's
+    across = np.array([-d[1], d[0]])
+    expected = (0.02 * math.hypot(*target)) ** 2
+    assert across @ cov[:2, :2] @ across == pytest.approx(expected, rel=0.01)
+
+
+def test_direction_and_time_with_an_unknown_clock_waits() -> None:
+    """30 km of clock: the distance is open."""
+    config = TrackerConfig(initial_position_sd_max_m=10.0)
+    assert solve(config, [rsu(0, 0)], at(20.0, 30.0, 5000.0), Field.AZIMUTH | Field.TOA) is None
+
+
+@pytest.mark.parametrize("clock_m", [0.0, 6000.0, -9000.0])
+def test_two_directions_and_times_give_the_clock(clock_m: float) -> None:
+    stations = [rsu(0, 0), rsu(60, 0)]
+    solution = solve(TrackerConfig(), stations, at(25.0, 20.0, clock_m), Field.AZIMUTH | Field.TOA)
+    assert solution is not None
+    mean, cov = solution
+    np.testing.assert_allclose(mean[:2], [25.0, 20.0], atol=0.1)
+    assert abs(mean[4] - clock_m) < 0.2
+    assert 0.0 < cov[4, 4] < 1.0
+    assert mean[5] == pytest.approx(25e-6 * speed_of_light, rel=1e-3)  # nothing says otherwise
+    assert cov[5, 5] == pytest.approx((30e-6 * speed_of_light) ** 2, rel=1e-3)
+
+
+def test_three_ranges() -> None:
+    stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40)]
+    solution = solve(TrackerConfig(), stations, at(12.0, 25.0), Field.RANGE)
+    assert solution is not None
+    np.testing.assert_allclose(solution[0][:2], [12.0, 25.0], atol=0.02)
+    H = np.array([(np.array([12.0, 25.0]) - s.info.position[:2]) for s in stations])
+    H /= np.linalg.norm(H, axis=1)[:, None]
+    expected = np.linalg.inv(H.T @ H / 0.3**2 + np.eye(2) / 150.0**2)
+    np.testing.assert_allclose(solution[1][:2, :2], expected, rtol=1e-3, atol=1e-6)
+
+
+def test_two_ranges_wait_between_their_two_solutions() -> None:
+    stations = [rsu(0, 0), rsu(40, 0)]
+    assert solve(TrackerConfig(), stations, at(12.0, 25.0), Field.RANGE) is None
+
+
+def test_one_direction_waits() -> None:
+    assert solve(TrackerConfig(), [rsu(0, 0)], at(12.0, 25.0), Field.AZIMUTH) is None
+
+
+def test_a_fix_far_from_the_origin_needs_no_rsu_nearby() -> None:
+    config = TrackerConfig()
+    initialiser = Initialiser(config)
+    rows = linear_rows(np.array([3e5, -2e5]), np.eye(2), np.eye(2, 6), 0)
+    initialiser.add(T0, rows, np.zeros(2), ())
+    solution = initialiser.solve()
+    assert solution is not None
+    np.testing.assert_allclose(solution[0][:2], [3e5, -2e5], atol=1e-3)
+    np.testing.assert_allclose(solution[1][:2, :2], np.eye(2), rtol=1e-3, atol=1e-6)
+
+
+def test_a_speed_alone_waits() -> None:
+    initialiser = Initialiser(TrackerConfig())
+    initialiser.add(T0, speed_row(3.0, 0.1, 0), np.zeros(1), ())
+    assert initialiser.solve() is None
+
+
+# sides
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 90.0, -135.0])
+def test_cone_arrays_put_the_device_before_them(yaw_deg: float) -> None:
+    """Two linear arrays on one wall: their cones also meet behind it."""
+    turn = Rotation.from_euler("z", yaw_deg, degrees=True).as_matrix()[:2, :2]
+    stations = [
+        rsu(*(turn @ [0.0, y]), yaw_deg, angle_convention=AngleConvention.CONE)
+        for y in (-10.0, 10.0)
+    ]
+    front = turn @ [14.0, 3.0]
+    solution = solve(TrackerConfig(), stations, at(*front), Field.AZIMUTH)
+    assert solution is not None
+    assert np.linalg.norm(solution[0][:2] - front) < 0.3
+
+
+def test_spherical_arrays_see_behind_themselves() -> None:
+    stations = [rsu(0, -10), rsu(0, 10)]
+    solution = solve(TrackerConfig(), stations, at(-14.0, 3.0), Field.AZIMUTH)
+    assert solution is not None
+    np.testing.assert_allclose(solution[0][:2], [-14.0, 3.0], atol=0.3)
+
+
+# over time
+
+
+def test_motion_within_the_window_is_part_of_the_fit() -> None:
+    """A moving device, ranges of one anchor per epoch: position and velocity at the newest stamp,
+    against SciPy's solution of the same least-squares problem."""
+    rng = np.random.default_rng(3)
+    stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40), rsu(40, 40)]
+    config = TrackerConfig(initial_position_sd_max_m=1e-3, initial_window_s=2.0)
+    initialiser = Initialiser(config)
+    velocity, end = np.array([6.0, -3.0]), np.array([22.0, 17.0])
+    observed = []
+    for k in range(16):
+        age = (k - 15) * 0.1
+        state = np.array([*(end + velocity * age), *velocity, 0.0, 0.0])
+        station = stations[k % 4]
+        stamp = T0 + k * 100_000_000
+        rows = measure(station, state, Field.RANGE, rng)
+        initialiser.add(stamp, rows, np.zeros(1), (station,))
+        observed.append((age, station.info.position[:2], rows[0, 1]))
+        if k < 15:
+            assert initialiser.solve() is None  # the sd limit is out of reach
+
+    centre = np.mean([o for _, o, _ in observed], axis=0)
+
+    def residuals(x: Array) -> Array:
+        fit = [(np.hypot(*(x[:2] + x[2:] * age - o)) - value) / 0.3 for age, o, value in observed]
+        prior = [*((x[:2] - centre) / 150.0), *(x[2:] / 5.0)]
+        return np.array([*fit, *prior])
+
+    oracle = least_squares(residuals, [20.0, 20.0, 0.0, 0.0], xtol=1e-14, ftol=1e-14)
+    rows_of_last = Initialiser(TrackerConfig(initial_window_s=2.0))
+    for stamp, rows, rsus in initialiser._window:
+        rows_of_last.add(stamp, rows[:, :-1], rows[:, -1], rsus)
+    solution = rows_of_last.solve()
+    assert solution is not None
+    np.testing.assert_allclose(solution[0][:4], oracle.x, atol=1e-3)
+    cov = np.linalg.inv(oracle.jac.T @ oracle.jac) * max(1.0, 2 * oracle.cost / len(observed))
+    np.testing.assert_allclose(solution[1][:4, :4], cov, rtol=2e-2, atol=1e-3)
+
+
+def test_old_measurements_leave_the_window() -> None:
+    config = TrackerConfig(initial_window_s=1.0)
+    initialiser = Initialiser(config)
+    a, b = rsu(0, 0), rsu(40, 0)
+    initialiser.add(T0, measure(a, at(12, 25), Field.AZIMUTH), np.zeros(1), (a,))
+    on_time = T0 + 1_000_000_000
+    initialiser.add(on_time, measure(b, at(12, 25), Field.AZIMUTH), np.zeros(1), (b,))
+    assert len(initialiser._window) == 2
+    initialiser.add(on_time + 1, measure(b, at(12, 25), Field.AZIMUTH), np.zeros(1), (b,))
+    assert [entry[0] for entry in initialiser._window] == [on_time, on_time + 1]
+
+
+def test_attempts_are_at_least_a_tenth_of_a_second_apart() -> None:
+    initialiser = Initialiser(TrackerConfig())
+    a, b = rsu(0, 0), rsu(40, 0)
+    initialiser.add(T0, measure(a, at(12, 25), Field.AZIMUTH), np.zeros(1), (a,))
+    assert initialiser.solve() is None
+    for ms, solved in ((99, False), (100, True)):
+        rows = measure(b, at(12, 25), Field.AZIMUTH)
+        initialiser.add(T0 + ms * 1_000_000, rows, np.zeros(1), (b,))
+        assert (initialiser.solve() is not None) is solved
+
+
+def test_an_ambiguity_is_waited_for_most_of_the_window_only() -> None:
+    config = TrackerConfig(initial_window_s=1.0)
+    initialiser = Initialiser(config)
+    stations = [rsu(0, 0), rsu(40, 0)]
+    for ms in range(0, 1000, 100):
+        rows = np.vstack([measure(s, at(12, 25), Field.RANGE, range_sd=0.3) for s in stations])
+        initialiser.add(T0 + ms * 1_000_000, rows, np.zeros(2), tuple(stations))
+        solution = initialiser.solve()
+        assert (solution is None) is (ms < 800)
+        if solution is not None:
+            assert abs(solution[0][1]) == pytest.approx(25.0, abs=0.2)  # one of the two
+            break
+
+
+# covariance
+
+
+def test_covariance_is_consistent_over_many_seeds() -> None:
+    """DOA and TOA of two RSUs, truth from the prior: mean NEES of the position within its
+    chi-square bounds."""
+    config = TrackerConfig(**KNOWN_CLOCK)
+    stations = [rsu(0, 0), rsu(50, 10)]
+    nees = []
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        truth = at(*rng.uniform([10, 20], [40, 60]))
+        solution = solve(config, stations, truth, Field.AZIMUTH, rng)
+        assert solution is not None
+        error = solution[0][:2] - truth[:2]
+        nees.append(error @ np.linalg.solve(solution[1][:2, :2], error))
+    low, high = chi2.ppf([0.0005, 0.9995], 2 * 300) / 300
+    assert low < np.mean(nees) < high
+
+
+def test_inconsistent_measurements_widen_the_covariance() -> None:
+    """Three ranges that do not meet by far more than their noise."""
+    stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40), rsu(40, 40)]
+    rows = np.vstack([measure(s, at(20.0, 21.0), Field.RANGE) for s in stations])
+    good, bad = rows.copy(), rows.copy()
+    bad[0, 1] += 6.0
+    results = []
+    for values in (good, bad):
+        initialiser = Initialiser(TrackerConfig(initial_position_sd_max_m=50.0))
+        initialiser.add(T0, values, np.zeros(4), tuple(stations))
+        solution = initialiser.solve()
+        assert solution is not None
+        results.append(solution)
+    error = results[1][0][:2] - [20.0, 21.0]
+    assert error @ np.linalg.solve(results[0][1][:2, :2], error) > 20.0
+    assert error @ np.linalg.solve(results[1][1][:2, :2], error) < 9.0
+
+
+def test_averaging_never_beats_the_bias() -> None:
+    """Ten epochs with a 1 m bias in each range: the mean keeps the variance of the bias."""
+    stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40)]
+    config = TrackerConfig(initial_position_sd_max_m=0.2, initial_speed_sd_mps=1e-3)
+    biased, free = Initialiser(config), Initialiser(config)
+    for k in range(10):
+        rows = np.vstack([measure(s, at(15.0, 15.0), Field.RANGE) for s in stations])
+        stamp = T0 + k * 100_000_000
+        biased.add(stamp, rows, np.ones(3), tuple(stations))
+        free.add(stamp, rows, np.zeros(3), tuple(stations))
+    assert free.solve() is not None
+    assert biased.solve() is None  # its sd never gets below a metre or so
+    wide = Initialiser(TrackerConfig(initial_speed_sd_mps=1e-3))
+    for stamp, rows, rsus in biased._window:
+        wide.add(stamp, rows[:, :-1], rows[:, -1], rsus)
+    solution = wide.solve()
+    assert solution is not None
+    H = np.array([(np.array([15.0, 15.0]) - s.info.position[:2]) for s in stations])
+    H /= np.linalg.norm(H, axis=1)[:, None]
+    expected = np.linalg.inv(H.T @ H / (1.0 + 0.3**2 / 10) + np.eye(2) / 150.0**2)
+    np.testing.assert_allclose(solution[1][:2, :2], expected, rtol=1e-2, atol=1e-4)
+
+
+def test_bias_columns_do_not_reach_outside_the_six_states() -> None:
+    """Rows that name bias states (6, 7) are fitted without them, and the caller's rows survive."""
+    stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40)]
+    rows = np.vstack([measure(s, at(15.0, 15.0), Field.RANGE) for s in stations])
+    rows[:, 4], rows[:, 5] = 6, 7
+    initialiser = Initialiser(TrackerConfig())
+    initialiser.add(T0, rows, np.zeros(3), tuple(stations))
+    solution = initialiser.solve()
+    assert solution is not None
+    np.testing.assert_allclose(solution[0][:2], 15.0, atol=0.02)
+    assert set(rows[:, 4]) == {6.0}
+    assert set(rows[:, 0]) == {float(Kind.RANGE)}

@@ -1,0 +1,104 @@
+"""State to odometry and clock state: SciPy rotations, covariances by sampling, differences."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from netpos.messages.values import Array
+from netpos.tracking import output
+from scipy.constants import speed_of_light
+from scipy.spatial.transform import Rotation
+
+
+def spd(seed: int, scale: float = 1.0) -> Array:
+    A = np.random.default_rng(seed).normal(size=(8, 8))
+    return scale * (A @ A.T + 0.5 * np.eye(8))
+
+
+def state(vx: float, vy: float) -> Array:
+    return np.array([10.0, 20.0, vx, vy, 30.0, 0.5, 0.1, 0.2])
+
+
+@pytest.mark.parametrize("velocity", [(5.0, 0.0), (-3.0, 4.0), (0.0, -8.0), (-6.0, -1e-3)])
+def test_heading_variance_by_differences(velocity: tuple[float, float]) -> None:
+    cov = spd(1, 0.01)
+    yaw, variance = output.heading(state(*velocity), cov, last=9.0)
+    assert yaw == pytest.approx(math.atan2(velocity[1], velocity[0]))
+    eps, gradient = 1e-6, np.zeros(2)
+    for i in range(2):
+        step = np.eye(2)[i] * eps
+        ahead, back = np.array(velocity) + step, np.array(velocity) - step
+        turn = math.atan2(ahead[1], ahead[0]) - math.atan2(back[1], back[0])
+        gradient[i] = math.remainder(turn, 2 * math.pi) / (2 * eps)
+    assert variance == pytest.approx(gradient @ cov[2:4, 2:4] @ gradient, rel=1e-6)
+
+
+def test_heading_variance_by_sampling() -> None:
+    rng = np.random.default_rng(3)
+    cov = np.eye(6)
+    cov[2:4, 2:4] = [[0.04, 0.01], [0.01, 0.09]]
+    v = rng.multivariate_normal([6.0, 3.0], cov[2:4, 2:4], size=200_000)
+    _, variance = output.heading(state(6.0, 3.0)[:6], cov, 0.0)
+    assert variance == pytest.approx(np.arctan2(v[:, 1], v[:, 0]).var(), rel=0.02)
+
+
+def test_heading_holds_the_last_one_where_the_speed_does_not_stand_out() -> None:
+    nothing_known = math.pi**2 / 3  # variance of a uniform angle
+    cov = np.eye(6)
+    limit = nothing_known / 4
+    speed = 1.0 / math.sqrt(limit)  # variance = 1 / speed^2
+    assert output.heading(state(speed * 0.999, 0.0), cov, 1.25) == (1.25, nothing_known)
+    yaw, variance = output.heading(state(speed * 1.001, 0.0), cov, 1.25)
+    assert yaw == 0.0
+    assert variance == pytest.approx(limit / 1.001**2)
+    # at rest, however well the velocity is known
+    assert output.heading(state(0.9e-6, 0.0), 1e-30 * cov, -0.5) == (-0.5, nothing_known)
+    assert output.heading(state(0.0, 1.1e-6), 1e-30 * cov, -0.5)[0] == pytest.approx(math.pi / 2)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7, -2.5, math.pi])
+def test_odometry(yaw: float) -> None:
+    mean, cov = state(3.0, -4.0), spd(2)
+    odometry = output.odometry(123, "vue_9", mean, cov, 1.5, yaw, 0.02)
+    assert (odometry.stamp_ns, odometry.vue_id) == (123, "vue_9")
+    np.testing.assert_array_equal(odometry.position, [10.0, 20.0, 1.5])
+    turn = Rotation.from_euler("z", yaw)
+    assert (Rotation.from_quat(odometry.quaternion) * turn.inv()).magnitude() < 1e-12
+    assert np.linalg.norm(odometry.quaternion) == pytest.approx(1.0)
+    # the twist is the map velocity seen from the body: turning it back gives the state
+    np.testing.assert_allclose(turn.apply(odometry.linear_velocity), [3.0, -4.0, 0.0], atol=1e-12)
+    np.testing.assert_array_equal(odometry.angular_velocity, 0.0)
+    back = turn.as_matrix()[:2, :2]
+    np.testing.assert_allclose(
+        back @ odometry.twist_cov[:2, :2] @ back.T, cov[2:4, 2:4], atol=1e-12
+    )
+    np.testing.assert_array_equal(odometry.pose_cov[:2, :2], cov[:2, :2])
+    assert odometry.pose_cov[5, 5] == 0.02
+
+
+def test_what_is_not_estimated_has_a_huge_variance_and_no_correlation() -> None:
+    odometry = output.odometry(1, "v", state(1.0, 0.0), spd(2), 0.0, 0.3, 0.02)
+    assert output.UNOBSERVED_VAR == 1e6
+    np.testing.assert_array_equal(np.diag(odometry.pose_cov)[2:5], 1e6)
+    np.testing.assert_array_equal(np.diag(odometry.twist_cov)[2:], 1e6)
+    for cov in (odometry.pose_cov, odometry.twist_cov):
+        assert cov.shape == (6, 6)
+        rest = cov.copy()
+        rest[:2, :2] = 0.0
+        np.testing.assert_array_equal(rest - np.diag(np.diag(rest)), 0.0)
+
+
+def test_moving_along_the_heading_is_forward() -> None:
+    odometry = output.odometry(1, "v", state(3.0, 4.0), spd(2), 0.0, math.atan2(4.0, 3.0), 0.1)
+    np.testing.assert_allclose(odometry.linear_velocity, [5.0, 0.0, 0.0], atol=1e-12)
+
+
+def test_clock_state_in_seconds() -> None:
+    cov = spd(4)
+    clock = output.clock_state(77, "vue_9", state(0.0, 0.0), cov)
+    assert (clock.stamp_ns, clock.vue_id) == (77, "vue_9")
+    assert clock.offset_s == pytest.approx(30.0 / speed_of_light, rel=1e-14)
+    assert clock.drift == pytest.approx(0.5 / speed_of_light, rel=1e-14)
+    np.testing.assert_allclose(clock.cov, cov[4:6, 4:6] / speed_of_light**2, rtol=1e-14)

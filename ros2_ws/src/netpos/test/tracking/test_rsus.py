@@ -1,0 +1,146 @@
+"""Which slow and coloured errors of an RSU enter which rows."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from netpos.filters.measurement import Kind
+from netpos.messages.values import AngleConvention, Field, RsuInfo, RsuMeasurement
+from netpos.tracking.rsus import BiasStates, Rsu
+from scipy.spatial.transform import Rotation
+
+ALL = Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE
+
+
+def info(rsu_id: str = "a", **change: object) -> RsuInfo:
+    values: dict[str, object] = {"rsu_id": rsu_id, "position": np.zeros(3)}
+    return RsuInfo(**(values | change))  # type: ignore[arg-type]
+
+
+def biased(rsu_id: str = "a", **change: object) -> Rsu:
+    values = {
+        "azimuth_bias_sd_rad": 0.01,
+        "elevation_bias_sd_rad": 0.02,
+        "range_bias_sd_m": 0.3,
+        "bias_correlation_time_s": 50.0,
+    }
+    return Rsu.of(info(rsu_id, **(values | change)))
+
+
+def measured(fields: Field = ALL, stamp_ns: int = 1) -> RsuMeasurement:
+    return RsuMeasurement(stamp_ns=stamp_ns, rsu_id="a", vue_id="v", fields=fields)
+
+
+def test_bias_sd_by_kind() -> None:
+    rsu = biased()
+    assert {kind: rsu.bias_sd(kind) for kind in Kind if kind not in (Kind.LINEAR, Kind.SPEED)} == {
+        Kind.AZIMUTH: 0.01,
+        Kind.COSINE_Y: 0.01,
+        Kind.ELEVATION: 0.02,
+        Kind.COSINE_Z: 0.02,
+        Kind.TOA: 0.3,
+        Kind.RANGE: 0.3,
+    }
+
+
+def test_kinds_follow_the_convention() -> None:
+    assert biased().kinds(measured()) == (Kind.AZIMUTH, Kind.ELEVATION, Kind.TOA, Kind.RANGE)
+    cone = biased(angle_convention=AngleConvention.CONE)
+    assert cone.kinds(measured()) == (Kind.COSINE_Y, Kind.COSINE_Z, Kind.TOA, Kind.RANGE)
+    assert biased().kinds(measured(Field.POSITION)) == ()
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 200.0])
+def test_a_cone_array_sees_the_half_plane_before_it(yaw_deg: float) -> None:
+    turned = info(
+        angle_convention=AngleConvention.CONE,
+        quaternion=Rotation.from_euler("z", yaw_deg, degrees=True).as_quat(),
+    )
+    rsu = Rsu.of(turned)
+    for off_deg, front in (
+        (0, True),
+        (89, True),
+        (-89, True),
+        (91, False),
+        (-91, False),
+        (180, False),
+    ):
+        a = math.radians(yaw_deg + off_deg)
+        assert rsu.in_front(math.cos(a), math.sin(a)) is front
+        assert Rsu.of(info()).in_front(math.cos(a), math.sin(a)) is True
+    assert rsu.in_front(0.0, 0.0) is True
+
+
+def test_unbiased_white_rsu_has_no_states() -> None:
+    states = BiasStates()
+    coupling = states.coupling(Rsu.of(info()), measured())
+    assert (coupling.bias, coupling.common, coupling.inflation) == ({}, {}, {})
+    assert (states.sd, states.tau_s) == ([], [])
+
+
+def test_every_biased_quantity_has_its_own_state_once() -> None:
+    states = BiasStates()
+    first = states.coupling(biased(), measured())
+    assert first.bias == {Kind.AZIMUTH: 6, Kind.ELEVATION: 7, Kind.TOA: 8, Kind.RANGE: 9}
+    assert states.sd == [0.01, 0.02, 0.3, 0.3]
+    assert states.tau_s == [50.0] * 4
+    assert states.coupling(biased(), measured()).bias == first.bias
+    other = states.coupling(biased("b", bias_correlation_time_s=9.0), measured(Field.RANGE))
+    assert other.bias == {Kind.RANGE: 10}
+    assert states.tau_s[4] == 9.0
+    assert first.common == {}
+
+
+def test_only_measured_quantities_get_states() -> None:
+    states = BiasStates()
+    assert states.coupling(biased(azimuth_bias_sd_rad=0.0), measured(Field.AZIMUTH)).bias == {}
+    assert states.coupling(biased(), measured(Field.ELEVATION)).bias == {Kind.ELEVATION: 6}
+
+
+def test_common_bias_is_shared_by_the_ranges_of_a_network() -> None:
+    states = BiasStates()
+    common = {"common_range_bias_sd_m": 0.5, "common_bias_correlation_time_s": 70.0}
+    a = states.coupling(Rsu.of(info("a", network="n", **common)), measured())
+    b = states.coupling(Rsu.of(info("b", network="n", **common)), measured())
+    other = states.coupling(Rsu.of(info("c", network="m", **common)), measured())
+    assert a.common == b.common == {Kind.TOA: 6, Kind.RANGE: 6}
+    assert other.common == {Kind.TOA: 7, Kind.RANGE: 7}
+    assert (states.sd, states.tau_s) == ([0.5, 0.5], [70.0, 70.0])
+
+
+def test_an_rsu_named_like_a_network_has_its_own_state() -> None:
+    states = BiasStates()
+    rsu = biased("n", network="n", common_range_bias_sd_m=0.5, common_bias_correlation_time_s=7.0)
+    coupling = states.coupling(rsu, measured(Field.RANGE))
+    assert coupling.bias != coupling.common
+    assert len(states.sd) == 2
+
+
+def test_inflation_is_correlation_time_over_interval_since_the_last_accepted() -> None:
+    states, rsu = BiasStates(), Rsu.of(info(noise_correlation_time_s=0.4))
+    assert states.coupling(rsu, measured(stamp_ns=10**9)).inflation[Kind.RANGE] == 1.0
+    # not accepted: still the first
+    assert states.coupling(rsu, measured(stamp_ns=2 * 10**9)).inflation[Kind.RANGE] == 1.0
+    states.accepted(rsu, measured(Field.RANGE, stamp_ns=2 * 10**9))
+    soon = states.coupling(rsu, measured(stamp_ns=2_100_000_000)).inflation
+    assert soon[Kind.RANGE] == pytest.approx(4.0)
+    assert soon[Kind.AZIMUTH] == 1.0  # was not measured then
+    later = states.coupling(rsu, measured(stamp_ns=2_500_000_000)).inflation
+    assert later[Kind.RANGE] == 1.0  # never below 1
+    for stamp in (2 * 10**9, 10**9):
+        assert states.coupling(rsu, measured(stamp_ns=stamp)).inflation[Kind.RANGE] == 1.0
+
+
+def test_inflated_mean_has_the_variance_of_the_mean_of_coloured_noise() -> None:
+    """n samples of an exponentially correlated error over a long time: the variance of their mean
+    is S(0) / T, as if they were white with the inflated variance."""
+    tau, dt, n = 0.5, 0.05, 200_000
+    lags = np.arange(n)
+    correlation = np.exp(-lags * dt / tau)
+    of_mean = (n + 2 * np.sum((n - lags[1:]) * correlation[1:])) / n**2
+    states, rsu = BiasStates(), Rsu.of(info(noise_correlation_time_s=2 * tau))
+    states.accepted(rsu, measured(stamp_ns=10**9))
+    factor = states.coupling(rsu, measured(stamp_ns=10**9 + int(dt * 1e9))).inflation[Kind.RANGE]
+    assert factor / n == pytest.approx(of_mean, rel=2e-3)

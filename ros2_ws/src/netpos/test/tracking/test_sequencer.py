@@ -1,0 +1,325 @@
+"""Stamp order and epochs whatever the order of arrival."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import permutations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from netpos.messages.values import GroundSpeed, InitialPose, RsuMeasurement, Velocity
+from netpos.tracking.sequencer import Epoch, Item, Sequencer, channel_and_source
+
+MS = 1_000_000
+HOLD = 250 * MS
+
+
+def rsu(stamp_ms: int, rsu_id: str = "a", expected: int = 0) -> RsuMeasurement:
+    return RsuMeasurement(stamp_ns=stamp_ms * MS, rsu_id=rsu_id, vue_id="v", expected=expected)
+
+
+def velocity(stamp_ms: int, source: str = "step_velocity") -> Velocity:
+    return Velocity(
+        stamp_ns=stamp_ms * MS, vue_id="v", velocity=np.zeros(2), cov=np.eye(2), source=source
+    )
+
+
+def speed(stamp_ms: int) -> GroundSpeed:
+    return GroundSpeed(stamp_ns=stamp_ms * MS, vue_id="v", speed_mps=1.0, speed_var=1.0)
+
+
+def pose(stamp_ms: int) -> InitialPose:
+    return InitialPose(stamp_ns=stamp_ms * MS, vue_id="v", position=np.zeros(3), cov=np.eye(3))
+
+
+def feed(sequencer: Sequencer, items: list[Item]) -> list[list[Item]]:
+    """Items of the epochs in order of release; releases after each arrival, then the end."""
+    epochs: list[Epoch] = []
+    for item in items:
+        assert sequencer.add(item) is None
+        epochs += sequencer.release()
+    epochs += sequencer.flush()
+    return [list(epoch.sorted()) for epoch in epochs]
+
+
+def stamps_ms(epochs: list[Epoch]) -> list[int]:
+    return [e.stamp_ns // MS for e in epochs]
+
+
+def test_channels() -> None:
+    assert channel_and_source(rsu(1, "b")) == ("rsu", "b")
+    assert channel_and_source(velocity(1, "shoe")) == ("shoe", "shoe")
+    assert channel_and_source(speed(1)) == ("ground_speed", "ground_speed")
+    assert channel_and_source(pose(1)) == ("initial_pose", "")
+
+
+def test_order_within_an_epoch_is_by_channel_and_source() -> None:
+    items = [rsu(1, "b"), velocity(1), rsu(1, "a"), pose(1), speed(1)]
+    for order in permutations(items):
+        sequencer = Sequencer(HOLD)
+        for item in order:
+            assert sequencer.add(item) is None
+        (epoch,) = sequencer.flush()
+        assert epoch.stamp_ns == MS
+        assert [channel_and_source(i) for i in epoch.sorted()] == [
+            ("ground_speed", "ground_speed"),
+            ("initial_pose", ""),
+            ("rsu", "a"),
+            ("rsu", "b"),
+            ("step_velocity", "step_velocity"),
+        ]
+
+
+# when an epoch is complete
+
+
+@pytest.mark.parametrize(
+    ("measured", "complete"),
+    [
+        ([], True),  # no RSU in it
+        ([0], False),  # nobody said how many
+        ([1], True),
+        ([2], False),
+        ([2, 2], True),
+        ([2, 3], False),  # the largest announcement counts
+        ([0, 2], True),
+        ([1, 1], True),  # more than announced
+    ],
+)
+def test_expected_counts(measured: list[int], complete: bool) -> None:
+    epoch = Epoch(MS)
+    for i, expected in enumerate(measured):
+        item = rsu(1, str(i), expected)
+        epoch.items[channel_and_source(item)] = item
+    epoch.items[channel_and_source(velocity(1))] = velocity(1)
+    assert epoch.rsu_complete() is complete
+
+
+def test_complete_epoch_is_released_at_once() -> None:
+    s = Sequencer(HOLD)
+    s.add(rsu(100, "a", 2))
+    assert s.release() == []
+    s.add(rsu(100, "b", 2))
+    (epoch,) = s.release()
+    assert [i.rsu_id for i in epoch.sorted()] == ["a", "b"]
+    assert s.release() == []
+
+
+def test_unannounced_epoch_waits_for_the_next_stamp_of_the_rsus() -> None:
+    s = Sequencer(HOLD)
+    s.add(rsu(100, "a"))
+    s.add(rsu(100, "b"))
+    assert s.release() == []
+    s.add(rsu(101, "a"))
+    assert stamps_ms(s.release()) == [100]
+    assert stamps_ms(s.flush()) == [101]
+
+
+def test_a_live_channel_is_waited_for() -> None:
+    s = Sequencer(HOLD)
+    s.add(velocity(50))
+    assert stamps_ms(s.release()) == [50]
+    s.add(rsu(100, expected=1))
+    assert s.release() == []  # a velocity of stamp 100 or before may come
+    s.add(velocity(99))
+    assert stamps_ms(s.release()) == [99]  # its own epoch is free of RSUs and reached by them
+    s.add(velocity(100))
+    (epoch,) = s.release()
+    assert len(epoch.items) == 2
+
+
+def test_a_channel_silent_for_more_than_a_second_is_not_waited_for() -> None:
+    for silence_ns, waits in ((1_000_000_000, True), (1_000_000_001, False)):
+        s = Sequencer(5000 * MS)
+        s.add(velocity(50))
+        s.release()
+        s.add(replace(rsu(50, expected=1), stamp_ns=50 * MS + silence_ns))
+        assert (s.release() == []) is waits
+
+
+def test_an_initial_pose_is_never_waited_for() -> None:
+    s = Sequencer(HOLD)
+    s.add(pose(10))
+    s.add(rsu(20, expected=1))
+    assert stamps_ms(s.release()) == [10, 20]
+    s.add(rsu(30, expected=1))
+    assert stamps_ms(s.release()) == [30]
+
+
+def test_an_initial_pose_shares_the_epoch_of_the_measurements_of_its_stamp() -> None:
+    """However long they take to follow it: one epoch, not two of one stamp."""
+    s = Sequencer(HOLD)
+    s.add(pose(10))
+    assert s.release() == []
+    s.add(rsu(10, "a", 2))
+    assert s.release() == []
+    s.add(rsu(10, "b", 2))
+    (epoch,) = s.release()
+    assert len(epoch.items) == 3
+
+
+@pytest.mark.parametrize(("ahead_ms", "released"), [(249, False), (250, True), (251, True)])
+def test_hold_at_its_boundary(ahead_ms: int, released: bool) -> None:
+    """What is missing is waited for until the newest stamp is ``hold`` ahead."""
+    s = Sequencer(HOLD)
+    s.add(velocity(90))
+    s.release()
+    s.add(rsu(100, "a", 2))
+    s.add(velocity(100 + ahead_ms))
+    assert stamps_ms(s.release()) == ([100] if released else [])
+
+
+def test_hold_counts_from_each_epoch() -> None:
+    s = Sequencer(HOLD)
+    s.add(rsu(100, "a", 9))
+    s.add(rsu(200, "a", 9))
+    s.add(rsu(300, "a", 9))
+    assert stamps_ms(s.release()) == [100, 200]  # a later stamp of the RSUs closes an epoch
+    s.add(velocity(549))
+    assert s.release() == []
+    s.add(velocity(550))
+    assert stamps_ms(s.release()) == [300]  # 550 waits for the RSUs, which are live
+
+
+def test_hold_zero_waits_for_nothing() -> None:
+    s = Sequencer(0)
+    s.add(velocity(50))
+    assert stamps_ms(s.release()) == [50]
+    s.add(rsu(100, "a", 5))
+    assert stamps_ms(s.release()) == [100]
+    assert s.add(rsu(100, "b", 5)) is None  # same stamp again: another epoch
+    assert stamps_ms(s.release()) == [100]
+    assert s.add(velocity(99)) == "late"
+
+
+def test_flush_releases_everything_in_order() -> None:
+    s = Sequencer(HOLD)
+    for stamp in (300, 100, 200):
+        s.add(velocity(stamp, f"source {stamp}"))
+    assert stamps_ms(s.flush()) == [100, 200, 300]
+    assert s.flush() == []
+    assert s.release() == []
+    assert s.add(velocity(299)) == "late"
+    assert s.add(velocity(300, "other")) is None
+
+
+# refusals
+
+
+def test_duplicates_are_refused_before_and_after_release() -> None:
+    s = Sequencer(HOLD)
+    assert s.add(rsu(100, "a", 2)) is None
+    assert s.add(rsu(100, "a", 2)) == "duplicate"
+    assert s.add(rsu(100, "b", 2)) is None
+    s.release()
+    assert s.add(rsu(100, "b", 2)) == "duplicate"
+    assert s.add(rsu(100, "c", 2)) is None
+    assert s.add(rsu(100, "c", 2)) == "duplicate"
+    assert len(s.flush()[0].items) == 1
+
+
+def test_late_is_before_the_last_released_epoch() -> None:
+    s = Sequencer(HOLD)
+    s.add(rsu(100, "a", 1))
+    s.release()
+    assert s.add(velocity(99)) == "late"
+    assert s.add(velocity(100)) is None
+
+
+def test_older_than_pending_but_not_released_is_in_time() -> None:
+    s = Sequencer(HOLD)
+    s.add(rsu(100, "a", 2))
+    assert s.add(velocity(90)) is None
+    assert stamps_ms(s.flush()) == [90, 100]
+
+
+def test_late_initial_pose_is_applied_at_the_last_released_stamp() -> None:
+    """Tools stamp it 0 or with another clock's time."""
+    s = Sequencer(HOLD)
+    assert s.add(pose(0)) is None
+    assert [e.stamp_ns for e in s.flush()] == [0]
+    s.add(velocity(100))
+    s.flush()
+    for stamp in (0, 50):
+        t = Sequencer(HOLD)
+        t.add(velocity(100))
+        t.flush()
+        assert t.add(pose(stamp)) is None
+        assert stamps_ms(t.flush()) == [100]
+
+
+# the property
+
+
+def stream(name: str, stamps: list[int]) -> list[Item]:
+    if name == "rsu":
+        return [rsu(t, i, 2) for t in stamps for i in ("a", "b")]
+    return [velocity(t, name) for t in stamps]
+
+
+@st.composite
+def interleavings(draw: st.DrawFn) -> tuple[list[Item], list[Item]]:
+    """Channels with stamps 40..60 ms apart, and two orders of arrival.
+
+    In both, each channel is in stamp order and never lags the newest stamp by the hold.
+    """
+    channels = []
+    for name in ("rsu", "shoe", "wheel"):
+        steps = draw(st.lists(st.integers(40, 60), min_size=3, max_size=6))
+        channels.append(stream(name, [int(t) for t in np.cumsum([100, *steps])]))
+
+    def merged() -> list[Item]:
+        queues = [list(c) for c in channels]
+        out = [q.pop(0) for q in queues]  # every channel is known from the start
+        newest = max(i.stamp_ns for i in out)
+        while any(queues):
+            ready = [q for q in queues if q]
+            oldest = min(q[0].stamp_ns for q in ready)
+            allowed = [
+                q
+                for q in ready
+                if max(newest, q[0].stamp_ns) - oldest < HOLD or q[0].stamp_ns == oldest
+            ]
+            q = draw(st.sampled_from(allowed))
+            out.append(q.pop(0))
+            newest = max(newest, out[-1].stamp_ns)
+        return out
+
+    return merged(), merged()
+
+
+@settings(max_examples=150, deadline=None)
+@given(interleavings())
+def test_any_interleaving_within_the_hold_gives_the_same_epochs(
+    orders: tuple[list[Item], list[Item]],
+) -> None:
+    def epochs(order: list[Item]) -> list[list[tuple[int, str, str]]]:
+        s = Sequencer(HOLD)
+        out = []
+        for k, item in enumerate(order):
+            assert s.add(item) is None
+            if k >= 2:  # the first item of every channel has come
+                out += s.release()
+        out += s.flush()
+        return [[(i.stamp_ns, *channel_and_source(i)) for i in e.sorted()] for e in out]
+
+    first, second = epochs(orders[0]), epochs(orders[1])
+    assert first == second
+    flat = [entry[0] for epoch in first for entry in epoch]
+    assert flat == sorted(flat)
+    assert len(flat) == len(orders[0])
+    assert len({epoch[0][0] for epoch in first}) == len(first)  # one epoch per stamp
+
+
+def test_permutations_of_arrival_within_an_epoch_give_the_same_epochs() -> None:
+    later = [rsu(150, "a", 2), rsu(150, "b", 2), velocity(150)]
+    results = set()
+    for order in permutations([rsu(100, "a", 2), rsu(100, "b", 2), velocity(100)]):
+        s = Sequencer(HOLD)
+        s.add(velocity(50))
+        s.add(rsu(50, "a", 1))
+        s.release()
+        results.add(str([[channel_and_source(i) for i in e] for e in feed(s, [*order, *later])]))
+    assert len(results) == 1

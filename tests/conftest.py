@@ -1,0 +1,53 @@
+"""Fixtures of the integration tests: the running graph, the checkout and the real recordings."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+os.environ.setdefault(
+    "ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"
+)  # read once, by the first context
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+# A background job of a shell ignores SIGINT, and so would every process started here.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+try:
+    from graph import Graph, claim_domain
+except ImportError as error:
+    pytest.exit(f"{error}: run the tests by `make test`, or `source env.sh` first", returncode=4)
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """The checkout under test."""
+    return ROOT
+
+
+@pytest.fixture(scope="session")
+def data_folder() -> Path:
+    """The folder of real recordings; the test is skipped where it is absent."""
+    folder = Path(os.environ.get("NETPOS_DATA") or ROOT.parent / "shared" / "data")
+    if not folder.is_dir():
+        pytest.skip(f"real recordings are absent: no folder {folder} (set NETPOS_DATA to it)")
+    return folder
+
+
+@pytest.fixture
+def domain_id() -> Iterator[int]:
+    """A ROS domain no other test of this machine uses at this time."""
+    with claim_domain() as domain:
+        yield domain
+
+
+@pytest.fixture
+def graph(domain_id: int, tmp_path: Path) -> Iterator[Graph]:
+    """A ROS graph of its own; what is still running at the end is killed."""
+    with Graph(domain_id, tmp_path / "logs") as running:
+        yield running

@@ -1,0 +1,121 @@
+"""What several integration tests need: scenarios, commands that must succeed, bags in pieces."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from graph import Graph, Process, claim_domain
+from netpos.bags import BagReader, codec, typestore
+from netpos.messages.codec import stamp_ns
+from netpos.messages.topics import RSU_INFO, RSU_MEASUREMENTS, of_vue
+from netpos.scenario.load import scenario_files
+
+ROOT = Path(__file__).resolve().parents[1]
+VUE = "vue_1"
+INFOS, MEASUREMENTS = RSU_INFO, RSU_MEASUREMENTS
+ODOMETRY, CLOCK_STATE, TRACK_STATUS, TRUTH = (
+    of_vue(VUE, name) for name in ("odometry", "clock_state", "track_status", "ground_truth")
+)
+ESTIMATES = (ODOMETRY, CLOCK_STATE, TRACK_STATUS)
+RUN_S = 120.0
+
+
+@contextmanager
+def graphs(folder: Path, count: int = 1) -> Iterator[list[Graph]]:
+    """So many graphs, each on a domain of its own."""
+    with ExitStack() as stack:
+        yield [
+            stack.enter_context(Graph(stack.enter_context(claim_domain()), folder / f"logs_{i}"))
+            for i in range(count)
+        ]
+
+
+def script(graph: Graph, name: str, *arguments: str | Path) -> Process:
+    """Start scripts/NAME.sh in the graph's domain."""
+    return graph.start(name, [str(ROOT / "scripts" / f"{name}.sh"), *map(str, arguments)])
+
+
+def finish(*processes: Process) -> None:
+    """Wait for scripts to end well; one that hangs is stopped together with its nodes."""
+    for process in processes:
+        try:
+            code = process.wait(RUN_S)
+        except TimeoutError:
+            process.signal(signal.SIGTERM)
+            process.wait()
+            raise
+        assert code == 0, process.describe()
+
+
+def run_netpos(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run the command line and wait for it."""
+    command = ["netpos", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=RUN_S, check=False)
+
+
+def netpos(*arguments: str | Path) -> str:
+    """Run the command line, which must succeed; its output."""
+    done = run_netpos(*arguments)
+    assert done.returncode == 0, f"netpos {arguments} ended with {done.returncode}: {done.stderr}"
+    return done.stdout
+
+
+def changed_scenario(
+    path: Path, base: str, device: dict[str, Any] | None = None, **changes: Any
+) -> Path:
+    """Write a scenario like ``base`` with other values; ``device`` changes its first device."""
+    content = yaml.safe_load(scenario_files()[base].read_text(encoding="utf-8"))
+    content["devices"][0].update(device or {})
+    content.update(changes)
+    # a number such as 5.0e-08 has a dot and a signed exponent, so any YAML reader sees a number
+    path.write_text(yaml.safe_dump(content), encoding="utf-8")
+    return path
+
+
+def long_road(path: Path) -> Path:
+    """The errors of fast_pass on a straight road of 4 km at 20 m/s: as long as a test may need."""
+    units = [{"id": f"rsu_{i}", "position": [60.0 * i, 0.0, 0.0]} for i in range(67)]
+    route = {"kind": "waypoints", "points": [[0.0, -10.0], [3960.0, -10.0]]}
+    device = {"route": route, "speed_mps": 20.0}
+    return changed_scenario(path, "fast_pass", device, rsus={"units": units})
+
+
+def messages(bag: Path, topic: str) -> list[Any]:
+    """Decoded messages of a topic, in order."""
+    with BagReader(bag) as reader:
+        return [entry.message for entry in reader.messages([topic])]
+
+
+def payloads(bag: Path, topics: Collection[str]) -> dict[str, list[bytes]]:
+    """Messages per topic, serialised anew: equal bytes are equal bits of every field.
+
+    What a bag holds as it was sent may differ in the padding between fields, which no field owns.
+    """
+    found: dict[str, list[bytes]] = {topic: [] for topic in topics}
+    with BagReader(bag) as reader:
+        for entry in reader.messages(topics):
+            anew = typestore().serialize_cdr(entry.message, entry.type_name)
+            found[entry.topic].append(bytes(anew))
+    return found
+
+
+def horizontal_errors(truth: list[Any], odometry: list[Any]) -> dict[int, float]:
+    """Distance [m] of each estimate to the truth of the same stamp, by stamp [ns]."""
+    true_positions = {t.stamp_ns: t.position for t in map(codec().odometry_from_msg, truth)}
+    return {
+        o.stamp_ns: float(np.hypot(*(o.position - true_positions[o.stamp_ns])[:2]))
+        for o in map(codec().odometry_from_msg, odometry)
+        if o.stamp_ns in true_positions
+    }
+
+
+def stamps(received: list[Any]) -> list[int]:
+    """Header stamps [ns]."""
+    return [stamp_ns(message.header.stamp) for message in received]
