@@ -107,7 +107,7 @@ def misfit(
     per row; unlike the NIS it stays so where the model bends over the width of the prior.
     """
     innovation, _ = linearise(rows, x, height_m)
-    return distance2(cov, x - mean) + float((innovation * innovation / variance).sum())
+    return float(distance2(cov, x - mean) + (innovation * innovation / variance).sum())
 
 
 @njit(cache=True)

@@ -12,6 +12,18 @@ from typing import Any
 
 import numpy as np
 
+from netpos.messages.fields import (
+    MAP_FRAME,
+    NS,
+    base_link,
+    embed,
+    flat,
+    imu_covariance,
+    square,
+    stamp_ns,
+    vue_of_frame,
+    xyz,
+)
 from netpos.messages.values import (
     AngleConvention,
     Array,
@@ -30,52 +42,6 @@ from netpos.messages.values import (
     TrackStatus,
     Velocity,
 )
-
-MAP_FRAME = "map"
-NS = 1_000_000_000
-
-
-def base_link(vue_id: str) -> str:
-    """Name of a device's body frame (REP-105)."""
-    return f"{vue_id}/base_link"
-
-
-def vue_of_frame(frame_id: str) -> str:
-    """Device name of a body frame; the inverse of ``base_link``."""
-    return frame_id.rsplit("/", 1)[0]
-
-
-def stamp_ns(time: Any) -> int:
-    """Integer nanoseconds of a builtin_interfaces/Time."""
-    return int(time.sec) * NS + int(time.nanosec)
-
-
-def _xyz(point: Any) -> Array:
-    return np.array([point.x, point.y, point.z], dtype=np.float64)
-
-
-def _square(values: Any, n: int) -> Array:
-    return np.asarray(values, dtype=np.float64).reshape(n, n)
-
-
-def _flat(matrix: Array) -> Array:
-    return np.ascontiguousarray(matrix, dtype=np.float64).reshape(-1)
-
-
-def _embed(cov: Array) -> Array:
-    """(2, 2) or (3, 3) covariance in the top left corner of a flat (6, 6)."""
-    full = np.zeros((6, 6))
-    full[: len(cov), : len(cov)] = cov
-    return full.reshape(-1)
-
-
-def _imu_covariance(variance: float) -> Array:
-    """Flat (3, 3) of equal variances; -1 (not measured, REP-145) only in the first element."""
-    cov = np.zeros(9)
-    cov[0::4] = variance
-    if variance < 0.0:
-        cov[4] = cov[8] = 0.0
-    return cov
 
 
 class Codec:
@@ -99,11 +65,11 @@ class Codec:
         """std_msgs/Header."""
         return self._header(stamp=self.time(ns), frame_id=frame_id)
 
-    def _to_point(self, xyz: Array) -> Any:
-        return self._point(x=float(xyz[0]), y=float(xyz[1]), z=float(xyz[2]))
+    def _to_point(self, v: Array) -> Any:
+        return self._point(x=float(v[0]), y=float(v[1]), z=float(v[2]))
 
-    def _to_vector(self, xyz: Array) -> Any:
-        return self._vector(x=float(xyz[0]), y=float(xyz[1]), z=float(xyz[2]))
+    def _to_vector(self, v: Array) -> Any:
+        return self._vector(x=float(v[0]), y=float(v[1]), z=float(v[2]))
 
     def _to_quaternion(self, q: Array) -> Any:
         return self._quaternion(x=float(q[0]), y=float(q[1]), z=float(q[2]), w=float(q[3]))
@@ -136,7 +102,7 @@ class Codec:
             stamp_ns=stamp_ns(msg.header.stamp),
             vue_id=msg.vue_id,
             sequence=int(msg.sequence),
-            position=_xyz(msg.position),
+            position=xyz(msg.position),
             clock_offset_s=float(msg.clock_offset),
         )
 
@@ -167,7 +133,7 @@ class Codec:
             stamp_ns=stamp_ns(msg.header.stamp),
             rsu_id=msg.rsu_id,
             network=msg.network,
-            position=_xyz(msg.pose.position),
+            position=xyz(msg.pose.position),
             quaternion=np.array([q.x, q.y, q.z, q.w], dtype=np.float64),
             azimuth_bias_sd_rad=float(msg.azimuth_bias_sd),
             elevation_bias_sd_rad=float(msg.elevation_bias_sd),
@@ -203,7 +169,7 @@ class Codec:
             phase_difference=float(m.phase_difference_rad),
             phase_difference_var=float(m.phase_difference_var),
             position=self._to_point(m.position),
-            position_covariance=_flat(m.position_cov),
+            position_covariance=flat(m.position_cov),
         )
 
     @staticmethod
@@ -228,8 +194,8 @@ class Codec:
             range_var=float(msg.range_var),
             phase_difference_rad=float(msg.phase_difference),
             phase_difference_var=float(msg.phase_difference_var),
-            position=_xyz(msg.position),
-            position_cov=_square(msg.position_covariance, 3),
+            position=xyz(msg.position),
+            position_cov=square(msg.position_covariance, 3),
         )
 
     def clock_state_to_msg(self, clock: ClockState) -> Any:
@@ -238,7 +204,7 @@ class Codec:
             header=self.header(clock.stamp_ns, base_link(clock.vue_id)),
             offset=float(clock.offset_s),
             drift=float(clock.drift),
-            covariance=_flat(clock.cov),
+            covariance=flat(clock.cov),
         )
 
     @staticmethod
@@ -249,7 +215,7 @@ class Codec:
             vue_id=vue_of_frame(msg.header.frame_id),
             offset_s=float(msg.offset),
             drift=float(msg.drift),
-            cov=_square(msg.covariance, 2),
+            cov=square(msg.covariance, 2),
         )
 
     def track_status_to_msg(self, status: TrackStatus) -> Any:
@@ -315,10 +281,10 @@ class Codec:
             child_frame_id=base_link(odometry.vue_id),
             pose=self._resolve("geometry_msgs/msg/PoseWithCovariance")(
                 pose=self._to_pose(odometry.position, odometry.quaternion),
-                covariance=_flat(odometry.pose_cov),
+                covariance=flat(odometry.pose_cov),
             ),
             twist=self._resolve("geometry_msgs/msg/TwistWithCovariance")(
-                twist=twist, covariance=_flat(odometry.twist_cov)
+                twist=twist, covariance=flat(odometry.twist_cov)
             ),
         )
 
@@ -329,12 +295,12 @@ class Codec:
         return Odometry(
             stamp_ns=stamp_ns(msg.header.stamp),
             vue_id=vue_of_frame(msg.child_frame_id),
-            position=_xyz(msg.pose.pose.position),
+            position=xyz(msg.pose.pose.position),
             quaternion=np.array([q.x, q.y, q.z, q.w], dtype=np.float64),
-            linear_velocity=_xyz(msg.twist.twist.linear),
-            angular_velocity=_xyz(msg.twist.twist.angular),
-            pose_cov=_square(msg.pose.covariance, 6),
-            twist_cov=_square(msg.twist.covariance, 6),
+            linear_velocity=xyz(msg.twist.twist.linear),
+            angular_velocity=xyz(msg.twist.twist.angular),
+            pose_cov=square(msg.pose.covariance, 6),
+            twist_cov=square(msg.twist.covariance, 6),
         )
 
     def imu_to_msg(self, imu: ImuSample) -> Any:
@@ -342,11 +308,11 @@ class Codec:
         return self._resolve("sensor_msgs/msg/Imu")(
             header=self.header(imu.stamp_ns, base_link(imu.vue_id)),
             orientation=self._to_quaternion(np.array([0.0, 0.0, 0.0, 1.0])),
-            orientation_covariance=_imu_covariance(-1.0),
+            orientation_covariance=imu_covariance(-1.0),
             angular_velocity=self._to_vector(imu.angular_velocity),
-            angular_velocity_covariance=_imu_covariance(imu.angular_velocity_var),
+            angular_velocity_covariance=imu_covariance(imu.angular_velocity_var),
             linear_acceleration=self._to_vector(imu.specific_force),
-            linear_acceleration_covariance=_imu_covariance(imu.specific_force_var),
+            linear_acceleration_covariance=imu_covariance(imu.specific_force_var),
         )
 
     @staticmethod
@@ -355,8 +321,8 @@ class Codec:
         return ImuSample(
             stamp_ns=stamp_ns(msg.header.stamp),
             vue_id=vue_of_frame(msg.header.frame_id),
-            angular_velocity=_xyz(msg.angular_velocity),
-            specific_force=_xyz(msg.linear_acceleration),
+            angular_velocity=xyz(msg.angular_velocity),
+            specific_force=xyz(msg.linear_acceleration),
             angular_velocity_var=float(msg.angular_velocity_covariance[0]),
             specific_force_var=float(msg.linear_acceleration_covariance[0]),
         )
@@ -366,7 +332,7 @@ class Codec:
         return self._resolve("sensor_msgs/msg/MagneticField")(
             header=self.header(mag.stamp_ns, base_link(mag.vue_id)),
             magnetic_field=self._to_vector(mag.magnetic_field),
-            magnetic_field_covariance=_flat(np.eye(3) * mag.magnetic_field_var),
+            magnetic_field_covariance=flat(np.eye(3) * mag.magnetic_field_var),
         )
 
     @staticmethod
@@ -375,7 +341,7 @@ class Codec:
         return MagneticSample(
             stamp_ns=stamp_ns(msg.header.stamp),
             vue_id=vue_of_frame(msg.header.frame_id),
-            magnetic_field=_xyz(msg.magnetic_field),
+            magnetic_field=xyz(msg.magnetic_field),
             magnetic_field_var=float(msg.magnetic_field_covariance[0]),
         )
 
@@ -388,7 +354,7 @@ class Codec:
                 twist=self._resolve("geometry_msgs/msg/Twist")(
                     linear=self._to_vector(linear), angular=self._to_vector(np.zeros(3))
                 ),
-                covariance=_embed(velocity.cov),
+                covariance=embed(velocity.cov),
             ),
         )
 
@@ -399,8 +365,8 @@ class Codec:
             stamp_ns=stamp_ns(msg.header.stamp),
             vue_id=vue_id,
             frame_id=msg.header.frame_id,
-            velocity=_xyz(msg.twist.twist.linear)[:2],
-            cov=_square(msg.twist.covariance, 6)[:2, :2].copy(),
+            velocity=xyz(msg.twist.twist.linear)[:2],
+            cov=square(msg.twist.covariance, 6)[:2, :2].copy(),
             source=source,
         )
 
@@ -422,7 +388,7 @@ class Codec:
             header=self.header(pose.stamp_ns, MAP_FRAME),
             pose=self._resolve("geometry_msgs/msg/PoseWithCovariance")(
                 pose=self._to_pose(pose.position, np.array([0.0, 0.0, 0.0, 1.0])),
-                covariance=_embed(pose.cov),
+                covariance=embed(pose.cov),
             ),
         )
 
@@ -432,8 +398,8 @@ class Codec:
         return InitialPose(
             stamp_ns=stamp_ns(msg.header.stamp),
             vue_id=vue_id,
-            position=_xyz(msg.pose.pose.position),
-            cov=_square(msg.pose.covariance, 6)[:3, :3].copy(),
+            position=xyz(msg.pose.pose.position),
+            cov=square(msg.pose.covariance, 6)[:3, :3].copy(),
         )
 
     def transform_to_msg(self, odometry: Odometry) -> Any:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
-from netpos.messages.codec import MAP_FRAME
+from netpos.messages.fields import MAP_FRAME
 from netpos.messages.topics import is_vue_id
 from netpos.messages.values import (
     Array,

@@ -1,0 +1,58 @@
+"""Frames, stamps and arrays as messages carry them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from netpos.messages.values import Array
+
+MAP_FRAME = "map"
+NS = 1_000_000_000
+
+
+def base_link(vue_id: str) -> str:
+    """Name of a device's body frame (REP-105)."""
+    return f"{vue_id}/base_link"
+
+
+def vue_of_frame(frame_id: str) -> str:
+    """Device name of a body frame; the inverse of ``base_link``."""
+    return frame_id.rsplit("/", 1)[0]
+
+
+def stamp_ns(time: Any) -> int:
+    """Integer nanoseconds of a builtin_interfaces/Time."""
+    return int(time.sec) * NS + int(time.nanosec)
+
+
+def xyz(point: Any) -> Array:
+    """Point or vector message as (3,)."""
+    return np.array([point.x, point.y, point.z], dtype=np.float64)
+
+
+def square(values: Any, n: int) -> Array:
+    """Flat covariance of a message as (n, n)."""
+    return np.asarray(values, dtype=np.float64).reshape(n, n)
+
+
+def flat(matrix: Array) -> Array:
+    """Matrix as the flat row-major array a message takes."""
+    return np.ascontiguousarray(matrix, dtype=np.float64).reshape(-1)
+
+
+def embed(cov: Array) -> Array:
+    """(2, 2) or (3, 3) covariance in the top left corner of a flat (6, 6)."""
+    full = np.zeros((6, 6))
+    full[: len(cov), : len(cov)] = cov
+    return full.reshape(-1)
+
+
+def imu_covariance(variance: float) -> Array:
+    """Flat (3, 3) of equal variances; -1 (not measured, REP-145) only in the first element."""
+    cov = np.zeros(9)
+    cov[0::4] = variance
+    if variance < 0.0:
+        cov[4] = cov[8] = 0.0
+    return cov
