@@ -22,7 +22,7 @@ bag=${positional[0]} out=${positional[1]} rate=${positional[2]:-1}
 . "$NETPOS_ROOT/scripts/graph.sh"
 
 graph_begin "$(basename "$out")"
-start netpos_record netpos_bag record --output "$out"
+start netpos_record netpos_bag record --output "$out" --log-time clock
 start_up netpos_record
 start ekf_tracker ekf_tracker ekf_tracker --ros-args -p scenario:="$bag" "$@"
 start_up ekf_tracker

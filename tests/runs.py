@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 from collections.abc import Collection, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 from graph import Graph, Process, claim_domain
 from netpos.bags import BagReader, codec, typestore
-from netpos.messages.codec import stamp_ns
+from netpos.messages.fields import stamp_ns
 from netpos.messages.topics import RSU_INFO, RSU_MEASUREMENTS, of_vue
 from netpos.scenario.load import scenario_files
 
@@ -31,10 +31,18 @@ RUN_S = 120.0
 def graphs(folder: Path, count: int = 1) -> Iterator[list[Graph]]:
     """So many graphs, each on a domain of its own."""
     with ExitStack() as stack:
-        yield [
+        made = [
             stack.enter_context(Graph(stack.enter_context(claim_domain()), folder / f"logs_{i}"))
             for i in range(count)
         ]
+        try:
+            yield made
+        finally:
+            # a script that is killed leaves its nodes behind; asked to end it takes them along
+            for process in [p for graph in made for p in graph.processes if p.running]:
+                process.signal(signal.SIGTERM)
+                with suppress(TimeoutError):
+                    process.wait()
 
 
 def script(graph: Graph, name: str, *arguments: str | Path) -> Process:
@@ -43,15 +51,9 @@ def script(graph: Graph, name: str, *arguments: str | Path) -> Process:
 
 
 def finish(*processes: Process) -> None:
-    """Wait for scripts to end well; one that hangs is stopped together with its nodes."""
+    """Wait for scripts to end well."""
     for process in processes:
-        try:
-            code = process.wait(RUN_S)
-        except TimeoutError:
-            process.signal(signal.SIGTERM)
-            process.wait()
-            raise
-        assert code == 0, process.describe()
+        assert process.wait(RUN_S) == 0, process.describe()
 
 
 def run_netpos(*arguments: str | Path) -> subprocess.CompletedProcess[str]:

@@ -14,7 +14,7 @@ from netpos.tracking import Tracker, TrackOutput
 from netpos.tracking.warm_up import warm_up
 from netpos_msgs.msg import ClockState, RsuInfo, RsuMeasurement
 from netpos_msgs.msg import TrackStatus as TrackStatusMsg
-from netpos_node import CODEC, LATCHED, STREAM, run
+from netpos_node import BACKLOG, CODEC, LATCHED, STREAM, run, spin_until_stopped
 from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -26,7 +26,8 @@ from tf2_msgs.msg import TFMessage
 from ekf_tracker.conversions import diagnostics_to_msg
 from ekf_tracker.parameters import declare_parameters
 
-_SILENCE_S = 0.5
+_SILENCE_S = 2.0  # long: a stalled machine must not look like the end of the measurements
+_DELIVERY_S = 1
 
 
 class EkfTrackerNode(Node):
@@ -64,7 +65,7 @@ class EkfTrackerNode(Node):
     # inputs
 
     def _listen(
-        self, msg_type: Any, topic: str, handler: Callable[[Any], None], qos: Any = STREAM
+        self, msg_type: Any, topic: str, handler: Callable[[Any], None], qos: Any = BACKLOG
     ) -> None:
         def on_message(msg: Any) -> None:
             self._take_all(handler, msg)
@@ -72,7 +73,9 @@ class EkfTrackerNode(Node):
         subscription = self.create_subscription(msg_type, topic, on_message, qos)
         self._inputs.append((subscription, handler))
 
-    def _take_all(self, first_handler: Callable[[Any], None], first: Any) -> None:
+    def _take_all(
+        self, first_handler: Callable[[Any], None] | None = None, first: Any = None
+    ) -> None:
         """Hand over all that has arrived, so that ready topics cannot overtake each other."""
         self._heard_since_tick = True
         for subscription, handler in self._inputs:
@@ -153,6 +156,13 @@ class EkfTrackerNode(Node):
             diagnostics_to_msg(self._statuses.values(), self._tracker.rsu_count)
         )
 
+    def finish(self) -> None:
+        """Give out what still follows from all that has arrived, and see it delivered."""
+        self._take_all()
+        self._publish(self._tracker.flush())
+        for publisher in self.publishers:
+            publisher.wait_for_all_acked(Duration(seconds=_DELIVERY_S))
+
     # time and services
 
     def _on_silence_tick(self) -> None:
@@ -176,6 +186,11 @@ class EkfTrackerNode(Node):
         return response
 
 
+def _spin(node: Node) -> None:
+    assert isinstance(node, EkfTrackerNode)
+    spin_until_stopped(node, node.finish)
+
+
 def main() -> None:
     """Entry point of ``ros2 run ekf_tracker ekf_tracker``."""
-    run(EkfTrackerNode)
+    run(EkfTrackerNode, _spin)

@@ -1,4 +1,4 @@
-"""Start the graph of a scenario: ``ros2 launch netpos_bringup netpos.launch.py scenario:=metis_madrid``.
+"""Start a scenario's graph: ``ros2 launch netpos_bringup netpos.launch.py scenario:=fast_pass``.
 
 For ROS installations that have `launch`; scripts/run_graph.sh does the same with `ros2 run` alone.
 The launch ends when the scenario has ended. With ``bag:=DIR`` the run is recorded.

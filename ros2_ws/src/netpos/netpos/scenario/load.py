@@ -139,7 +139,13 @@ def _change(content: Any, dotted: str, value: object) -> None:
 def _describe(path: Path, root: yaml.Node, error: ValidationError) -> str:
     """One sentence per complaint."""
     lines = []
-    for item in error.errors(include_url=False):
+    complaints = error.errors(include_url=False)
+    for item in complaints:
+        if item["type"] == "too_short" and any(
+            other["loc"][: len(item["loc"])] == item["loc"] and other is not item
+            for other in complaints
+        ):
+            continue  # short only of the entries the others complain about
         keys, line = _locate(root, item["loc"])
         text = item["msg"].removeprefix("Value error, ")
         if item["type"] in {"extra_forbidden", "unexpected_keyword_argument"}:

@@ -173,7 +173,7 @@ class Initialiser:
             state[4] = _clock_at(state, rows, self._config.device_height_m)
             scored.append((_normal_equations(state, *problem)[0], len(scored), state))
         fits = [_solve(state, problem) for _, _, state in sorted(scored)[:_REFINED]]
-        fits = [fit for fit in fits if np.isfinite(fit[0]) and self._plausible(fit[1])]
+        fits = [fit for fit in fits if _is_sound(fit) and self._plausible(fit[1])]
         return sorted(fits, key=lambda fit: fit[0])
 
     def _plausible(self, state: Array) -> bool:

@@ -87,7 +87,6 @@ class Track:
         self._initialiser = Initialiser(self._config)
         self._yaw = 0.0
         self._has_clock = False
-        self._posed = False
         self._rejected_in_row = 0
         self._last_accepted_ns = 0
 
@@ -141,11 +140,10 @@ class Track:
         cov = np.diag(np.array([*sd, c * cfg.clock_offset_sd_s, c * cfg.clock_drift_sd]) ** 2)
         cov[:2, :2] = pose.cov[:2, :2]
         self._estimate = _Estimate(stamp_ns, mean, cov)
-        self._posed = True
         self._last_accepted_ns = stamp_ns
 
     def _try_first_fix(self, stamp_ns: int, batch: _Batch) -> tuple[str, ...]:
-        if self._config.require_initial_pose and not self._posed and not self._accepted:
+        if self._config.require_initial_pose and not self._accepted:
             self.rejected["no_initial_pose"] += len(batch.items)
             return ()
         heard = tuple(self._rsus[i.rsu_id] for i in batch.items if isinstance(i, RsuMeasurement))

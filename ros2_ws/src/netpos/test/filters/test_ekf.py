@@ -227,6 +227,18 @@ def test_gate_has_one_threshold_per_number_of_rows_and_the_last_for_more() -> No
         assert ekf.update(mean, cov, rows, 0.0, np.array(gate, float), 1)[2].tolist() == [accepted]
 
 
+def test_every_group_has_the_threshold_of_its_own_size() -> None:
+    mean, cov = np.zeros(6), np.eye(6)
+    sizes = (1, 2, 1)  # NIS 2 per row
+    rows = [
+        linear_row(np.eye(6)[i], 2.0, 1.0, group)
+        for i, group in enumerate(g for g, size in enumerate(sizes) for _ in range(size))
+    ]
+    for gate, taken in (([0, 2.1, 3.9, 99], [1, 0, 1]), ([0, 1.9, 4.1, 99], [0, 1, 0])):
+        result = ekf.update(mean, cov, np.array(rows), 0.0, np.array(gate, float), 1)
+        assert result[2].tolist() == taken
+
+
 def test_gate_looks_at_the_gate_variance_and_the_update_at_the_variance() -> None:
     mean, cov = np.zeros(6), np.eye(6)
     one = linear_row(np.eye(6)[0], 4.0, 99.0, 0)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from netpos.bags import codec, typestore
-from netpos.messages.codec import base_link, stamp_ns, vue_of_frame
+from netpos.messages.fields import base_link, stamp_ns, vue_of_frame
 from netpos.messages.values import (
     AngleConvention,
     Beacon,

@@ -190,6 +190,18 @@ def test_waiting_then_initialising_then_tracking(world: Any, feed: Any) -> None:
     assert output.status.state is TrackState.TRACKING
 
 
+@pytest.mark.parametrize("fields", [ALL, Field.RANGE | Field.AZIMUTH])
+def test_clock_is_reported_from_the_first_toa_on(world: Any, feed: Any, fields: Field) -> None:
+    tracker = world.tracker()
+    (output,) = feed(tracker, world.measure(0.0, standing(), fields))
+    assert output.odometry is not None
+    assert (output.clock is not None) is bool(fields & Field.TOA)
+    (output,) = feed(tracker, world.measure(0.1, standing(), ALL))
+    assert output.clock is not None
+    (output,) = feed(tracker, world.measure(0.2, standing(), Field.RANGE))
+    assert output.clock is not None
+
+
 def test_initial_pose_starts_the_track_as_the_paper_does(world: Any, feed: Any) -> None:
     """fokin2020:eq.32, 33: position given, velocity 0, clock 0, drift 25 ppm."""
     tracker = world.tracker()
@@ -289,6 +301,34 @@ def test_lost_track_finds_itself_again(world: Any, feed: Any) -> None:
     assert outputs[0].status.nis_dof == 0
 
 
+def test_an_initial_pose_counts_rejected_epochs_from_none(world: Any, feed: Any) -> None:
+    config = {"max_rejected_epochs": 3, "inflate_after_epochs": 10000}
+    tracker = settled(world, feed, **config)
+    elsewhere = standing(80.0, 30.0)
+    for k in range(2):
+        feed(tracker, world.measure(2.0 + 0.1 * k, elsewhere))
+    feed(tracker, [pose(2.2, 40.0, 2.0, 0.01)])
+    states = []
+    for k in range(3):
+        (output,) = feed(tracker, world.measure(2.3 + 0.1 * k, elsewhere))
+        states.append(output.status.state)
+    # the pose is news of the device: no coasting for a second after it
+    assert states == [TrackState.TRACKING, TrackState.TRACKING, TrackState.WAITING]
+
+
+def test_rejected_epochs_do_not_leave_the_velocity_opened(world: Any, feed: Any) -> None:
+    """Opening is a trial: where nothing passes even then, the covariance is the prediction's."""
+    sds = []
+    for after in (1, 10000):
+        tracker = settled(world, feed, inflate_after_epochs=after, max_rejected_epochs=100)
+        for k in range(5):
+            far = standing(40.0, 900.0)
+            (output,) = feed(tracker, world.measure(2.0 + 0.1 * k, far, Field.RANGE))
+        assert output.status.used == 0
+        sds.append(output.status.position_sd_m)
+    assert sds[0] == sds[1]
+
+
 def test_an_accepted_epoch_ends_the_row_of_rejected_ones(world: Any, feed: Any) -> None:
     tracker = settled(world, feed, max_rejected_epochs=3, inflate_after_epochs=10000)
     for k in range(12):
@@ -366,6 +406,19 @@ def test_gap_starts_anew(world: Any, feed: Any) -> None:
         assert output.status.used == 3
         assert output.status.nis_dof == accepted_dof  # 0: a first fix, not an update
         assert error(output, standing()) < 1.0
+
+
+def test_a_gap_forgets_the_biases_too(world: Any, feed: Any) -> None:
+    """The states of RSUs heard before the gap must not be counted for the new track."""
+    with_errors(world, range_bias_sd_m=0.5, bias_correlation_time_s=100.0)
+    tracker = world.tracker(max_gap_s=1.0)
+    feed(tracker, world.measure(0.0, standing(), Field.RANGE))
+    feed(tracker, world.measure(9.0, standing(), Field.RANGE | Field.AZIMUTH))
+    track = tracker._tracks["vue_1"]
+    assert track._biases.sd == [0.5] * 3
+    assert track._estimate.mean.size == 9
+    (output,) = feed(tracker, world.measure(9.1, standing(), Field.RANGE))
+    assert output.status.used == 3
 
 
 def test_coasting_after_silence(world: Any, feed: Any) -> None:
@@ -575,6 +628,13 @@ def test_height_of_the_device_is_reported_and_used(world: Any, feed: Any) -> Non
     tracker = world.tracker(device_height_m=1.5)
     (output,) = feed(tracker, world.measure(0.0, standing()))
     assert output.odometry.position[2] == 1.5
+
+
+def test_a_new_track_has_no_heading_yet(world: Any, feed: Any) -> None:
+    tracker = world.tracker(**STILL)
+    feed(tracker, [pose(0.0, 0.0, 0.0), velocity(0.0, (0.0, 3.0), 1e-4)])
+    (output,) = feed(tracker, [pose(0.1, 0.0, 0.0)])
+    np.testing.assert_array_equal(output.odometry.quaternion, [0.0, 0.0, 0.0, 1.0])
 
 
 def test_heading_is_held_at_rest(world: Any, feed: Any) -> None:

@@ -1,0 +1,117 @@
+"""A live run carries the same measurements and estimates as the offline run of its scenario."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from netpos.bags import BagReader
+from netpos.bags.qos import is_latched, is_reliable
+from runs import (
+    ESTIMATES,
+    INFOS,
+    MEASUREMENTS,
+    ODOMETRY,
+    changed_scenario,
+    finish,
+    graphs,
+    netpos,
+    payloads,
+    script,
+)
+
+SEED = "11"
+SIMULATED = ("beacon", "ground_truth", "ground_truth_clock")
+INERTIAL = ("imu", "mag", "initialpose")
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Recordings of one scenario."""
+
+    live: Path
+    offline: Path
+    topics: tuple[str, ...]
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pair]:
+    """fast_pass by `netpos run` at real time, a short METIS with an IMU by the script at 4x."""
+    folder = tmp_path_factory.mktemp("live_offline")
+    device: dict[str, Any] = {"imu": {"rate_hz": 100.0}, "magnetometer": {"rate_hz": 50.0}}
+    device["route"] = {"kind": "metis_random", "corner_radius_m": 3.0}
+    metis = changed_scenario(
+        folder / "metis_short.yaml", "metis_madrid", device, max_duration_s=12.0
+    )
+    made = {
+        name: Pair(
+            folder / f"{name}_live",
+            folder / f"{name}_offline",
+            tuple(f"/vue_1/{topic}" for topic in topics),
+        )
+        for name, topics in {"fast_pass": SIMULATED, "metis": SIMULATED + INERTIAL}.items()
+    }
+    with graphs(folder, 2) as (first, second):
+        command = ["netpos", "run", "fast_pass", "--bag", str(made["fast_pass"].live)]
+        started = [
+            first.start("netpos_run", command),
+            script(second, "run_graph", metis, made["metis"].live, "4", SEED),
+        ]
+        netpos("run", "fast_pass", "--offline", "--bag", made["fast_pass"].offline)
+        netpos("run", metis, "--offline", "--seed", SEED, "--bag", made["metis"].offline)
+        finish(*started)
+    return made
+
+
+@pytest.mark.parametrize("name", ["fast_pass", "metis"])
+def test_same_simulation_and_measurements(pairs: dict[str, Pair], name: str) -> None:
+    pair = pairs[name]
+    topics = (INFOS, MEASUREMENTS, *pair.topics)
+    offline, live = payloads(pair.offline, topics), payloads(pair.live, topics)
+    for topic in topics:
+        assert offline[topic], topic
+        assert len(live[topic]) == len(offline[topic]), topic
+        assert live[topic] == offline[topic], topic
+
+
+@pytest.mark.parametrize("name", ["fast_pass", "metis"])
+def test_same_estimates(pairs: dict[str, Pair], name: str) -> None:
+    offline = payloads(pairs[name].offline, ESTIMATES)
+    live = payloads(pairs[name].live, ESTIMATES)
+    assert len(offline[ODOMETRY]) >= 40
+    for topic in ESTIMATES:
+        assert len(live[topic]) == len(offline[topic]), topic
+        assert live[topic] == offline[topic], topic
+
+
+def test_a_seed_of_its_own_gives_other_noise(pairs: dict[str, Pair], tmp_path: Path) -> None:
+    """Otherwise the equalities above might hold whatever the seed."""
+    other = tmp_path / "other"
+    netpos("run", "fast_pass", "--offline", "--seed", "12", "--bag", other)
+    mine = payloads(pairs["fast_pass"].offline, (MEASUREMENTS, "/vue_1/beacon"))
+    theirs = payloads(other, (MEASUREMENTS, "/vue_1/beacon"))
+    assert len(mine[MEASUREMENTS]) == len(theirs[MEASUREMENTS])
+    assert mine[MEASUREMENTS] != theirs[MEASUREMENTS]
+
+
+def test_a_live_recording_replays_to_its_own_estimates(
+    pairs: dict[str, Pair], tmp_path: Path
+) -> None:
+    """It names its scenario, so `netpos replay` needs nothing else."""
+    for pair in pairs.values():
+        again = tmp_path / pair.live.name
+        netpos("replay", pair.live, "--out", again)
+        assert payloads(again, ESTIMATES) == payloads(pair.live, ESTIMATES)
+
+
+def test_a_live_recording_notes_run_and_qos(pairs: dict[str, Pair]) -> None:
+    with BagReader(pairs["metis"].live) as bag:
+        assert bag.metadata["seed"] == SEED
+        assert bag.metadata["rate"] == "4"
+        assert bag.metadata["scenario"].endswith("metis_short.yaml")
+        assert is_latched(bag.topics[INFOS].qos)
+        for topic in (MEASUREMENTS, *ESTIMATES, *pairs["metis"].topics):
+            assert is_reliable(bag.topics[topic].qos)
+            assert not is_latched(bag.topics[topic].qos)

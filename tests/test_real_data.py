@@ -1,0 +1,100 @@
+"""Real recordings: imported, replayed live and offline, as accurate as the references."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from runs import MEASUREMENTS, ODOMETRY, TRACK_STATUS, finish, graphs, netpos, payloads, script
+
+# 2-D RMSE [m] of a plain azimuth-only filter on the same runs
+BLE_REFERENCE_M = {"uc1_run1": 1.04, "uc1_run2": 0.96, "uc2_run1": 0.69}
+MEAN_RATIO = 0.85
+# 2-D RMSE [m] that the authors of the UWB recording report
+UWB_REFERENCE_M = {"LOS": 1.04, "NLOS": 0.94}
+LIVE_RUN = "uc2_run1"  # the shortest
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """A recording as imported, replayed and scored."""
+
+    imported: Path
+    replayed: Path
+    figures: dict[str, Any]
+
+
+def scored(bag: Path) -> dict[str, Any]:
+    figures = bag.with_suffix(".json")
+    netpos("evaluate", bag, "--json", figures)
+    vues: dict[str, dict[str, Any]] = json.loads(figures.read_text(encoding="utf-8"))["vues"]
+    (only,) = vues.values()
+    return only
+
+
+def replayed(imported: Path) -> Replayed:
+    out = imported.with_name(f"{imported.name}_offline")
+    netpos("replay", imported, "--out", out)
+    return Replayed(imported, out, scored(out))
+
+
+def recording(data_folder: Path, *parts: str) -> Path:
+    folder = data_folder.joinpath(*parts)
+    if not folder.is_dir():
+        pytest.skip(f"real recording is absent: no folder {folder}")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def ble(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Replayed]:
+    source, folder = recording(data_folder, "ble_aoa"), tmp_path_factory.mktemp("ble")
+    runs = {}
+    for run in BLE_REFERENCE_M:
+        netpos("import", "ble-aoa", source, folder / run, "--run", run)
+        runs[run] = replayed(folder / run)
+    return runs
+
+
+@pytest.mark.parametrize("run", BLE_REFERENCE_M)
+def test_ble_angles(ble: dict[str, Replayed], run: str) -> None:
+    figures = ble[run].figures
+    assert figures["n"] > 3000
+    assert figures["availability"] > 0.9
+    assert figures["rmse_m"] <= BLE_REFERENCE_M[run]
+    assert 0.5 <= figures["nees_mean"] <= 3.3
+    assert figures["clock_offset_sd_ns"] is None  # angles say nothing about a clock
+
+
+def test_ble_angles_in_the_mean(ble: dict[str, Replayed]) -> None:
+    ratios = [ble[run].figures["rmse_m"] / limit for run, limit in BLE_REFERENCE_M.items()]
+    assert math.fsum(ratios) / len(ratios) <= MEAN_RATIO
+
+
+def test_ble_angles_through_the_live_graph(ble: dict[str, Replayed]) -> None:
+    """Ten times real time, about 1500 messages per second: the same bits, so the same figures."""
+    offline = ble[LIVE_RUN]
+    live = offline.imported.with_name(f"live_{LIVE_RUN}")
+    with graphs(live.parent) as (graph,):
+        finish(script(graph, "play_bag", offline.imported, live, "10"))
+    topics = (MEASUREMENTS, ODOMETRY, TRACK_STATUS)
+    wanted, found = payloads(offline.replayed, topics), payloads(live, topics)
+    for topic in topics:
+        assert wanted[topic]
+        assert len(found[topic]) == len(wanted[topic]), topic
+        assert found[topic] == wanted[topic], topic
+    figures = scored(live)
+    for name in ("n", "rmse_m", "p95_m", "nees_mean", "nis_mean", "rejected"):
+        assert figures[name] == offline.figures[name], name
+
+
+@pytest.mark.parametrize("view", UWB_REFERENCE_M)
+def test_uwb_ranges(data_folder: Path, tmp_path: Path, view: str) -> None:
+    source = recording(data_folder, "uwb_car_anchors", view)
+    netpos("import", "uwb-anchors", source, tmp_path / view)
+    figures = replayed(tmp_path / view).figures
+    assert figures["n"] > 1000
+    assert figures["rmse_m"] < UWB_REFERENCE_M[view]
