@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +53,15 @@ class Bags:
     good: Path
     cut: Path
     blind: Path
+    contents: dict[str, bytes] = field(default_factory=dict)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        str(file.relative_to(folder)): file.read_bytes()
+        for file in sorted(folder.rglob("*"))
+        if file.is_file() and not file.relative_to(folder).parts[0].startswith("logs_")
+    }
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +79,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Bags:
                 writer.write_raw(entry.topic, entry.type_name, entry.cdr, entry.log_time_ns)
     (folder / "malformed.yaml").write_text(MALFORMED)
     (folder / "broken.yaml").write_text("rsus: [1, 2\nseed: 3\n")
+    made.contents.update(contents(folder))
     return made
 
 
@@ -143,24 +153,34 @@ COMMANDS: dict[str, tuple[str, int, str]] = {
 }
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {
-        str(file.relative_to(folder)): file.read_bytes()
-        for file in sorted(folder.rglob("*"))
-        if file.is_file() and not file.relative_to(folder).parts[0].startswith("logs_")
-    }
+@pytest.fixture(scope="module")
+def commanded(bags: Bags) -> Iterator[dict[str, Process]]:
+    """All the commands above, started together."""
+    with graphs(bags.folder) as (graph,):
+        started = {
+            name: graph.start("netpos", ["netpos", *text.format(f=bags.folder).split()])
+            for name, (text, _, _) in COMMANDS.items()
+        }
+        yield started
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_command_refuses_with_one_sentence(bags: Bags, name: str) -> None:
-    text, code, said = COMMANDS[name]
-    before = contents(bags.folder)
-    done = run_netpos(*text.format(f=bags.folder).split())
-    assert done.returncode == code, done.stderr
-    lines = [line for line in done.stderr.splitlines() if line.strip()]
-    assert len(lines) == 1, done.stderr
+def test_command_refuses_with_one_sentence(commanded: dict[str, Process], name: str) -> None:
+    _, code, said = COMMANDS[name]
+    process = commanded[name]
+    assert process.wait() == code, process.describe()
+    lines = [line for line in process.output.splitlines() if line.strip()]
+    assert len(lines) == 1, process.output
     assert said in lines[0]
-    assert contents(bags.folder) == before
+
+
+@pytest.mark.usefixtures("refused")
+def test_nothing_was_lost_or_left_behind(bags: Bags, commanded: dict[str, Process]) -> None:
+    for process in commanded.values():
+        process.wait()
+    names = {path.name for path in bags.folder.iterdir() if not path.name.startswith("logs_")}
+    assert names == {"good", "cut", "blind", "malformed.yaml", "broken.yaml"}
+    assert contents(bags.folder) == bags.contents
 
 
 def test_import_never_overwrites(bags: Bags, tmp_path: Path) -> None:
@@ -227,7 +247,9 @@ def attacked(bags: Bags) -> Iterator[tuple[list[Any], list[Any], Counter[str], s
         info_out.publish(
             CODEC.rsu_info_to_msg(replace(infos[0], position=infos[0].position * NAN))
         )
-        tracker = graph.run("ekf_tracker", "ekf_tracker", parameters={"scenario": "fast_pass"})
+        tracker = graph.run(
+            "ekf_tracker", "ekf_tracker", parameters={"scenario": "fast_pass", "subscribers": 1}
+        )
         tracker.wait_for_output("tracking vue_1")
         graph.wait_for_subscribers(MEASUREMENTS)
         tracker.wait_for_output("RSU refused: pose of rsu_1 is not finite")

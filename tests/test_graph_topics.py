@@ -72,7 +72,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
             topic: graph.collect(topic, kind, *([LATCHED] if topic == "/rsu/info" else []))
             for topic, (kind, _) in TOPICS.items()
         }
-        tracker = graph.run("ekf_tracker", "ekf_tracker", parameters=scenario)
+        tracker = graph.run("ekf_tracker", "ekf_tracker", parameters=scenario | {"subscribers": 1})
         graph.run("rsu_sensor", "rsu_sensor", parameters=scenario | {"subscribers": 2})
         graph.wait_for_nodes("ekf_tracker", "rsu_sensor")
         made = Run(graph, tracker, heard)

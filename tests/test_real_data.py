@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,11 +53,13 @@ def recording(data_folder: Path, *parts: str) -> Path:
 @pytest.fixture(scope="module")
 def ble(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Replayed]:
     source, folder = recording(data_folder, "ble_aoa"), tmp_path_factory.mktemp("ble")
-    runs = {}
-    for run in BLE_REFERENCE_M:
+
+    def prepare(run: str) -> Replayed:
         netpos("import", "ble-aoa", source, folder / run, "--run", run)
-        runs[run] = replayed(folder / run)
-    return runs
+        return replayed(folder / run)
+
+    with ThreadPoolExecutor(2) as pool:
+        return dict(zip(BLE_REFERENCE_M, pool.map(prepare, BLE_REFERENCE_M), strict=True))
 
 
 @pytest.mark.parametrize("run", BLE_REFERENCE_M)

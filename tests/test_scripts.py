@@ -102,7 +102,9 @@ def test_order_and_arguments(graph: Graph, stubs: Stubs, repository: Path, tmp_p
     assert stubs.stopped() == ["rsu_sensor", "ekf_tracker", "netpos_record"]
     said = {line.split()[0]: line for line in stubs.notes if " started" in line}
     assert f"--output {bag}" in said["netpos_record"]
-    assert said["ekf_tracker"].endswith("-p scenario:=metis_madrid -p hold_s:=0.1")
+    assert said["ekf_tracker"].endswith(
+        "-p scenario:=metis_madrid -p subscribers:=1 -p hold_s:=0.1"
+    )
     assert "-p scenario:=metis_madrid -p seed:=7" in said["rsu_sensor"]
     assert "-p rate:=10.000000" in said["vue_sim"]
 

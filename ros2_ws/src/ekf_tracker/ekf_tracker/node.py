@@ -14,7 +14,15 @@ from netpos.tracking import Tracker, TrackOutput
 from netpos.tracking.warm_up import warm_up
 from netpos_msgs.msg import ClockState, RsuInfo, RsuMeasurement
 from netpos_msgs.msg import TrackStatus as TrackStatusMsg
-from netpos_node import BACKLOG, CODEC, LATCHED, STREAM, run, spin_until_stopped
+from netpos_node import (
+    BACKLOG,
+    CODEC,
+    LATCHED,
+    STREAM,
+    run,
+    spin_until_stopped,
+    wait_until_heard,
+)
 from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -28,6 +36,7 @@ from ekf_tracker.parameters import declare_parameters
 
 _SILENCE_S = 2.0  # long: a stalled machine must not look like the end of the measurements
 _DELIVERY_S = 1
+_PATIENCE_S = 30.0
 
 
 class EkfTrackerNode(Node):
@@ -49,6 +58,7 @@ class EkfTrackerNode(Node):
         self._listen(RsuInfo, topics.RSU_INFO, self._on_rsu_info, LATCHED)
         for vue_id in parameters.vue_ids:
             self._add_device(vue_id)
+        self._wait_for_subscribers(parameters.subscribers)
         self._listen(RsuMeasurement, topics.RSU_MEASUREMENTS, self._on_measurement)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/enable", self._on_enable)
@@ -61,6 +71,17 @@ class EkfTrackerNode(Node):
             threshold, post_callback=self._on_clock_jump
         )
         self.get_logger().info(f"tracking {', '.join(parameters.vue_ids)}")
+
+    def _wait_for_subscribers(self, wanted: int) -> None:
+        """Hear no measurement before the estimates are heard: what is given out is then seen."""
+        publishers = {pub.topic_name: pub for pubs in self._outputs.values() for pub in pubs}
+        unheard = wait_until_heard(
+            publishers, dict.fromkeys(publishers, wanted), _PATIENCE_S, settle_s=0.0
+        )
+        if unheard:
+            self.get_logger().warning(
+                f"fewer than {wanted} subscribers to {', '.join(unheard)}; tracking all the same"
+            )
 
     # inputs
 

@@ -18,6 +18,7 @@ class TrackerParameters:
     config: TrackerConfig
     vue_ids: tuple[str, ...]
     publish_tf: bool
+    subscribers: int
 
 
 def declare_parameters(node: Node) -> TrackerParameters:
@@ -33,5 +34,11 @@ def declare_parameters(node: Node) -> TrackerParameters:
     return TrackerParameters(
         vue_ids=vue_ids,
         publish_tf=declare(node, "publish_tf", True, "publish map -> base_link on /tf"),
+        subscribers=declare(
+            node,
+            "subscribers",
+            0,
+            "listen to measurements once the estimates have so many subscribers (or after 30 s)",
+        ),
         config=declare_config(node, TrackerConfig, asdict(defaults)),
     )

@@ -8,7 +8,7 @@ from geometry_msgs.msg import TwistWithCovarianceStamped
 from netpos.inertial.pdr import PedestrianDeadReckoning
 from netpos.messages import topics
 from netpos_msgs.msg import Step
-from netpos_node import CODEC, STREAM, run
+from netpos_node import BACKLOG, CODEC, STREAM, run
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, MagneticField
 
@@ -29,9 +29,9 @@ class PdrNode(Node):
         self._velocity_pub = self.create_publisher(
             TwistWithCovarianceStamped, topics.of_vue(vue, topics.STEP_VELOCITY), STREAM
         )
-        self.create_subscription(Imu, topics.of_vue(vue, topics.IMU), self._on_imu, STREAM)
+        self.create_subscription(Imu, topics.of_vue(vue, topics.IMU), self._on_imu, BACKLOG)
         self.create_subscription(
-            MagneticField, topics.of_vue(vue, topics.MAG), self._on_magnetic_field, STREAM
+            MagneticField, topics.of_vue(vue, topics.MAG), self._on_magnetic_field, BACKLOG
         )
         self.create_timer(2.0, self._report_refusals)
 

@@ -8,6 +8,7 @@ from threading import Thread
 from typing import Any
 
 from netpos.messages.topics import BEACON, CLOCK, INITIAL_POSE, split
+from netpos.messages.values import InitialPose
 from netpos.scenario import Simulation
 from netpos.scenario.offline import timeline
 from netpos_node import STREAM, run, wait_until_heard
@@ -46,8 +47,11 @@ class VueSimNode(Node):
             f"{scenario.name}, seed {scenario.seed}: {', '.join(scenario.vue_ids)} for "
             f"{scenario.duration_s:.1f} s at rate {rate:g}"
         )
+        self._hand_over_initial_poses()
         started_s = time.monotonic()
         for item in timeline(self._simulation, self._settings.clock_hz):
+            if isinstance(item, InitialPose):
+                continue
             topic, stamp_ns, message = publication(item)
             _sleep_until(started_s + (stamp_ns - scenario.start_ns) * 1e-9 / rate)
             if not self.context.ok():
@@ -58,6 +62,15 @@ class VueSimNode(Node):
         self.get_logger().info(f"{scenario.name} is over")
         while not self._settings.shutdown_at_end and self.context.ok():
             time.sleep(_POLL_S)
+
+    def _hand_over_initial_poses(self) -> None:
+        """Before anything moves, and only once: a lone message that is lost is repaired late."""
+        for vue_id in self._settings.scenario.vue_ids:
+            pose = self._simulation.initial_pose(vue_id)
+            if pose is not None:
+                topic, _, message = publication(pose)
+                self._pubs[topic].publish(message)
+                self._pubs[topic].wait_for_all_acked(Duration(seconds=_DELIVERY_S))
 
     def _wait_for_subscribers(self) -> None:
         """Until all beacons are heard and for a while nobody new has subscribed to anything."""

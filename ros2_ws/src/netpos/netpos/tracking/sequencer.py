@@ -18,6 +18,7 @@ from netpos.messages.values import GroundSpeed, InitialPose, RsuMeasurement, Vel
 Item = RsuMeasurement | Velocity | GroundSpeed | InitialPose
 
 RSU = "rsu"
+POSE = "initial_pose"  # before RSU in the order of application
 _LIVE_NS = 1_000_000_000
 
 
@@ -26,7 +27,7 @@ def channel_and_source(item: Item) -> tuple[str, str]:
     an epoch."""
     match item:
         case InitialPose():
-            return "initial_pose", ""
+            return POSE, ""
         case RsuMeasurement():
             return RSU, item.rsu_id
         case _:
@@ -61,8 +62,10 @@ class Epoch:
 class Sequencer:
     """Collects the items of one device and releases epochs in stamp order."""
 
-    def __init__(self, hold_ns: int) -> None:
+    def __init__(self, hold_ns: int, needs_pose: bool = False) -> None:
+        """``needs_pose``: nothing is complete before an initial pose, so that it is waited for."""
         self._hold_ns = hold_ns
+        self._needs_pose = needs_pose
         self._pending: dict[int, Epoch] = {}
         self._watermark: dict[str, int] = {}
         self._released_ns = -1
@@ -108,10 +111,12 @@ class Sequencer:
         return epoch
 
     def _ready(self, epoch: Epoch) -> bool:
+        if self._needs_pose and POSE not in self._watermark:
+            return max(self._watermark.values()) >= epoch.stamp_ns + self._hold_ns
         newest = max(self._watermark.values())
         if newest >= epoch.stamp_ns + self._hold_ns:
             return True
         live = [c for c, w in self._watermark.items() if w >= newest - _LIVE_NS]
-        reached = all(self._watermark[c] >= epoch.stamp_ns for c in live if c != "initial_pose")
+        reached = all(self._watermark[c] >= epoch.stamp_ns for c in live if c != POSE)
         closed = epoch.rsu_complete() or self._watermark.get(RSU, 0) > epoch.stamp_ns
         return reached and closed and (newest > epoch.stamp_ns or not epoch.only_a_pose())

@@ -94,7 +94,9 @@ class Tracker:
 
     def _sequencer(self, vue_id: str) -> Sequencer:
         if vue_id not in self._sequencers:
-            self._sequencers[vue_id] = Sequencer(int(self._config.hold_s * 1e9))
+            self._sequencers[vue_id] = Sequencer(
+                int(self._config.hold_s * 1e9), self._config.require_initial_pose
+            )
         return self._sequencers[vue_id]
 
     def _track(self, vue_id: str) -> Track:

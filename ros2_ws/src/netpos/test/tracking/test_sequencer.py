@@ -323,3 +323,28 @@ def test_permutations_of_arrival_within_an_epoch_give_the_same_epochs() -> None:
         s.release()
         results.add(str([[channel_and_source(i) for i in e] for e in feed(s, [*order, *later])]))
     assert len(results) == 1
+
+
+@pytest.mark.parametrize("pose_first", [True, False])
+def test_an_initial_pose_that_is_needed_is_waited_for(pose_first: bool) -> None:
+    """Pose and measurement of one stamp are one epoch, whichever topic arrives first."""
+    second = 1_000_000_000
+    measured = RsuMeasurement(stamp_ns=second, rsu_id="a", vue_id="v", expected=1)
+    pose = InitialPose(stamp_ns=second, vue_id="v", position=np.zeros(3), cov=np.eye(3))
+    sequencer = Sequencer(hold_ns=second // 4, needs_pose=True)
+    epochs = []
+    for item in (pose, measured) if pose_first else (measured, pose):
+        assert sequencer.add(item) is None
+        epochs += sequencer.release()
+    assert [list(epoch.sorted()) for epoch in epochs] == [[pose, measured]]
+    assert sequencer.flush() == []
+
+
+def test_an_initial_pose_is_not_waited_for_longer_than_hold() -> None:
+    sequencer = Sequencer(hold_ns=100, needs_pose=True)
+    for stamp_ns in (1000, 1099):
+        item = RsuMeasurement(stamp_ns=stamp_ns, rsu_id="a", vue_id="v", expected=1)
+        assert sequencer.add(item) is None
+        assert sequencer.release() == []
+    assert sequencer.add(RsuMeasurement(stamp_ns=1100, rsu_id="a", vue_id="v", expected=1)) is None
+    assert [epoch.stamp_ns for epoch in sequencer.release()] == [1000]

@@ -183,6 +183,7 @@ def test_waiting_then_initialising_then_tracking(world: Any, feed: Any) -> None:
     (output,) = feed(tracker, world.measure(0.1, straight(0.1)))
     assert output.status.state is TrackState.TRACKING
     assert (output.status.used, output.status.nis_dof) == (3, 0)  # a fit has no innovation
+    assert output.status.nis == 0.0
     assert output.status.sources == ("a", "b", "c")
     (output,) = feed(world.tracker(), [pose(0.0, 0.0, 0.0, 5.01**2)])
     assert output.status.state is TrackState.INITIALISING
@@ -200,6 +201,21 @@ def test_clock_is_reported_from_the_first_toa_on(world: Any, feed: Any, fields: 
     assert output.clock is not None
     (output,) = feed(tracker, world.measure(0.2, standing(), Field.RANGE))
     assert output.clock is not None
+
+
+def test_first_fix_knows_of_the_biases(world: Any, feed: Any) -> None:
+    """Own bias 0.4 m and common bias 1.2 m on 0.3 m of noise: the sd grows by 1.3 / 0.3."""
+    (plain,) = feed(world.tracker(), world.measure(0.0, standing(), Field.RANGE))
+    with_errors(
+        world,
+        range_bias_sd_m=0.4,
+        bias_correlation_time_s=9.0,
+        common_range_bias_sd_m=1.2,
+        common_bias_correlation_time_s=9.0,
+    )
+    (biased,) = feed(world.tracker(), world.measure(0.0, standing(), Field.RANGE))
+    ratio = biased.status.position_sd_m / plain.status.position_sd_m
+    assert ratio == pytest.approx(1.3 / 0.3, rel=0.01)
 
 
 def test_initial_pose_starts_the_track_as_the_paper_does(world: Any, feed: Any) -> None:
@@ -384,6 +400,11 @@ def test_manoeuvre_is_accepted_at_once_where_allowed(world: Any, feed: Any) -> N
         (output,) = feed(tracker, world.measure(2.4, standing(44.0, 2.0), Field.RANGE))
         assert (output.status.used == 3) is (sd > 0.0)
         assert ("gate" in output.status.rejected) is (sd == 0.0)
+    # a small allowance is one too: 1.5 m in half a second
+    for sd in (0.0, 0.9):
+        tracker = settled(world, feed, Field.RANGE, manoeuvre_speed_sd_mps=sd)
+        (output,) = feed(tracker, world.measure(2.4, standing(41.5, 2.0), Field.RANGE))
+        assert (output.status.used == 3) is (sd > 0.0)
     # an outlier no manoeuvre explains is rejected all the same, and then nothing is opened
     sds = []
     for sd in (0.0, 1.0):
