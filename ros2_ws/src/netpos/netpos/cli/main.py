@@ -20,6 +20,7 @@ for command in (
     runs.replay,
     results.evaluate,
     results.report,
+    results.bench,
     recordings.recover,
 ):
     app.command()(command)

@@ -92,3 +92,25 @@ def tables(evaluation: Evaluation) -> list[Table]:
     for row in verdict_rows(evaluation):
         verdicts.add_row(*map(escape, row))
     return [figures, verdicts]
+
+
+def bench(
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Write the ratios as JSON.")
+    ] = None,
+) -> None:
+    """Measure speed as ratios, side by side in one run."""
+    from rich.console import Console  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+
+    from netpos.evaluation.bench import as_json  # noqa: PLC0415
+    from netpos.evaluation.bench import bench as run_bench  # noqa: PLC0415
+
+    rows = run_bench()
+    table = Table("operation", "ours", "reference", "", "times faster")
+    for row in rows:
+        ours, reference = (f"{1e6 * s:,.1f} µs" for s in (row.ours_s, row.reference_s))
+        table.add_row(row.name, ours, row.reference, reference, f"{row.ratio:.0f}")
+    Console().print(table)
+    if json_file is not None:
+        json_file.write_text(json.dumps(as_json(rows), indent=2) + "\n", encoding="utf-8")
