@@ -14,11 +14,12 @@ from graph import LATCHED, Process
 from nav_msgs.msg import Odometry
 from netpos.bags import BagReader, BagWriter, codec
 from netpos.messages.values import Field, RsuMeasurement
-from netpos_msgs.msg import RsuInfo, TrackStatus
+from netpos_msgs.msg import ClockState, RsuInfo, TrackStatus
 from netpos_msgs.msg import RsuMeasurement as RsuMeasurementMessage
 from netpos_node import CODEC
 from rclpy.serialization import serialize_message
 from runs import (
+    CLOCK_STATE,
     INFOS,
     MEASUREMENTS,
     ODOMETRY,
@@ -240,6 +241,7 @@ def attacked(bags: Bags) -> Iterator[tuple[list[Any], list[Any], Counter[str], s
     with graphs(bags.folder) as (graph,):
         odometry = graph.collect(ODOMETRY, Odometry)
         status = graph.collect(TRACK_STATUS, TrackStatus)
+        graph.collect(CLOCK_STATE, ClockState)
         info_out = graph.publisher(INFOS, RsuInfo, LATCHED)
         out = graph.publisher(MEASUREMENTS, RsuMeasurementMessage)
         for info in infos:
