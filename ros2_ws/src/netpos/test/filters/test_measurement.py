@@ -1,4 +1,4 @@
-"""Measurement rows against closed forms, SciPy rotations and central differences."""
+"""Values, Jacobians and curvature of the measurement models."""
 
 from __future__ import annotations
 
@@ -8,37 +8,31 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from netpos.filters import ekf
 from netpos.filters.measurement import (
     AXES,
     BIAS,
     COMMON,
     GATE_VARIANCE,
-    GROUP,
     KIND,
     ORIGIN,
     ROW_WIDTH,
     VALUE,
     VARIANCE,
-    Coupling,
     Kind,
     curvature_variance,
-    linear_rows,
     linearise,
     predict_row,
     rsu_axes,
     rsu_rows,
-    scalar_values,
-    speed_row,
     wrap,
 )
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
-from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 
 ANGLE_KINDS = (Kind.AZIMUTH, Kind.ELEVATION)
+
+
 DIRECTION_KINDS = (*ANGLE_KINDS, Kind.COSINE_Y, Kind.COSINE_Z)
-ALL_FIELDS = Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE | Field.POSITION
 
 
 def random_info(rng: np.random.Generator, convention: AngleConvention) -> RsuInfo:
@@ -181,9 +175,6 @@ def test_floors_at_the_rsu_and_at_rest() -> None:
     np.testing.assert_allclose(h[2:4], [0.6, -0.8], rtol=1e-14)
 
 
-# wrap
-
-
 @pytest.mark.parametrize(
     ("angle", "wrapped"),
     [
@@ -247,9 +238,6 @@ def test_innovation_is_measured_minus_predicted_for_every_row() -> None:
         single = np.empty(9)
         predict_row(row, x, 0.5, single)
         np.testing.assert_array_equal(h, single)
-
-
-# curvature
 
 
 def hessian(row: Array, x: Array, height_m: float) -> Array:
@@ -352,167 +340,3 @@ def test_curvature_at_the_rsu_is_finite_and_linear_rows_have_none() -> None:
     assert value == pytest.approx(0.5 * (1e-8 / 1e-6) ** 2 / 1e-6)
     for kind in (Kind.LINEAR, Kind.SPEED):
         assert curvature_variance(level_row(kind, np.ones(3)), x, cov, 0.0) == 0.0
-
-
-# from measurements to rows
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_axes_turn_map_vectors_into_the_rsus_axes(seed: int) -> None:
-    info = random_info(np.random.default_rng(seed), AngleConvention.SPHERICAL)
-    d = np.array([3.0, -1.0, 0.5])
-    expected = Rotation.from_quat(info.quaternion).inv().apply(d)
-    np.testing.assert_allclose(rsu_axes(info).reshape(3, 3) @ d, expected, atol=1e-13)
-
-
-def full_measurement(info: RsuInfo, target: Array, clock_m: float) -> RsuMeasurement:
-    """Noise-free measurement of ``target`` written with SciPy, in the convention of the RSU."""
-    d = target - info.position
-    ux, uy, uz = Rotation.from_quat(info.quaternion).inv().apply(d)
-    r = float(np.linalg.norm(d))
-    if info.angle_convention is AngleConvention.CONE:
-        azimuth, elevation = math.asin(uy / r), math.asin(uz / r)
-    else:
-        azimuth, elevation = math.atan2(uy, ux), math.asin(uz / r)
-    return RsuMeasurement(
-        stamp_ns=1,
-        rsu_id=info.rsu_id,
-        vue_id="v",
-        fields=ALL_FIELDS,
-        azimuth_rad=azimuth,
-        azimuth_var=0.01,
-        elevation_rad=elevation,
-        elevation_var=0.02,
-        toa_s=(r + clock_m) / speed_of_light,
-        toa_var=1e-18,
-        range_m=r,
-        range_var=0.25,
-        position=target,
-        position_cov=np.array([[2.0, 0.7, 0.1], [0.7, 1.0, 0.2], [0.1, 0.2, 3.0]]),
-    )
-
-
-@pytest.mark.parametrize("convention", list(AngleConvention))
-@pytest.mark.parametrize("seed", range(10))
-def test_noise_free_measurement_has_no_innovation(convention: AngleConvention, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    info, x = random_info(rng, convention), random_state(rng, 6)
-    m = full_measurement(info, np.array([x[0], x[1], 1.5]), x[4])
-    rows = rsu_rows(m, info, rsu_axes(info), 3)
-    innovation, _ = linearise(rows, x, 1.5)
-    np.testing.assert_allclose(innovation, 0.0, atol=2e-6)
-    assert rows.shape == (6, ROW_WIDTH)
-    assert set(rows[:, GROUP]) == {3.0}
-    assert set(rows[:, BIAS]) == set(rows[:, COMMON]) == {-1.0}
-
-
-def test_spherical_rows_keep_values_and_variances() -> None:
-    info = random_info(np.random.default_rng(1), AngleConvention.SPHERICAL)
-    m = full_measurement(info, np.array([30.0, 20.0, 1.0]), 7.0)
-    c = speed_of_light
-    assert list(scalar_values(m, info.angle_convention)) == [
-        (Kind.AZIMUTH, m.azimuth_rad, 0.01),
-        (Kind.ELEVATION, m.elevation_rad, 0.02),
-        (Kind.TOA, pytest.approx(c * m.toa_s), pytest.approx(c**2 * 1e-18)),
-        (Kind.RANGE, m.range_m, 0.25),
-    ]
-
-
-def test_cone_variance_is_that_of_the_sine() -> None:
-    """sd of sin(a) by sampling; at end-fire the second-order term remains."""
-    rng = np.random.default_rng(2)
-    info = random_info(rng, AngleConvention.CONE)
-    for angle in (0.0, 0.6, -1.2, math.pi / 2):
-        m = RsuMeasurement(
-            stamp_ns=1,
-            rsu_id="r",
-            vue_id="v",
-            fields=Field.AZIMUTH | Field.ELEVATION,
-            azimuth_rad=angle,
-            azimuth_var=4e-4,
-            elevation_rad=-angle,
-            elevation_var=1e-4,
-        )
-        (kind_y, y, var_y), (kind_z, z, var_z) = scalar_values(m, info.angle_convention)
-        assert (kind_y, kind_z) == (Kind.COSINE_Y, Kind.COSINE_Z)
-        assert (y, z) == (pytest.approx(math.sin(angle)), pytest.approx(-math.sin(angle)))
-        sampled = np.sin(angle + 0.02 * rng.normal(size=400_000)).var()
-        assert var_y == pytest.approx(sampled, rel=0.01)
-        assert var_z == pytest.approx(
-            np.sin(angle + 0.01 * rng.normal(size=400_000)).var(), rel=0.01
-        )
-
-
-@pytest.mark.parametrize(
-    ("flag", "kind"),
-    [
-        (Field.AZIMUTH, Kind.AZIMUTH),
-        (Field.ELEVATION, Kind.ELEVATION),
-        (Field.TOA, Kind.TOA),
-        (Field.RANGE, Kind.RANGE),
-        (Field.POSITION, Kind.LINEAR),
-    ],
-)
-def test_only_named_fields_become_rows(flag: Field, kind: Kind) -> None:
-    info = random_info(np.random.default_rng(1), AngleConvention.SPHERICAL)
-    full = full_measurement(info, np.array([30.0, 20.0, 1.0]), 7.0)
-    m = RsuMeasurement(**{n: getattr(full, n) for n in full.__slots__} | {"fields": flag})
-    rows = rsu_rows(m, info, rsu_axes(info), 0)
-    assert set(rows[:, KIND]) == {float(kind)}
-    assert len(rows) == (2 if kind is Kind.LINEAR else 1)
-
-
-def test_coupling_enters_the_rows_of_its_kind_only() -> None:
-    info = random_info(np.random.default_rng(1), AngleConvention.SPHERICAL)
-    m = full_measurement(info, np.array([30.0, 20.0, 1.0]), 7.0)
-    coupling = Coupling({Kind.AZIMUTH: 6}, {Kind.RANGE: 7}, {Kind.RANGE: 5.0, Kind.AZIMUTH: 3.0})
-    rows = rsu_rows(m, info, rsu_axes(info), 0, coupling)
-    np.testing.assert_array_equal(rows[:, BIAS], [6, -1, -1, -1, -1, -1])
-    np.testing.assert_array_equal(rows[:, COMMON], [-1, -1, -1, 7, -1, -1])
-    np.testing.assert_allclose(
-        rows[:4, GATE_VARIANCE], [0.01, 0.02, speed_of_light**2 * 1e-18, 0.25]
-    )
-    np.testing.assert_allclose(rows[:4, VARIANCE], [0.03, 0.02, speed_of_light**2 * 1e-18, 1.25])
-
-
-# linear rows
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_linear_rows_equal_the_update_with_the_full_covariance(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    A, B = rng.normal(size=(3, 3)), rng.normal(size=(6, 6))
-    R, P = A @ A.T + 0.1 * np.eye(3), B @ B.T + 0.1 * np.eye(6)
-    H, z, x = rng.normal(size=(3, 6)), rng.normal(size=3), rng.normal(size=6)
-    rows = linear_rows(z, R, H, 4)
-    no_gate = np.full(5, np.inf)
-    rows[:, GROUP] = 0
-    mean, cov, _, nis, used = ekf.update(x, P, rows, 0.0, no_gate, 1)
-    S = H @ P @ H.T + R
-    K = P @ H.T @ np.linalg.inv(S)
-    np.testing.assert_allclose(mean, x + K @ (z - H @ x), rtol=1e-9)
-    np.testing.assert_allclose(cov, P - K @ S @ K.T, rtol=1e-8, atol=1e-10)
-    assert nis == pytest.approx((z - H @ x) @ np.linalg.solve(S, z - H @ x), rel=1e-9)
-    assert used == 3
-
-
-def test_linear_rows_fill_the_whole_row() -> None:
-    rows = linear_rows(np.array([1.0, 2.0]), np.diag([4.0, 9.0]), np.eye(2, 6, k=2), 5)
-    np.testing.assert_array_equal(rows[:, GROUP], 5)
-    np.testing.assert_array_equal(rows[:, KIND], Kind.LINEAR)
-    np.testing.assert_array_equal(rows[:, [VARIANCE, GATE_VARIANCE]], 1.0)
-    np.testing.assert_array_equal(rows[:, [BIAS, COMMON]], -1.0)
-    np.testing.assert_allclose(rows[:, VALUE], [0.5, 2 / 3])
-    np.testing.assert_allclose(
-        rows[:, ORIGIN : ORIGIN + 6], [[0, 0, 1 / 2, 0, 0, 0], [0, 0, 0, 1 / 3, 0, 0]]
-    )
-
-
-def test_linear_rows_refuse_a_covariance_that_is_none() -> None:
-    with pytest.raises(np.linalg.LinAlgError):
-        linear_rows(np.zeros(2), np.array([[1.0, 2.0], [2.0, 1.0]]), np.eye(2, 6), 0)
-
-
-def test_speed_row() -> None:
-    (row,) = speed_row(3.0, 0.04, 2)
-    assert row.tolist() == [Kind.SPEED, 3.0, 0.04, 0.04, -1, -1, 2, *([0.0] * 12)]

@@ -1,0 +1,372 @@
+"""The first fix from within: cost, starts, rivals, covariance."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from netpos.filters.measurement import Kind, linearise, rsu_rows, speed_row
+from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.initialise import (
+    Initialiser,
+    _bias_inflated,
+    _clock_at,
+    _has_rival,
+    _inverse,
+    _is_sound,
+    _normal_equations,
+    _solve,
+    _starts,
+)
+from netpos.tracking.rsus import Rsu
+from scipy.constants import speed_of_light
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+T0 = 1_000_000_000
+
+
+KNOWN_CLOCK = {"clock_offset_sd_s": 1e-12, "clock_drift_mean": 0.0, "clock_drift_sd": 1e-12}
+
+
+def rsu(x: float, y: float, yaw_deg: float = 0.0, **change: object) -> Rsu:
+    q = Rotation.from_euler("z", yaw_deg, degrees=True).as_quat()
+    values = {"rsu_id": f"{x},{y}", "position": np.array([x, y, 0.0]), "quaternion": q}
+    return Rsu.of(RsuInfo(**(values | change)))  # type: ignore[arg-type]
+
+
+def measure(
+    station: Rsu,
+    state: Array,
+    fields: Field,
+    rng: np.random.Generator | None = None,
+    angle_sd: float = 0.02,
+    range_sd: float = 0.3,
+    group: int = 0,
+    stamp_ns: int = T0,
+) -> Array:
+    """Rows of a measurement of [x, y, vx, vy, clock m, drift m/s]; noise-free without ``rng``."""
+    noise = rng.normal(size=3) if rng is not None else np.zeros(3)
+    d = state[:2] - station.info.position[:2]
+    ux, uy, _ = Rotation.from_quat(station.info.quaternion).inv().apply([*d, 0.0])
+    r = math.hypot(*d)
+    cone = station.info.angle_convention is AngleConvention.CONE
+    azimuth = math.asin(uy / r) if cone else math.atan2(uy, ux)
+    m = RsuMeasurement(
+        stamp_ns=stamp_ns,
+        rsu_id=station.info.rsu_id,
+        vue_id="v",
+        fields=fields,
+        azimuth_rad=azimuth + angle_sd * noise[0],
+        azimuth_var=angle_sd**2,
+        toa_s=(r + state[4] + range_sd * noise[1]) / speed_of_light,
+        toa_var=(range_sd / speed_of_light) ** 2,
+        range_m=r + range_sd * noise[2],
+        range_var=range_sd**2,
+        position=np.array([*state[:2], 0.0]),
+        position_cov=np.eye(3) * range_sd**2,
+    )
+    return rsu_rows(m, station.info, station.axes, group)
+
+
+def solve(
+    config: TrackerConfig,
+    stations: list[Rsu],
+    state: Array,
+    fields: Field,
+    rng: np.random.Generator | None = None,
+) -> tuple[Array, Array] | None:
+    initialiser = Initialiser(config)
+    rows = np.vstack([measure(s, state, fields, rng, group=i) for i, s in enumerate(stations)])
+    initialiser.add(T0, rows, np.zeros(len(rows)), tuple(stations))
+    return initialiser.solve()
+
+
+def at(x: float, y: float, clock: float = 0.0) -> Array:
+    return np.array([x, y, 0.0, 0.0, clock, 0.0])
+
+
+def mixed_rows() -> tuple[list[Rsu], Array, Array]:
+    """Every kind of row, at different ages; one bearing on the far side of +-pi."""
+    cone = rsu(-5, 8, 20, angle_convention=AngleConvention.CONE, rsu_id="cone")
+    stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40), cone]
+    truth = np.array([-12.0, 0.4, 3.0, -2.0, 500.0, 40.0])
+    rng = np.random.default_rng(6)
+    fields = Field.AZIMUTH | Field.TOA | Field.RANGE | Field.POSITION
+    rows = [measure(s, truth, fields, rng, group=i) for i, s in enumerate(stations)]
+    rows[0][0, 1] += 2 * math.pi
+    rows += [speed_row(3.5, 0.04, 4)]
+    out = np.vstack(rows)
+    out[:, 4:6] = -1
+    return stations, out, np.linspace(-1.5, 0.0, len(out))
+
+
+def cost_of(state: Array, problem: tuple[Array, Array, float, Array, Array]) -> float:
+    """Twice the negative log posterior, row by row, through the public model."""
+    ages, rows, height, prior, prior_var = problem
+    total = float(np.sum((state - prior) ** 2 / prior_var))
+    for age, row in zip(ages, rows, strict=True):
+        F = np.eye(6)
+        F[0, 2] = F[1, 3] = F[4, 5] = age
+        innovation, _ = linearise(row[None], F @ state, height)
+        total += float(innovation[0] ** 2 / row[2])
+    return total
+
+
+def test_cost_gradient_and_curvature_of_the_fit() -> None:
+    _, rows, ages = mixed_rows()
+    prior = np.array([1.0, 2.0, 0.5, -0.5, 300.0, 20.0])
+    problem = (ages, rows, 0.7, prior, np.array([900.0, 900.0, 25.0, 25.0, 1e4, 400.0]))
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        state = np.array([-12.0, 0.5, 3.0, -2.0, 500.0, 40.0]) + rng.normal(size=6)
+        cost, half_gradient, hessian = _normal_equations(state, *problem)
+        assert cost == pytest.approx(cost_of(state, problem), rel=1e-10)
+        numeric = np.empty(6)
+        for i, e in enumerate(np.eye(6) * 1e-5):
+            numeric[i] = (cost_of(state + e, problem) - cost_of(state - e, problem)) / 2e-5
+        np.testing.assert_allclose(half_gradient, -numeric / 2, rtol=1e-5, atol=1e-3)
+        J = []
+        for age, row in zip(ages, rows, strict=True):
+            F = np.eye(6)
+            F[0, 2] = F[1, 3] = F[4, 5] = age
+            _, H = linearise(row[None], F @ state, 0.7)
+            J.append((H @ F)[0] / math.sqrt(row[2]))
+        expected = np.diag(1 / problem[4]) + np.array(J).T @ np.array(J)
+        np.testing.assert_allclose(hessian, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_solver_ends_in_a_minimum_from_anywhere(seed: int) -> None:
+    """Steps that do not go down are damped until they do: the gradient vanishes at the end."""
+    rng = np.random.default_rng(seed)
+    stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40)]
+    fields = Field.AZIMUTH | Field.RANGE
+    rows = np.vstack([measure(s, at(25.0, 18.0), fields, rng) for s in stations])
+    prior_var = np.array([150.0**2, 150.0**2, 25.0, 25.0, 1e4, 1e4])
+    problem = (np.zeros(len(rows)), rows, 0.0, np.array([13.0, 13.0, 0, 0, 0, 0]), prior_var)
+    start = np.array([*rng.uniform(-60, 60, 2), 0, 0, 0, 0])
+    cost, state, cov = _solve(start, problem)
+    assert cost <= cost_of(start, problem)
+    _, half_gradient, hessian = _normal_equations(state, *problem)
+    # in units of the sd of the solution
+    assert math.sqrt(half_gradient @ np.linalg.solve(hessian, half_gradient)) < 0.02
+    np.testing.assert_allclose(cov @ hessian, np.eye(6), atol=1e-8)
+
+
+@pytest.mark.parametrize("start", [(-59.4, 38.5), (43.2, 50.2), (22.7, 41.0), (-5.2, 57.1)])
+def test_a_step_uphill_is_tried_again_shorter(start: tuple[float, float]) -> None:
+    """Two bearings from afar: the first step overshoots."""
+    stations = [rsu(0, 0), rsu(40, 0)]
+    rows = np.vstack([measure(s, at(25.0, 18.0), Field.AZIMUTH) for s in stations])
+    prior_var = np.array([150.0**2, 150.0**2, 25.0, 25.0, 1e4, 1e4])
+    problem = (np.zeros(2), rows, 0.0, np.array([13.0, 13.0, 0, 0, 0, 0]), prior_var)
+    cost, b, A = _normal_equations(at(*start), *problem)
+    first = at(*start) + np.linalg.solve(A + 1e-3 * np.diag(np.diag(A)), b)
+    assert cost_of(first, problem) > cost
+    end, state, _ = _solve(at(*start), problem)
+    assert end < 0.02
+    np.testing.assert_allclose(state[:2], [25.0, 18.0], atol=1.0)
+
+
+def test_starts_lie_where_the_measurements_point() -> None:
+    centre = np.array([1.0, 2.0])
+    turned = rsu(10, 20, 90)
+    d = np.array([0.6, 0.8])
+    azimuth = measure(turned, at(*(np.array([10, 20]) + 30 * d)), Field.AZIMUTH)
+    starts = _starts(np.vstack([azimuth, azimuth]), centre)
+    np.testing.assert_array_equal(starts[0], centre)
+    along = np.array(starts[1:]) - [10, 20]
+    assert len(along) == 5  # the second row of the same sensor adds none
+    np.testing.assert_allclose(along / np.linalg.norm(along, axis=1)[:, None], [d] * 5, atol=1e-12)
+    assert np.linalg.norm(along, axis=1)[-1] >= 100.0
+    cone = rsu(10, 20, 90, angle_convention=AngleConvention.CONE)
+    row = measure(cone, at(*(np.array([10, 20]) + 30 * d)), Field.AZIMUTH)
+    np.testing.assert_allclose(np.array(_starts(row, centre)[1:]) - [10, 20], along, atol=1e-9)
+    row[0, 1] = 1.2  # noise beyond the end-fire direction
+    assert np.isfinite(np.array(_starts(row, centre))).all()
+
+    circle = np.array(_starts(measure(turned, at(10, 27), Field.RANGE), centre)[1:]) - [10, 20]
+    np.testing.assert_allclose(np.linalg.norm(circle, axis=1), 7.0)
+    angles = np.sort(np.arctan2(circle[:, 1], circle[:, 0]))
+    np.testing.assert_allclose(np.diff(angles), 2 * math.pi / 12, atol=1e-9)
+    toa = np.array(_starts(measure(turned, at(10, 27), Field.TOA), centre)[1:]) - [10, 20]
+    np.testing.assert_allclose(np.linalg.norm(toa, axis=1), 30.0)
+    assert len(toa) == 4
+
+    fix = _starts(measure(turned, at(7, -8), Field.POSITION), centre)
+    np.testing.assert_allclose(fix, [centre, [7.0, -8.0]], atol=1e-9)
+    assert len(_starts(speed_row(3.0, 1.0, 0), centre)) == 1
+
+
+def test_clock_start_is_the_weighted_mean_of_what_the_times_leave() -> None:
+    stations = [rsu(0, 0, position=np.array([0.0, 0.0, 6.0])), rsu(40, 0)]
+    rows = np.vstack([measure(s, at(12.0, 9.0), Field.TOA | Field.AZIMUTH) for s in stations])
+    rows[:, 1] = 0.3, 100.0, 0.3, 230.0
+    rows[:, 2] = 1.0, 1.0, 1.0, 4.0
+    left = [100.0 - math.sqrt(12**2 + 9**2 + 4**2), 230.0 - math.hypot(math.hypot(28, 9), 2)]
+    expected = (left[0] + left[1] / 4) / 1.25
+    assert _clock_at(at(12.0, 9.0), rows, 2.0) == pytest.approx(expected)
+    assert _clock_at(at(12.0, 9.0), rows[[0, 2]], 2.0) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("cost", "apart", "rival"),
+    [
+        (9.2, 10.0, True),
+        (9.22, 10.0, False),  # explains the measurements worse by more than chi-square 0.99
+        (1.0, 4.2, False),  # 4.2^2 / 2 = 8.8: the same solution
+        (1.0, 4.4, True),  # 9.7
+    ],
+)
+def test_a_rival_is_elsewhere_and_about_as_good(cost: float, apart: float, rival: bool) -> None:
+    fits = [(0.0, np.zeros(6), np.eye(6)), (0.5, np.zeros(6), np.eye(6))]
+    assert not _has_rival(fits)
+    assert _has_rival([fits[0], (cost, at(0.0, apart), np.eye(6))]) is rival
+    fits.append((cost, at(0.0, apart), np.eye(6)))
+    assert _has_rival(fits) is rival
+
+
+def test_bias_variance_counts_once_per_row_of_the_sensor() -> None:
+    a, b = rsu(0, 0), rsu(40, 0)
+    fields = Field.RANGE | Field.AZIMUTH
+    rows = np.vstack([measure(s, at(9, 9), fields) for s in (a, a, a, b)])
+    bias_var = np.array([0.1, 2.0] * 4)
+    given = np.column_stack([rows, bias_var])
+    before = given.copy()
+    out = _bias_inflated(given)
+    np.testing.assert_array_equal(given, before)
+    np.testing.assert_allclose(out[:, 2] - rows[:, 2], [0.3, 6.0] * 3 + [0.1, 2.0])
+
+
+def test_no_fit_whose_covariance_drowned_in_rounding() -> None:
+    assert _is_sound((1.0, np.zeros(6), np.eye(6)))
+    assert not _is_sound((math.nan, np.zeros(6), np.eye(6)))
+    assert not _is_sound((math.inf, np.zeros(6), np.eye(6)))
+    assert not _is_sound((1.0, np.zeros(6), np.diag([1.0, -1e-12, 1, 1, 1, 1])))
+    assert not _is_sound((1.0, np.zeros(6), np.diag([-1e-12, 1.0, 1, 1, 1, 1])))
+
+
+def test_inverse_of_units_that_differ_by_many_orders() -> None:
+    rng = np.random.default_rng(1)
+    B = rng.normal(size=(6, 6))
+    C, sd = B @ B.T + np.eye(6), 10.0 ** np.array([9.0, -9.0, 0.0, 6.0, -6.0, 3.0])
+    inverse = _inverse(C * np.outer(sd, sd)) * np.outer(sd, sd)
+    np.testing.assert_allclose(inverse, np.linalg.inv(C), rtol=1e-9, atol=1e-11)
+
+
+def test_old_measurements_leave_the_window() -> None:
+    config = TrackerConfig(initial_window_s=1.0)
+    initialiser = Initialiser(config)
+    a, b = rsu(0, 0), rsu(40, 0)
+    initialiser.add(T0, measure(a, at(12, 25), Field.AZIMUTH), np.zeros(1), (a,))
+    on_time = T0 + 1_000_000_000
+    initialiser.add(on_time, measure(b, at(12, 25), Field.AZIMUTH), np.zeros(1), (b,))
+    assert len(initialiser._window) == 2
+    initialiser.add(on_time + 1, measure(b, at(12, 25), Field.AZIMUTH), np.zeros(1), (b,))
+    assert [entry[0] for entry in initialiser._window] == [on_time, on_time + 1]
+
+
+def test_attempts_are_at_least_a_tenth_of_a_second_apart() -> None:
+    initialiser = Initialiser(TrackerConfig())
+    a, b = rsu(0, 0), rsu(40, 0)
+    initialiser.add(T0, measure(a, at(12, 25), Field.AZIMUTH), np.zeros(1), (a,))
+    assert initialiser.solve() is None
+    for ms, solved in ((99, False), (100, True)):
+        rows = measure(b, at(12, 25), Field.AZIMUTH)
+        initialiser.add(T0 + ms * 1_000_000, rows, np.zeros(1), (b,))
+        assert (initialiser.solve() is not None) is solved
+
+
+def test_an_ambiguity_is_waited_for_most_of_the_window_only() -> None:
+    config = TrackerConfig(initial_window_s=2.0)
+    initialiser = Initialiser(config)
+    stations = [rsu(0, 0), rsu(40, 0)]
+    for ms in range(0, 2000, 100):
+        rows = np.vstack([measure(s, at(12, 25), Field.RANGE, range_sd=0.3) for s in stations])
+        initialiser.add(T0 + ms * 1_000_000, rows, np.zeros(2), tuple(stations))
+        solution = initialiser.solve()
+        assert (solution is None) is (ms < 1600)
+        if solution is not None:
+            assert abs(solution[0][1]) == pytest.approx(25.0, abs=0.2)  # one of the two
+            break
+
+
+def test_covariance_is_consistent_over_many_seeds() -> None:
+    """DOA and TOA of two RSUs, truth from the prior: mean NEES of the position within its
+    chi-square bounds."""
+    config = TrackerConfig(**KNOWN_CLOCK)
+    stations = [rsu(0, 0), rsu(50, 10)]
+    nees = []
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        truth = at(*rng.uniform([10, 20], [40, 60]))
+        solution = solve(config, stations, truth, Field.AZIMUTH, rng)
+        assert solution is not None
+        error = solution[0][:2] - truth[:2]
+        nees.append(error @ np.linalg.solve(solution[1][:2, :2], error))
+    low, high = chi2.ppf([0.0005, 0.9995], 2 * 300) / 300
+    assert low < np.mean(nees) < high
+
+
+def test_inconsistent_measurements_widen_the_covariance() -> None:
+    """Three ranges that do not meet by far more than their noise."""
+    stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40), rsu(40, 40)]
+    rows = np.vstack([measure(s, at(20.0, 21.0), Field.RANGE) for s in stations])
+    good, bad = rows.copy(), rows.copy()
+    bad[0, 1] += 6.0
+    results = []
+    for values in (good, bad):
+        initialiser = Initialiser(TrackerConfig(initial_position_sd_max_m=50.0))
+        initialiser.add(T0, values, np.zeros(4), tuple(stations))
+        solution = initialiser.solve()
+        assert solution is not None
+        results.append(solution)
+    sds = [math.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]) for _, cov in results]
+    assert sds[1] > 3.0 * sds[0]
+    for limit, found in ((0.99 * sds[1], False), (1.01 * sds[1], True)):
+        strict = Initialiser(TrackerConfig(initial_position_sd_max_m=limit))
+        strict.add(T0, bad, np.zeros(4), tuple(stations))
+        assert (strict.solve() is not None) is found
+    error = results[1][0][:2] - [20.0, 21.0]
+    assert error @ np.linalg.solve(results[0][1][:2, :2], error) > 20.0
+    assert error @ np.linalg.solve(results[1][1][:2, :2], error) < 9.0
+
+
+def test_averaging_never_beats_the_bias() -> None:
+    """Ten epochs with a 1 m bias in each range: the mean keeps the variance of the bias."""
+    stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40)]
+    config = TrackerConfig(initial_position_sd_max_m=0.2, initial_speed_sd_mps=1e-3)
+    biased, free = Initialiser(config), Initialiser(config)
+    for k in range(10):
+        rows = np.vstack([measure(s, at(15.0, 15.0), Field.RANGE) for s in stations])
+        stamp = T0 + k * 100_000_000
+        biased.add(stamp, rows, np.ones(3), tuple(stations))
+        free.add(stamp, rows, np.zeros(3), tuple(stations))
+    assert free.solve() is not None
+    assert biased.solve() is None  # its sd never gets below a metre or so
+    wide = Initialiser(TrackerConfig(initial_speed_sd_mps=1e-3))
+    for stamp, rows, rsus in biased._window:
+        wide.add(stamp, rows[:, :-1], rows[:, -1], rsus)
+    solution = wide.solve()
+    assert solution is not None
+    H = np.array([(np.array([15.0, 15.0]) - s.info.position[:2]) for s in stations])
+    H /= np.linalg.norm(H, axis=1)[:, None]
+    expected = np.linalg.inv(H.T @ H / (1.0 + 0.3**2 / 10) + np.eye(2) / 150.0**2)
+    np.testing.assert_allclose(solution[1][:2, :2], expected, rtol=1e-2, atol=1e-4)
+
+
+def test_bias_columns_do_not_reach_outside_the_six_states() -> None:
+    """Rows that name bias states (6, 7) are fitted without them, and the caller's rows survive."""
+    stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40)]
+    rows = np.vstack([measure(s, at(15.0, 15.0), Field.RANGE) for s in stations])
+    rows[:, 4], rows[:, 5] = 6, 7
+    initialiser = Initialiser(TrackerConfig())
+    initialiser.add(T0, rows, np.zeros(3), tuple(stations))
+    solution = initialiser.solve()
+    assert solution is not None
+    np.testing.assert_allclose(solution[0][:2], 15.0, atol=0.02)
+    assert set(rows[:, 4]) == {6.0}
+    assert set(rows[:, 0]) == {float(Kind.RANGE)}
