@@ -100,8 +100,17 @@ class Sequencer:
         return released
 
     def flush(self) -> list[Epoch]:
-        """All that is pending, in stamp order: the end of a recording, or a silence."""
-        return [self._take(stamp) for stamp in sorted(self._pending)]
+        """All that is pending, in stamp order: the end of a recording, or a silence.
+
+        A pose that nothing has followed stays: it waits for the first measurement, however long
+        that takes, so that both are one epoch.
+        """
+        newest = max(self._watermark.values(), default=0)
+        return [
+            self._take(stamp)
+            for stamp, epoch in sorted(self._pending.items())
+            if newest > stamp or not epoch.only_a_pose()
+        ]
 
     def _take(self, stamp: int) -> Epoch:
         epoch = self._pending.pop(stamp)

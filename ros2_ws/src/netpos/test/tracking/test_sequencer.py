@@ -237,17 +237,23 @@ def test_older_than_pending_but_not_released_is_in_time() -> None:
 
 def test_late_initial_pose_is_applied_at_the_last_released_stamp() -> None:
     """Tools stamp it 0 or with another clock's time."""
-    s = Sequencer(HOLD)
-    assert s.add(pose(0)) is None
-    assert [e.stamp_ns for e in s.flush()] == [0]
-    s.add(velocity(100))
-    s.flush()
     for stamp in (0, 50):
         t = Sequencer(HOLD)
         t.add(velocity(100))
         t.flush()
         assert t.add(pose(stamp)) is None
-        assert stamps_ms(t.flush()) == [100]
+        t.add(velocity(110))
+        assert stamps_ms(t.flush()) == [100, 110]
+
+
+def test_a_pose_waits_for_a_measurement_through_any_silence() -> None:
+    """Both are then one epoch, however long the first measurement takes to come."""
+    s = Sequencer(HOLD)
+    assert s.add(pose(100)) is None
+    assert s.release() == []
+    assert s.flush() == []
+    assert s.add(rsu(100, "a", 1)) is None
+    assert [len(epoch.items) for epoch in s.release() + s.flush()] == [2]
 
 
 # the property
