@@ -17,7 +17,8 @@ demo: setup ## run METIS Madrid as a live graph, record, replay, score, draw; th
 test: setup lint test-unit test-integration ## everything CI runs
 
 test-unit: setup ## the library and the nodes' conversions, without a running graph
-	@. ./env.sh && python -m pytest -q ros2_ws/src
+	@. ./env.sh && python -m pytest -q -n auto --dist loadfile ros2_ws/src/netpos/test
+	@. ./env.sh && python -m pytest -q ros2_ws/src --ignore=ros2_ws/src/netpos
 
 test-integration: setup ## the real processes, started with ros2 run
 	@. ./env.sh && python -m pytest -q tests

@@ -17,6 +17,9 @@ BLE_REFERENCE_M = {"uc1_run1": 1.04, "uc1_run2": 0.96, "uc2_run1": 0.69}
 MEAN_RATIO = 0.85
 # 2-D RMSE [m] that the authors of the UWB recording report
 UWB_REFERENCE_M = {"LOS": 1.04, "NLOS": 0.94}
+# 2-D RMSE [m] of a least-squares fit of each epoch's 24 trolley ranges, without biases, and that
+# fit's heading RMSE [deg], 7 deg of which are a mean that the truth shows at every heading.
+TROLLEY_REFERENCE = (0.159, 9.4)
 LIVE_RUN = "uc2_run1"  # the shortest
 
 
@@ -101,3 +104,14 @@ def test_uwb_ranges(data_folder: Path, tmp_path: Path, view: str) -> None:
     figures = replayed(tmp_path / view).figures
     assert figures["n"] > 1000
     assert figures["rmse_m"] < UWB_REFERENCE_M[view]
+
+
+def test_uwb_trolley(data_folder: Path, tmp_path: Path) -> None:
+    source = recording(data_folder, "uwb_trolley")
+    netpos("import", "uwb-trolley", source, tmp_path / "trolley")
+    figures = replayed(tmp_path / "trolley").figures
+    assert figures["n"] > 13_000
+    assert figures["availability"] > 0.9
+    assert figures["rmse_m"] < 0.5 * TROLLEY_REFERENCE[0]
+    assert 0.5 <= figures["nees_mean"] <= 3.3
+    assert figures["heading_rmse_deg"] < 1.2 * TROLLEY_REFERENCE[1]

@@ -3,7 +3,7 @@ from setuptools import find_packages, setup
 setup(
     name="netpos",
     version="0.1.0",
-    package_data={"netpos": ["py.typed"]},
+    package_data={"netpos": ["py.typed"], "netpos.evaluation.bench": ["*.c"]},
     packages=find_packages(exclude=["test", "test.*"]),
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/netpos"]),

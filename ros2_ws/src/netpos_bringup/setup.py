@@ -14,9 +14,12 @@ setup(
     ],
     install_requires=["setuptools"],
     zip_safe=True,
-    description="Scenarios, parameters, launch files and run scripts.",
+    description="Scenarios, launch files, and the processes that measure the live node.",
     license="Apache-2.0",
     entry_points={
-        "console_scripts": [],
+        "console_scripts": [
+            "bench_probe = netpos_bringup.bench_probe:main",
+            "bench_relay = netpos_bringup.bench_relay:main",
+        ],
     },
 )

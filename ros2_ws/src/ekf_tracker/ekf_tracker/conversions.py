@@ -7,6 +7,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from netpos.messages.values import TrackState, TrackStatus
+from netpos.tracking.health import RsuReport, RsuState
 from netpos_node import CODEC
 
 _LEVELS = {
@@ -17,8 +18,18 @@ _LEVELS = {
 }
 
 
-def diagnostics_to_msg(statuses: Iterable[TrackStatus], rsu_count: int) -> Any:
-    """diagnostic_msgs/DiagnosticArray with one entry per device, stamped with the newest epoch."""
+_RSU_LEVELS = {
+    RsuState.OK: DiagnosticStatus.OK,
+    RsuState.SUSPECT: DiagnosticStatus.WARN,
+    RsuState.ISOLATED: DiagnosticStatus.ERROR,
+}
+
+
+def diagnostics_to_msg(
+    statuses: Iterable[TrackStatus], rsu_count: int, reports: Iterable[RsuReport] = ()
+) -> Any:
+    """diagnostic_msgs/DiagnosticArray with one entry per device and per RSU heard, stamped with
+    the newest epoch."""
     array = DiagnosticArray()
     newest = 0
     for status in statuses:
@@ -31,13 +42,33 @@ def diagnostics_to_msg(statuses: Iterable[TrackStatus], rsu_count: int) -> Any:
             message=f"{rsu_count} RSUs known" if rsu_count else "no /rsu/info received yet",
         )
     )
+    array.status.extend(_rsu(report) for report in reports)
     array.header.stamp = CODEC.time(newest)
     return array
+
+
+def _rsu(report: RsuReport) -> Any:
+    values = {
+        "age_s": f"{report.age_s:.1f}",
+        "rate_hz": f"{report.rate_hz:.1f}",
+        "accept_ratio": f"{report.accept_ratio:.2f}",
+        "measurements": str(report.measurements),
+        **{f"innovation: {k}": f"{v:.4g}" for k, v in sorted(report.mean_innovation.items())},
+        **{f"innovation / sd: {k}": f"{v:.2f}" for k, v in sorted(report.mean_normalised.items())},
+    }
+    return DiagnosticStatus(
+        level=_RSU_LEVELS[report.state],
+        name=f"ekf_tracker: rsu {report.rsu_id}",
+        message=report.text,
+        hardware_id=report.rsu_id,
+        values=[KeyValue(key=key, value=value) for key, value in values.items()],
+    )
 
 
 def _device(status: TrackStatus) -> Any:
     values = {
         "position_sd_m": f"{status.position_sd_m:.3f}",
+        "protection_level_m": f"{status.protection_level_m:.3f}",
         "nis": f"{status.nis:.3f}",
         "nis_dof": str(status.nis_dof),
         "accepted": str(status.accepted),

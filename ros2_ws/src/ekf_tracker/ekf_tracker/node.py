@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from typing import Any
 
@@ -16,6 +17,7 @@ from netpos_msgs.msg import ClockState, RsuInfo, RsuMeasurement
 from netpos_msgs.msg import TrackStatus as TrackStatusMsg
 from netpos_node import (
     BACKLOG,
+    CDR,
     CODEC,
     LATCHED,
     STREAM,
@@ -27,7 +29,9 @@ from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
+from sensor_msgs.msg import Imu
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 
@@ -40,7 +44,11 @@ _PATIENCE_S = 30.0
 
 
 class EkfTrackerNode(Node):
-    """Feeds a ``Tracker``. All that has arrived is taken at once, RSU descriptions first."""
+    """Feeds a ``Tracker``.
+
+    Measurements and estimates come and go as bytes. Whoever spins the node hands messages over in
+    the order of their arrival, so that no topic overtakes another.
+    """
 
     def __init__(self, **node_options: Any) -> None:
         warm_up()  # before the node is seen: whoever sees it may count on it
@@ -48,7 +56,7 @@ class EkfTrackerNode(Node):
         parameters = declare_parameters(self)
         self._tracker = Tracker(parameters.config)
         self._inputs: list[tuple[Subscription, Callable[[Any], None]]] = []
-        self._outputs: dict[str, tuple[Publisher, Publisher, Publisher]] = {}
+        self._outputs: dict[str, tuple[Publisher, ...]] = {}
         self._statuses: dict[str, TrackStatus] = {}
         self._heard_since_tick = False
         self._diagnostics_pub = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
@@ -59,7 +67,7 @@ class EkfTrackerNode(Node):
         for vue_id in parameters.vue_ids:
             self._add_device(vue_id)
         self._wait_for_subscribers(parameters.subscribers)
-        self._listen(RsuMeasurement, topics.RSU_MEASUREMENTS, self._on_measurement)
+        self._listen(RsuMeasurement, topics.RSU_MEASUREMENTS, self._on_measurement, raw=True)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/enable", self._on_enable)
         self.create_timer(_SILENCE_S, self._on_silence_tick)
@@ -71,6 +79,8 @@ class EkfTrackerNode(Node):
             threshold, post_callback=self._on_clock_jump
         )
         self.get_logger().info(f"tracking {', '.join(parameters.vue_ids)}")
+        gc.collect()
+        gc.freeze()  # what is here stays: looking at it again stalls a tracker of many devices
 
     def _wait_for_subscribers(self, wanted: int) -> None:
         """Hear no measurement before the estimates are heard: what is given out is then seen."""
@@ -86,32 +96,28 @@ class EkfTrackerNode(Node):
     # inputs
 
     def _listen(
-        self, msg_type: Any, topic: str, handler: Callable[[Any], None], qos: Any = BACKLOG
+        self,
+        msg_type: Any,
+        topic: str,
+        handler: Callable[[Any], None],
+        qos: Any = BACKLOG,
+        *,
+        raw: bool = False,
     ) -> None:
         def on_message(msg: Any) -> None:
-            self._take_all(handler, msg)
+            self._heard_since_tick = True
+            handler(msg)
+            self._publish(self._tracker.process())
 
-        subscription = self.create_subscription(msg_type, topic, on_message, qos)
-        self._inputs.append((subscription, handler))
+        subscription = self.create_subscription(msg_type, topic, on_message, qos, raw=raw)
+        self._inputs.append((subscription, on_message))
 
-    def _take_all(
-        self, first_handler: Callable[[Any], None] | None = None, first: Any = None
-    ) -> None:
-        """Hand over all that has arrived, so that ready topics cannot overtake each other."""
-        self._heard_since_tick = True
-        for subscription, handler in self._inputs:
-            if handler == first_handler and first is not None:
-                handler(first)
-                first = None
-            with subscription.handle:
-                while True:
-                    taken = subscription.handle.take_message(
-                        subscription.msg_type, subscription.raw
-                    )
-                    if taken is None:
-                        break
-                    handler(taken[0])
-        self._publish(self._tracker.process())
+    @staticmethod
+    def _take_waiting(subscription: Subscription, on_message: Callable[[Any], None]) -> None:
+        kind = subscription.msg_type, subscription.raw
+        with subscription.handle:
+            while taken := subscription.handle.take_message(*kind):
+                on_message(taken[0])
 
     def _on_rsu_info(self, msg: Any) -> None:
         try:
@@ -119,10 +125,14 @@ class EkfTrackerNode(Node):
         except ValueError as error:
             self.get_logger().error(str(error))
 
-    def _on_measurement(self, msg: Any) -> None:
-        if msg.vue_id not in self._outputs and topics.is_vue_id(msg.vue_id):
-            self._add_device(msg.vue_id)
-        self._add(CODEC.measurement_from_msg(msg))
+    def _on_measurement(self, cdr: bytes) -> None:
+        self._take_waiting(*self._inputs[0])  # descriptions of RSUs come first
+        measurement = CDR.measurement(cdr)
+        if measurement is None:
+            measurement = CODEC.measurement_from_msg(deserialize_message(cdr, RsuMeasurement))
+        if measurement.vue_id not in self._outputs and topics.is_vue_id(measurement.vue_id):
+            self._add_device(measurement.vue_id)
+        self._add(measurement)
 
     def _add(self, item: Any) -> None:
         reason = self._tracker.add(item)
@@ -136,10 +146,15 @@ class EkfTrackerNode(Node):
         def topic(name: str) -> str:
             return topics.of_vue(vue_id, name)
 
-        self._outputs[vue_id] = (
-            self.create_publisher(Odometry, topic(topics.ODOMETRY), STREAM),
-            self.create_publisher(ClockState, topic(topics.CLOCK_STATE), STREAM),
-            self.create_publisher(TrackStatusMsg, topic(topics.TRACK_STATUS), STREAM),
+        outputs = [
+            (Odometry, topics.ODOMETRY),
+            (ClockState, topics.CLOCK_STATE),
+            (TrackStatusMsg, topics.TRACK_STATUS),
+        ]
+        if self._tracker.config.fixed_lag_s > 0.0:
+            outputs.append((Odometry, topics.ODOMETRY_SMOOTHED))
+        self._outputs[vue_id] = tuple(
+            self.create_publisher(kind, topic(name), STREAM) for kind, name in outputs
         )
         pose, twist = PoseWithCovarianceStamped, TwistWithCovarianceStamped
         self._listen(
@@ -157,29 +172,44 @@ class EkfTrackerNode(Node):
             topic(topics.GROUND_SPEED),
             lambda msg: self._add(CODEC.ground_speed_from_msg(msg, vue_id)),
         )
+        if self._tracker.config.use_imu:
+            self._listen(Imu, topic(topics.IMU), lambda cdr: self._on_imu(cdr, vue_id), raw=True)
+
+    def _on_imu(self, cdr: bytes, vue_id: str) -> None:
+        sample = CDR.imu(cdr, vue_id)
+        if sample is None:
+            sample = CODEC.imu_from_msg(deserialize_message(cdr, Imu), vue_id)
+        self._add(sample)
 
     # outputs
 
     def _publish(self, outputs: list[TrackOutput]) -> None:
         for output in outputs:
             self._statuses[output.status.vue_id] = output.status
-            odometry_pub, clock_pub, status_pub = self._outputs[output.status.vue_id]
+            odometry_pub, clock_pub, status_pub, *smoothed_pub = self._outputs[
+                output.status.vue_id
+            ]
             if output.odometry is not None:
-                odometry_pub.publish(CODEC.odometry_to_msg(output.odometry))
-                if self._tf_pub is not None:
-                    self._tf_pub.publish(CODEC.transform_to_msg(output.odometry))
+                odometry_pub.publish(CDR.odometry(output.odometry))
+                if self._tf_pub is not None and not output.revised:
+                    self._tf_pub.publish(CDR.transform(output.odometry))
             if output.clock is not None:
-                clock_pub.publish(CODEC.clock_state_to_msg(output.clock))
-            status_pub.publish(CODEC.track_status_to_msg(output.status))
+                clock_pub.publish(CDR.clock_state(output.clock))
+            status_pub.publish(CDR.track_status(output.status))
+            for odometry in output.smoothed:
+                smoothed_pub[0].publish(CDR.odometry(odometry))
 
     def _publish_diagnostics(self) -> None:
         self._diagnostics_pub.publish(
-            diagnostics_to_msg(self._statuses.values(), self._tracker.rsu_count)
+            diagnostics_to_msg(
+                self._statuses.values(), self._tracker.rsu_count, self._tracker.rsu_reports()
+            )
         )
 
     def finish(self) -> None:
         """Give out what still follows from all that has arrived, and see it delivered."""
-        self._take_all()
+        for waiting in self._inputs:
+            self._take_waiting(*waiting)
         self._publish(self._tracker.flush())
         for publisher in self.publishers:
             publisher.wait_for_all_acked(Duration(seconds=_DELIVERY_S))

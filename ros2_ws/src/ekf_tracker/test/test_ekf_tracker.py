@@ -4,31 +4,35 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import rclpy
-from diagnostic_msgs.msg import DiagnosticStatus
-from ekf_tracker.conversions import diagnostics_to_msg
 from ekf_tracker.node import EkfTrackerNode
-from netpos.bags import BagWriter, codec
+from nav_msgs.msg import Odometry
+from netpos.bags import BagWriter, codec, typestore
 from netpos.messages.values import (
     Field,
+    ImuSample,
     InitialPose,
     RsuInfo,
     RsuMeasurement,
     TrackState,
-    TrackStatus,
     Velocity,
 )
+from netpos_msgs.msg import ClockState
+from netpos_msgs.msg import TrackStatus as TrackStatusMsg
 from netpos_node import CODEC
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.time import Time
 from std_srvs.srv import SetBool, Trigger
+from tf2_msgs.msg import TFMessage
 
 DOMAIN = 36
 T0 = 1_000_000_000
@@ -36,13 +40,14 @@ PLACES = {"a": (0.0, 10.0), "b": (60.0, -10.0), "c": (120.0, 10.0)}
 
 
 class Kept:
-    """A publisher that keeps what it is given."""
+    """A publisher that keeps what it is given: messages, or their bytes."""
 
-    def __init__(self) -> None:
+    def __init__(self, kind: Any = None) -> None:
         self.messages: list[Any] = []
+        self._kind = kind
 
     def publish(self, msg: Any) -> None:
-        self.messages.append(msg)
+        self.messages.append(deserialize_message(msg, self._kind) if self._kind else msg)
 
 
 @pytest.fixture
@@ -62,15 +67,16 @@ def make() -> Iterator[Any]:
     rclpy.shutdown(context=context)
 
 
-def arrive(node: EkfTrackerNode, handler: Any, msg: Any) -> None:
-    """As the subscription does on arrival."""
-    node._take_all(handler, msg)
+def arrive(node: EkfTrackerNode, topic: str, msg: Any) -> None:
+    """As the executor does when a message has arrived."""
+    (subscription,) = (s for s, _ in node._inputs if s.topic_name == topic)
+    subscription.callback(serialize_message(msg) if subscription.raw else msg)
 
 
 def know_rsus(node: EkfTrackerNode) -> None:
     for name, (x, y) in PLACES.items():
         info = RsuInfo(rsu_id=name, position=np.array([x, y, 0.0]))
-        arrive(node, node._on_rsu_info, CODEC.rsu_info_to_msg(info))
+        arrive(node, "/rsu/info", CODEC.rsu_info_to_msg(info))
 
 
 def measurement(name: str, t_s: float, vue_id: str = "vue_1", **change: Any) -> Any:
@@ -93,19 +99,15 @@ def measurement(name: str, t_s: float, vue_id: str = "vue_1", **change: Any) -> 
 def drive(node: EkfTrackerNode, epochs: range, vue_id: str = "vue_1") -> None:
     for k in epochs:
         for name in PLACES:
-            arrive(node, node._on_measurement, measurement(name, 0.1 * k, vue_id))
+            arrive(node, "/rsu/measurements", measurement(name, 0.1 * k, vue_id))
 
 
 def keep(node: EkfTrackerNode, vue_id: str = "vue_1") -> tuple[Kept, Kept, Kept]:
     if vue_id not in node._outputs:
         node._add_device(vue_id)
-    kept = Kept(), Kept(), Kept()
+    kept = Kept(Odometry), Kept(ClockState), Kept(TrackStatusMsg)
     node._outputs[vue_id] = kept  # type: ignore[assignment]
     return kept
-
-
-def handler_of(node: EkfTrackerNode, topic: str) -> Any:
-    return next(h for s, h in node._inputs if s.topic_name == topic)
 
 
 # the graph
@@ -164,12 +166,34 @@ def test_unknown_device_gets_its_topics_when_first_heard(make: Any) -> None:
 def test_a_name_that_is_no_topic_is_refused_and_the_node_lives_on(make: Any, vue_id: str) -> None:
     node = make()
     know_rsus(node)
-    arrive(node, node._on_measurement, measurement("a", 0.0, vue_id))
+    arrive(node, "/rsu/measurements", measurement("a", 0.0, vue_id))
     assert set(node._outputs) == {"vue_1"}
     assert node._tracker.rejected() == {vue_id: {"vue_id": 1}}
     odometry, _, _ = keep(node)
     drive(node, range(3))
     assert len(odometry.messages) == 3
+
+
+def test_the_imu_is_heard_where_the_motion_model_needs_it(make: Any) -> None:
+    """Its topic names the device, whatever its frame is called."""
+    node = make(motion_model="inertial")
+    read = dict(node.get_subscriber_names_and_types_by_node("ekf_tracker", "/"))
+    assert read["/vue_1/imu"] == ["sensor_msgs/msg/Imu"]
+    taken: list[Any] = []
+    node._tracker.add = taken.append
+    sample = ImuSample(
+        stamp_ns=T0, vue_id="sensor", angular_velocity=np.ones(3), specific_force=np.ones(3)
+    )
+    msg = codec().imu_to_msg(sample)
+    arrive(node, "/vue_1/imu", CODEC.imu_to_msg(sample))
+    (callback,) = (s.callback for s, _ in node._inputs if s.topic_name == "/vue_1/imu")
+    callback(bytes(typestore().serialize_cdr(msg, msg.__msgtype__, little_endian=False)))
+    assert [repr(one) for one in taken] == [repr(replace(sample, vue_id="vue_1"))] * 2
+
+
+def test_the_imu_is_not_heard_elsewhere(make: Any) -> None:
+    read = dict(make().get_subscriber_names_and_types_by_node("ekf_tracker", "/"))
+    assert "/vue_1/imu" not in read
 
 
 # parameters
@@ -221,7 +245,7 @@ def test_a_bag_gives_defaults_and_explicit_values_win(make: Any, tmp_path: Path)
 def test_a_drive_is_published(make: Any) -> None:
     node = make()
     odometry, clock, status = keep(node)
-    node._tf_pub = Kept()
+    node._tf_pub = Kept(TFMessage)
     know_rsus(node)
     drive(node, range(30))
     assert len(odometry.messages) == len(clock.messages) == len(status.messages) == 30
@@ -243,32 +267,50 @@ def test_velocity_and_pose_of_a_device_reach_its_track(make: Any) -> None:
     pose = InitialPose(
         stamp_ns=T0, vue_id="vue_1", position=np.array([5.0, 6.0, 0.0]), cov=np.eye(3)
     )
-    arrive(node, handler_of(node, "/vue_1/initialpose"), CODEC.initial_pose_to_msg(pose))
+    arrive(node, "/vue_1/initialpose", CODEC.initial_pose_to_msg(pose))
     assert odometry.messages[-1].pose.pose.position.x == 5.0
     v = Velocity(
         stamp_ns=T0 + 10**8, vue_id="vue_1", velocity=np.array([2.0, 0.0]), cov=0.01 * np.eye(2)
     )
     msg = CODEC.velocity_to_msg(v)
-    arrive(node, handler_of(node, "/vue_1/step_velocity"), msg)
+    arrive(node, "/vue_1/step_velocity", msg)
     assert status.messages[-1].sources == ["step_velocity"]
     assert odometry.messages[-1].twist.twist.linear.x == pytest.approx(2.0, abs=0.05)
     msg = CODEC.velocity_to_msg(v)
     msg.header.stamp = CODEC.time(T0 + 2 * 10**8)
-    arrive(node, handler_of(node, "/vue_1/ground_speed"), msg)
+    arrive(node, "/vue_1/ground_speed", msg)
     assert status.messages[-1].sources == ["ground_speed"]
     assert clock.messages == []  # no TOA yet
+
+
+def test_measurements_in_the_other_byte_order_count_too(make: Any) -> None:
+    """Their bytes are not read the short way."""
+    node = make()
+    odometry, _, status = keep(node)
+    know_rsus(node)
+    drive(node, range(2))
+    (on_measurement,) = (
+        s.callback for s, _ in node._inputs if s.topic_name == "/rsu/measurements"
+    )
+    for name in PLACES:
+        values = CODEC.measurement_from_msg(measurement(name, 0.2))
+        msg = codec().measurement_to_msg(values)
+        on_measurement(bytes(typestore().serialize_cdr(msg, msg.__msgtype__, little_endian=False)))
+    assert len(odometry.messages) == 3
+    assert status.messages[-1].sources == ["a", "b", "c"]
+    assert status.messages[-1].rejected == 0
 
 
 def test_refusals_are_counted_not_raised(make: Any) -> None:
     node = make()
     know_rsus(node)
-    arrive(node, node._on_measurement, measurement("a", 0.0, rsu_id="nobody"))
-    arrive(node, node._on_measurement, measurement("a", 0.0, azimuth_rad=math.nan))
+    arrive(node, "/rsu/measurements", measurement("a", 0.0, rsu_id="nobody"))
+    arrive(node, "/rsu/measurements", measurement("a", 0.0, azimuth_rad=math.nan))
     broken = CODEC.rsu_info_to_msg(RsuInfo(rsu_id="x", position=np.full(3, math.nan)))
-    arrive(node, node._on_rsu_info, broken)
+    arrive(node, "/rsu/info", broken)
     broken = CODEC.rsu_info_to_msg(RsuInfo(rsu_id="x", position=np.zeros(3)))
     broken.angle_convention = 9
-    arrive(node, node._on_rsu_info, broken)
+    arrive(node, "/rsu/info", broken)
     assert node._tracker.rejected() == {"vue_1": {"unknown_rsu": 1, "not_finite": 1}}
     assert node._tracker.rsu_count == 3
 
@@ -280,7 +322,7 @@ def test_silence_flushes_what_waits(make: Any) -> None:
     node = make(hold_s=1.0)
     _, _, status = keep(node)
     know_rsus(node)
-    arrive(node, node._on_measurement, measurement("a", 0.0))
+    arrive(node, "/rsu/measurements", measurement("a", 0.0))
     node._on_silence_tick()  # something was heard since the last tick
     assert status.messages == []
     node._on_silence_tick()
@@ -295,7 +337,7 @@ def test_reset_service(make: Any) -> None:
     response = node._on_reset(Trigger.Request(), Trigger.Response())
     assert response.success
     assert response.message == "all tracks start anew"
-    arrive(node, node._on_measurement, measurement("a", 0.05, expected=1, fields=Field.TOA))
+    arrive(node, "/rsu/measurements", measurement("a", 0.05, expected=1, fields=Field.TOA))
     assert status.messages[-1].state == TrackState.WAITING
     assert len(odometry.messages) == 3
     assert node._tracker.rsu_count == 3
@@ -329,64 +371,12 @@ def test_simulated_clock_that_jumps_back_resets(make: Any) -> None:
     assert status.messages[-1].state == TrackState.TRACKING
     assert status.messages[-1].accepted == 12
     clock.set_ros_time_override(Time(nanoseconds=T0 + 10**9 - 1))
-    arrive(node, node._on_measurement, measurement("a", 0.0, expected=1, fields=Field.TOA))
+    arrive(node, "/rsu/measurements", measurement("a", 0.0, expected=1, fields=Field.TOA))
     assert status.messages[-1].state == TrackState.WAITING
     assert status.messages[-1].rejection_reasons == []  # an old stamp is not late any more
 
 
 # diagnostics
-
-
-def status(state: TrackState, stamp_ns: int, vue_id: str = "vue_1") -> TrackStatus:
-    return TrackStatus(
-        stamp_ns=stamp_ns,
-        vue_id=vue_id,
-        state=state,
-        nis=1.25,
-        nis_dof=4,
-        accepted=9,
-        rejected={"late": 2, "gate": 1},
-        position_sd_m=0.5,
-    )
-
-
-@pytest.mark.parametrize(
-    ("state", "level"),
-    [
-        (TrackState.WAITING, DiagnosticStatus.WARN),
-        (TrackState.INITIALISING, DiagnosticStatus.WARN),
-        (TrackState.TRACKING, DiagnosticStatus.OK),
-        (TrackState.COASTING, DiagnosticStatus.WARN),
-    ],
-)
-def test_diagnostics_of_a_device(state: TrackState, level: bytes) -> None:
-    array = diagnostics_to_msg([status(state, T0)], 2)
-    device, rsus = array.status
-    assert (device.level, device.message) == (level, state.name.lower())
-    assert (device.name, device.hardware_id) == ("ekf_tracker: vue_1", "vue_1")
-    assert {v.key: v.value for v in device.values} == {
-        "position_sd_m": "0.500",
-        "nis": "1.250",
-        "nis_dof": "4",
-        "accepted": "9",
-        "rejected: gate": "1",
-        "rejected: late": "2",
-    }
-    assert (rsus.level, rsus.message) == (DiagnosticStatus.OK, "2 RSUs known")
-
-
-def test_diagnostics_stamp_and_missing_rsus() -> None:
-    array = diagnostics_to_msg(
-        [status(TrackState.TRACKING, T0 + 5), status(TrackState.TRACKING, T0, "vue_2")], 0
-    )
-    assert (array.header.stamp.sec, array.header.stamp.nanosec) == (1, 5)
-    assert [s.name for s in array.status] == [
-        "ekf_tracker: vue_1",
-        "ekf_tracker: vue_2",
-        "ekf_tracker: rsus",
-    ]
-    assert array.status[-1].level == DiagnosticStatus.WARN
-    assert array.status[-1].message == "no /rsu/info received yet"
 
 
 def test_diagnostics_are_published(make: Any) -> None:
@@ -398,4 +388,9 @@ def test_diagnostics_are_published(make: Any) -> None:
     node._publish_diagnostics()
     first, second = node._diagnostics_pub.messages
     assert [s.name for s in first.status] == ["ekf_tracker: rsus"]
-    assert [s.message for s in second.status] == ["tracking", "3 RSUs known"]
+    assert [s.message for s in second.status[:2]] == ["tracking", "3 RSUs known"]
+    assert [(s.hardware_id, s.message) for s in second.status[2:]] == [
+        ("a", "ok"),
+        ("b", "ok"),
+        ("c", "ok"),
+    ]

@@ -19,4 +19,10 @@ Rooms
 ``cli``         the ``netpos`` command
 """
 
+from pathlib import Path
+
+from netpos import kernel_cache
+
 __version__ = "0.1.0"
+
+kernel_cache.select(Path(__file__).resolve().parent)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
@@ -11,7 +13,17 @@ import rclpy
 from nav_msgs.msg import Odometry
 from netpos.tracking import TrackerConfig
 from netpos_msgs.msg import RsuMeasurement
-from netpos_node import CODEC, LATCHED, STREAM, declare, declare_config, message_class, run
+from netpos_node import (
+    CODEC,
+    LATCHED,
+    STREAM,
+    declare,
+    declare_config,
+    message_class,
+    run,
+    spin_until_stopped,
+    wait_until_heard,
+)
 from rclpy.exceptions import (
     InvalidParameterTypeException,
     InvalidParameterValueException,
@@ -21,6 +33,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, ReliabilityPolicy
+from std_msgs.msg import String
 
 DOMAIN = 36
 
@@ -205,3 +218,56 @@ def test_an_error_while_spinning_shuts_down_and_shows() -> None:
     with pytest.raises(RuntimeError, match="broken"):
         run(lambda: node, spin)
     assert not rclpy.ok()
+
+
+@pytest.fixture
+def signal_handlers() -> Iterator[None]:
+    """Those of before come back."""
+    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in kept.items():
+        signal.signal(number, handler)
+
+
+class Listener(Node):
+    """Hears two topics; all is sent, by itself, in one callback."""
+
+    def __init__(self, order: str, stop: int) -> None:
+        super().__init__("listener")
+        self.heard: list[str] = []
+        self._expected, self._stop = len(order), stop
+        publishers = {}
+        for name in set(order):
+            topic = f"/probe_{name}"
+            self.create_subscription(String, topic, lambda msg: self.hear(msg.data), STREAM)
+            publishers[name] = self.create_publisher(String, topic, STREAM)
+        counts = dict.fromkeys(publishers, 1)
+        assert wait_until_heard(publishers, counts, 20.0, settle_s=0.0) == []
+
+        def send() -> None:
+            timer.cancel()
+            for index, name in enumerate(order):
+                publishers[name].publish(String(data=f"{name}{index}"))
+
+        timer = self.create_timer(0.01, send)
+
+    def hear(self, text: str) -> None:
+        self.heard.append(text)
+        if len(self.heard) == self._expected:
+            os.kill(os.getpid(), self._stop)
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.usefixtures("signal_handlers")
+def test_what_has_arrived_is_handed_over_in_its_order_until_a_signal(
+    monkeypatch: pytest.MonkeyPatch, stop: int
+) -> None:
+    """No topic overtakes another, however much of one arrived first."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(DOMAIN))
+    order, finished = "aaaabaabbbbabbaaaaaabab", []
+
+    def spin(node: Any) -> None:
+        spin_until_stopped(node, lambda: finished.append((rclpy.ok(), node.heard)))
+
+    run(lambda: Listener(order, stop), spin)
+    assert finished == [(True, [f"{name}{index}" for index, name in enumerate(order)])]

@@ -6,7 +6,17 @@ killed recorder left, ``netpos.bags.importers`` turn other people's recordings i
 
 from netpos.bags.errors import BagError
 from netpos.bags.reader import BagEntry, BagReader, TopicInfo
-from netpos.bags.types import codec, typestore
+from netpos.bags.types import cdr_codec, codec, has_common_definition, typestore
 from netpos.bags.writer import BagWriter
 
-__all__ = ["BagEntry", "BagError", "BagReader", "BagWriter", "TopicInfo", "codec", "typestore"]
+__all__ = [
+    "BagEntry",
+    "BagError",
+    "BagReader",
+    "BagWriter",
+    "TopicInfo",
+    "cdr_codec",
+    "codec",
+    "has_common_definition",
+    "typestore",
+]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,11 +9,12 @@ from types import TracebackType
 from typing import Any, Self
 
 from mcap.reader import make_reader
-from rosbags.interfaces import Connection, Qos
+from rosbags.interfaces import Qos
 from rosbags.rosbag2 import Reader, ReaderError
 from rosbags.serde import SerdeError
 
 from netpos.bags import layout
+from netpos.bags.chunks import Found, messages_in_order
 from netpos.bags.errors import BagError
 from netpos.bags.scan import summary_is_sound
 from netpos.bags.types import require_type, store_of_definition
@@ -188,27 +188,34 @@ class BagReader:
                     f"{self.path} has no topic {', '.join(absent)}; it holds "
                     f"{', '.join(sorted(self.topics)) or 'none'}"
                 )
-        wanted = self.topics.keys() if topics is None else set(topics)
-        connections = [c for c in self._reader.connections if c.topic in wanted]
-        if connections:
-            yield from self._checked(connections)
-
-    def _checked(self, connections: list[Connection]) -> Iterator[BagEntry]:
-        counts: Counter[str] = Counter()
-        stream = self._reader.messages(connections)
+        names = self.topics.keys() if topics is None else set(topics)
+        wanted = {name: self.topics[name] for name in names}
+        stream = self._by_chunk(names) or self._by_message(names)
+        counts = dict.fromkeys(names, 0)
         while True:
             try:
-                connection, log_time_ns, cdr = next(stream)
+                log_time_ns, _, topic, cdr = next(stream)
             except StopIteration:
                 break
             except Exception as error:  # damaged bytes raise nearly anything
                 raise self._damaged(error) from error
-            counts[connection.topic] += 1
-            yield BagEntry(
-                connection.topic, connection.msgtype, log_time_ns, bytes(cdr), self._decode
-            )
-        for topic in {c.topic for c in connections}:
-            if counts[topic] != self.topics[topic].count:
-                raise self._damaged(
-                    f"{topic}: {counts[topic]} of {self.topics[topic].count} messages found"
-                )
+            counts[topic] += 1
+            yield BagEntry(topic, wanted[topic].type_name, log_time_ns, cdr, self._decode)
+        for topic, info in wanted.items():
+            if counts[topic] != info.count:
+                raise self._damaged(f"{topic}: {counts[topic]} of {info.count} messages found")
+
+    def _by_message(self, wanted: Collection[str]) -> Iterator[Found]:
+        connections = [c for c in self._reader.connections if c.topic in wanted]
+        if connections:  # rosbags takes none for all
+            for connection, log_time_ns, cdr in self._reader.messages(connections):
+                yield log_time_ns, 0, connection.topic, bytes(cdr)
+
+    def _by_chunk(self, wanted: Collection[str]) -> Iterator[Found] | None:
+        """The short way, for a single MCAP file with an index."""
+        storages = getattr(self._reader.storage, "storages", [self._reader.storage])
+        whole = self._reader.storage.metadata.compression_mode != "message"
+        if len(storages) != 1 or not whole or not getattr(storages[0], "chunks", None):
+            return None
+        topics = {c.id: c.topic for c in storages[0].connections if c.topic in wanted}
+        return messages_in_order(storages[0], topics)

@@ -7,6 +7,7 @@ Definitions are the ``.msg`` files of the ROS installation (``AMENT_PREFIX_PATH`
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,28 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 from rosbags.typesys.store import Typestore
 
 from netpos.bags.errors import BagError
+from netpos.messages.cdr import STRING, CdrCodec
 from netpos.messages.codec import Codec
 
 SEPARATOR = "=" * 80
 _OWN_PACKAGE = "netpos_msgs"
+_CODES = {  # of the module struct
+    "bool": "?",
+    "byte": "B",
+    "char": "B",
+    "octet": "B",
+    "int8": "b",
+    "uint8": "B",
+    "int16": "h",
+    "uint16": "H",
+    "int32": "i",
+    "uint32": "I",
+    "int64": "q",
+    "uint64": "Q",
+    "float32": "f",
+    "float64": "d",
+    STRING: STRING,
+}
 
 
 def _message_folders(package: str) -> list[Path]:
@@ -154,6 +173,11 @@ def store_of_definition(type_name: str, text: str) -> Typestore:
     return common
 
 
+def has_common_definition(type_name: str, text: str) -> bool:
+    """Whether a bag's definition (``""``: it has none) is the one the common store holds."""
+    return not text or store_of_definition(type_name, text) is typestore()
+
+
 def type_hash(type_name: str, text: str) -> str:
     """REP-2016 hash of a definition, such as ``RIHS01_5df957...``."""
     return store_of_definition(type_name, text).hash_rihs01(type_name)
@@ -163,3 +187,28 @@ def type_hash(type_name: str, text: str) -> str:
 def codec() -> Codec:
     """Codec that builds and reads rosbags messages. Cached."""
     return Codec(lambda type_name: require_type(type_name).types[type_name])
+
+
+def flat_items(type_name: str) -> Iterator[str]:
+    """Fields of a type without nesting, as ``netpos.messages.cdr.Layout`` takes them.
+
+    Raises
+    ------
+    BagError  no definition is known, or the type has arrays or sequences of messages
+    """
+    fields: Any = require_type(type_name).get_msgdef(type_name).fields
+    for name, (kind, detail) in fields:
+        if kind == Nodetype.NAME:
+            yield from flat_items(detail)
+            continue
+        (inner_kind, inner), count = ((kind, detail), 1) if kind == Nodetype.BASE else detail
+        if inner_kind != Nodetype.BASE or (kind == Nodetype.ARRAY and inner[0] == STRING):
+            raise BagError(f"{type_name}: {name} cannot be laid out; decode the whole message")
+        code = _CODES[inner[0]]
+        yield {Nodetype.BASE: code, Nodetype.ARRAY: f"{count}{code}"}.get(kind, f"{code}[]")
+
+
+@cache
+def cdr_codec() -> CdrCodec:
+    """Codec between values and the bytes of messages. Cached."""
+    return CdrCodec(flat_items)

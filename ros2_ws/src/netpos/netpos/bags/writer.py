@@ -7,11 +7,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 from rosbags.interfaces import Qos
 
 import netpos
 from netpos.bags import layout
+from netpos.bags.chunks import FastWriter
 from netpos.bags.errors import BagError
 from netpos.bags.qos import default_profile
 from netpos.bags.types import check_type_name, definition, require_type, type_hash
@@ -45,8 +46,6 @@ class BagWriter:
         self._run = {str(key): str(value) for key, value in (metadata or {}).items()}
         self._topics: dict[str, layout.Topic] = {}
         self._schemas: dict[tuple[str, str], int] = {}
-        self._start_ns: int | None = None
-        self._end_ns = 0
         try:
             self.path.mkdir(parents=True)
         except FileExistsError:
@@ -55,7 +54,9 @@ class BagWriter:
             ) from None
         file = layout.storage_file(self.path.absolute())
         self._file = file.open("xb")
-        self._mcap = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._mcap = FastWriter(
+            self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
+        )
         self._mcap.start(profile="ros2", library=f"{layout.LIBRARY} {netpos.__version__}")
         if self._run:
             self._mcap.add_metadata(layout.RUN_RECORD, self._run)
@@ -163,15 +164,12 @@ class BagWriter:
             raise BagError(f"{topic}: {len(cdr)} bytes are no serialised message")
         self._mcap.add_message(
             entry.channel_id,
-            log_time=log_time_ns,
-            data=cdr,
-            publish_time=log_time_ns if publish_time_ns is None else publish_time_ns,
-            sequence=entry.count & 0xFFFFFFFF,
+            log_time_ns,
+            cdr,
+            log_time_ns if publish_time_ns is None else publish_time_ns,
+            entry.count & 0xFFFFFFFF,
         )
         entry.count += 1
-        self._end_ns = max(self._end_ns, log_time_ns)
-        if self._start_ns is None or log_time_ns < self._start_ns:
-            self._start_ns = log_time_ns
 
     def flush(self) -> None:
         """Close the chunk in progress and hand everything to the operating system."""
@@ -182,11 +180,11 @@ class BagWriter:
         if self._file.closed:
             return
         name = layout.storage_file(self.path.absolute()).name
-        information = layout.describe(
-            name, self._topics.values(), self._start_ns or 0, self._end_ns, self._run
-        )
         try:
             self._mcap.flush()
+            information = layout.describe(
+                name, self._topics.values(), *self._mcap.time_span(), self._run
+            )
             self._mcap.add_metadata(
                 layout.ROSBAG2_RECORD, {"serialized_metadata": layout.dump(information)}
             )

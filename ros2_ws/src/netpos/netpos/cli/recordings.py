@@ -46,6 +46,18 @@ def uwb_anchors(
     _report(bag, counts)
 
 
+@importers.command("uwb-trolley")
+def uwb_trolley(
+    path: Annotated[Path, typer.Argument(help="Folder with UWB_*.csv and motion_capture_*.csv.")],
+    bag: Bag,
+) -> None:
+    """Ranges of eight UWB anchors to three tags on a trolley."""
+    from netpos.bags.importers.uwb_trolley import import_uwb_trolley  # noqa: PLC0415
+
+    counts = import_uwb_trolley(path, bag)
+    _report(bag, counts)
+
+
 def _imu_command(recording_format: str, what: str) -> None:
     @importers.command(recording_format, help=what)
     def command(path: Annotated[Path, typer.Argument(help="The recording.")], bag: Bag) -> None:

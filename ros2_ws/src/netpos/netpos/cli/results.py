@@ -1,8 +1,9 @@
-"""``netpos evaluate`` and ``netpos report``."""
+"""``netpos evaluate``, ``netpos report`` and ``netpos bench``."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from netpos.evaluation import Evaluation
+    from netpos.evaluation.bench import Result
 
 
 def evaluate(
@@ -95,22 +97,78 @@ def tables(evaluation: Evaluation) -> list[Table]:
 
 
 def bench(
+    only: Annotated[
+        list[str] | None,
+        typer.Option("--only", metavar="NAME", help="Measure this part alone; may be repeated."),
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Few rounds: does it run, not how fast it is.")
+    ] = False,
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write the ratios as JSON.")
     ] = None,
 ) -> None:
     """Measure speed as ratios, side by side in one run."""
     from rich.console import Console  # noqa: PLC0415
-    from rich.table import Table  # noqa: PLC0415
 
-    from netpos.evaluation.bench import as_json  # noqa: PLC0415
+    from netpos.evaluation.bench import as_json, chosen, surroundings  # noqa: PLC0415
     from netpos.evaluation.bench import bench as run_bench  # noqa: PLC0415
 
-    rows = run_bench()
-    table = Table("operation", "ours", "reference", "", "times faster")
-    for row in rows:
-        ours, reference = (f"{1e6 * s:,.1f} µs" for s in (row.ours_s, row.reference_s))
-        table.add_row(row.name, ours, row.reference, reference, f"{row.ratio:.0f}")
-    Console().print(table)
+    console = Console()
+    around = surroundings(quick)
+    results = []
+    with console.status("measuring") as status:
+        parts = chosen(only or [])
+        for name, rows in run_bench(parts, quick):
+            status.update(f"measured {name}")
+            results += rows
+    console.print(bench_table(results))
+    load, cores = around["load_average"][0], around["cores"]
+    remarks = [f"The load average was {load:.1f} on {cores} cores before the first measurement."]
+    for line in (*remarks, *bench_remarks(results)):
+        console.print(line, markup=False, highlight=False)
     if json_file is not None:
-        json_file.write_text(json.dumps(as_json(rows), indent=2) + "\n", encoding="utf-8")
+        write_json(json_file, as_json(results, around))
+
+
+def bench_table(results: Iterable[Result]) -> Table:
+    """The rows that were measured."""
+    from rich.markup import escape  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+
+    from netpos.evaluation.bench import Row  # noqa: PLC0415
+
+    table = Table("what", "ours", "reference", "", "ratio", "target", "")
+    for row in results:
+        if isinstance(row, Row):
+            sign = "≥" if row.relation == ">=" else "≤"
+            table.add_row(
+                escape(row.name),
+                quantity(row.ours, row.unit),
+                escape(row.reference),
+                quantity(row.reference_value, row.unit),
+                f"{row.ratio:.3g}",
+                f"{sign} {row.target:g}",
+                "ok" if row.ok else "MISSED",
+            )
+    return table
+
+
+def bench_remarks(results: Iterable[Result]) -> list[str]:
+    """What the rows do not say: notes, and what was left out."""
+    from netpos.evaluation.bench import LeftOut  # noqa: PLC0415
+
+    return [
+        f"left out: {r.name}: {r.reason}" if isinstance(r, LeftOut) else f"{r.name}: {r.note}"
+        for r in results
+        if isinstance(r, LeftOut) or r.note
+    ]
+
+
+def quantity(value: float, unit: str) -> str:
+    """A figure with its unit; seconds in the prefix that suits them."""
+    if unit == "s":
+        for limit, factor, name in ((1e-3, 1e6, "µs"), (1.0, 1e3, "ms")):
+            if abs(value) < limit:
+                return f"{value * factor:.3g} {name}"
+    return f"{value:.4g} {unit}".rstrip()

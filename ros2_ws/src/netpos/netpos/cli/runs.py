@@ -76,12 +76,29 @@ def replay(
             "--set", metavar="KEY=VALUE", help="Parameter of the tracker; may be repeated."
         ),
     ] = None,
+    smooth: Annotated[
+        bool,
+        typer.Option("--smooth", help="Add the odometry of every epoch given all measurements."),
+    ] = False,
 ) -> None:
     """Estimate again from the recorded measurements, without ROS."""
     overrides = dict(parse_setting(text) for text in settings or [])
     refuse_existing(out)
-    _track(bag, out, overrides)
+    _track(bag, out, overrides, smooth=smooth)
+    if smooth:
+        _tell_gain(out)
     typer.echo(f"wrote {out}")
+
+
+def _tell_gain(bag: Path) -> None:
+    """What smoothing gained over the filter, where the recording has ground truth."""
+    from netpos.evaluation.smoothing import smoothing_gains  # noqa: PLC0415
+
+    for vue, gain in smoothing_gains(bag).items():
+        typer.echo(
+            f"{vue}: position RMSE {gain.filter_rmse_m:.3f} m filtered, {gain.smoothed_rmse_m:.3f}"
+            f" m smoothed over {gain.n} epochs: {gain.ratio:.2f} times better"
+        )
 
 
 def parse_setting(text: str) -> tuple[str, object]:
@@ -110,7 +127,7 @@ def refuse_existing(path: Path) -> None:
         )
 
 
-def _track(bag: Path, out: Path, overrides: Mapping[str, object]) -> None:
+def _track(bag: Path, out: Path, overrides: Mapping[str, object], *, smooth: bool = False) -> None:
     from rich.console import Console  # noqa: PLC0415
 
     from netpos.tracking.replay import replay_bag  # noqa: PLC0415
@@ -121,7 +138,7 @@ def _track(bag: Path, out: Path, overrides: Mapping[str, object]) -> None:
             if done % 500 == 0:
                 status.update(f"tracking: {done} messages")
 
-        summary = replay_bag(bag, out, overrides, show)
+        summary = replay_bag(bag, out, overrides, show, smooth=smooth)
     typer.echo(f"{summary.epochs} epochs")
     for vue, counts in sorted(summary.rejected.items()):
         reasons = ", ".join(f"{reason} {n}" for reason, n in sorted(counts.items()) if n)

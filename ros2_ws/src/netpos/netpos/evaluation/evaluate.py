@@ -4,24 +4,29 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from netpos.bags import BagReader, codec
 from netpos.evaluation.metrics import SKIP_EPOCHS, Run, Scored, score
 from netpos.evaluation.pairing import Trajectory
+from netpos.evaluation.recorded_bound import recorded_bound_m
 from netpos.evaluation.requirements import Verdict, judge
 from netpos.evaluation.scene import buildings_of
 from netpos.messages import topics
 from netpos.messages.values import (
     Array,
     ClockState,
+    InitialPose,
     Odometry,
     RsuInfo,
     RsuMeasurement,
     TrackStatus,
 )
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.settings import bag_settings
 
 _Sink = tuple[str, Callable[[Any], Any], Callable[[Any], None]]
 
@@ -127,6 +132,8 @@ class _Recording:
     clock: dict[str, list[ClockState]] = field(default_factory=lambda: defaultdict(list))
     clock_truth: dict[str, list[ClockState]] = field(default_factory=lambda: defaultdict(list))
     rsus: dict[str, RsuInfo] = field(default_factory=dict)
+    measured: dict[str, list[RsuMeasurement]] = field(default_factory=lambda: defaultdict(list))
+    poses: dict[str, list[InitialPose]] = field(default_factory=lambda: defaultdict(list))
     delivery: dict[str, _DeliveryCounter] = field(
         default_factory=lambda: defaultdict(_DeliveryCounter)
     )
@@ -174,6 +181,7 @@ def _sinks(recording: _Recording, vues: list[str]) -> dict[str, _Sink]:
 
     def add_measurement(measurement: RsuMeasurement) -> None:
         recording.delivery[measurement.vue_id].add(measurement)
+        recording.measured[measurement.vue_id].append(measurement)
 
     sinks: dict[str, _Sink] = {
         topics.RSU_INFO: ("netpos_msgs/msg/RsuInfo", convert.rsu_info_from_msg, add_rsu),
@@ -191,6 +199,11 @@ def _sinks(recording: _Recording, vues: list[str]) -> dict[str, _Sink]:
             topics.ODOMETRY: (odometry, convert.odometry_from_msg, estimate.append),
             topics.CLOCK_STATE: (clock, convert.clock_state_from_msg, clocks.append),
             topics.GROUND_TRUTH_CLOCK: (clock, convert.clock_state_from_msg, true_clocks.append),
+            topics.INITIAL_POSE: (
+                "geometry_msgs/msg/PoseWithCovarianceStamped",
+                partial(convert.initial_pose_from_msg, vue_id=vue),
+                recording.poses[vue].append,
+            ),
             topics.TRACK_STATUS: (
                 status,
                 convert.track_status_from_msg,
@@ -215,6 +228,34 @@ def _read(bag: BagReader, vues: list[str]) -> _Recording:
     return recording
 
 
+def _config_of(bag: BagReader) -> TrackerConfig | None:
+    """Parameters of the tracker, None where the scenario the bag names is not to be found."""
+    try:
+        return TrackerConfig.from_mapping(bag_settings(bag.metadata).parameters)
+    except ValueError:
+        return None
+
+
+def _with_bound(
+    scored: Scored, recording: _Recording, vue: str, config: TrackerConfig | None
+) -> Scored:
+    """The figures with the error over its bound, of a run that starts from one pose or none."""
+    poses, rmse = recording.poses[vue], scored.figures.rmse_m
+    if config is None or len(poses) > 1 or rmse is None:
+        return scored
+    bound = recorded_bound_m(
+        recording.measured[vue],
+        recording.rsus,
+        poses[0] if poses else None,
+        Trajectory.of(recording.truth[vue]),
+        config,
+        scored.counted.estimate.stamp_ns,
+    )
+    if not bound:
+        return scored
+    return replace(scored, figures=replace(scored.figures, bound_ratio=rmse / bound))
+
+
 def evaluate_bag(path: Path, *, skip: int = SKIP_EPOCHS, vue: str | None = None) -> Evaluation:
     """Score every device of a bag that has ground truth, or only ``vue``.
 
@@ -229,12 +270,13 @@ def evaluate_bag(path: Path, *, skip: int = SKIP_EPOCHS, vue: str | None = None)
         recording = _read(bag, names)
         counts = {topic: (info.type_name, info.count) for topic, info in bag.topics.items()}
         buildings = buildings_of(bag.metadata)
+        config = _config_of(bag)
     vues = {}
     for name in names:
         run = recording.run(name)
         if not len(run.truth):
             raise ValueError(f"{path}: no message on /{name}/ground_truth has finite values")
-        scored = score(run, skip=skip)
+        scored = _with_bound(score(run, skip=skip), recording, name, config)
         _, beacons = counts.get(topics.of_vue(name, topics.BEACON), ("", None))
         vues[name] = VueEvaluation(
             run=run,

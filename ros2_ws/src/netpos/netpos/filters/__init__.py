@@ -7,5 +7,12 @@ Delta, delta).
 
 ``motion``       f, F and Q of the process models
 ``measurement``  one scalar row per measured quantity: h, H and which components are angles
-``ekf``          prediction, gating and the extended Kalman update
+``ekf``          extended and iterated extended Kalman filter: predict, gate, update
+``fusion``, ``iteration``  rows into the estimate; again where the model bends (``fit``)
+``ukf``, ``srukf``  unscented filters on ``sigma`` points, the second on the square root of P
+``kf``           linear filter with an optional floor under its gain
+``imm``          interacting multiple models
+``gate``         acceptance by group; ``conditioning``, ``robust``: what fits badly counts less
+``smooth``       Rauch-Tung-Striebel smoothing
+``filterpy_backend``  the reference
 """

@@ -1,207 +1,322 @@
-"""Extended Kalman filter: prediction, gating by group, update by decorrelated scalar rows."""
+"""Extended and iterated extended Kalman filter: prediction, gating by group, update. Everything
+works in place."""
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
+import math
 
+import numpy as np
+
+from netpos.filters.compile import kernel, leaf
+from netpos.filters.fit import misfit
+from netpos.filters.fusion import (
+    W_COV,
+    W_GATE_VARIANCE,
+    W_INNOVATION,
+    W_PRIOR,
+    W_USE,
+    W_VARIANCE,
+    fuse,
+    fuse_by_factor,
+    group_nis,
+    is_definite,
+    workspace,
+)
+from netpos.filters.iteration import (
+    bends,
+    is_wide,
+    iterate,
+    iterate_from,
+    iterate_used,
+    refine_used,
+)
 from netpos.filters.measurement import (
     GATE_VARIANCE,
     GROUP,
     VARIANCE,
     curvature_variance,
-    linearise,
+    innovation_row,
 )
+from netpos.filters.motion import Model, Parameter, add_noise, propagate, transition
 from netpos.messages.values import Array
 
-
-@njit(cache=True)
-def predict(mean: Array, cov: Array, F: Array, Q: Array) -> tuple[Array, Array]:
-    """Prior mean (n,) and covariance (n, n): fokin2020:eq.21, 22. The covariance comes back
-    symmetric."""
-    prior = F @ cov @ F.T + Q
-    return F @ mean, (prior + prior.T) / 2.0
-
-
-@njit(cache=True)
-def group_nis(cov: Array, innovation: Array, H: Array, variance: Array) -> float:
-    """Squared Mahalanobis distance of one group's innovation (m,), with S = H cov H' +
-    diag(variance)."""
-    S = H @ cov @ H.T
-    for i in range(innovation.size):
-        S[i, i] += variance[i]
-    return float(innovation @ np.linalg.solve(S, innovation))
+__all__ = [
+    "fuse",
+    "gate",
+    "group_nis",
+    "iterate",
+    "iterate_from",
+    "predict",
+    "update",
+    "workspace",
+]
 
 
-@njit(cache=True)
-def fuse(
-    mean: Array, cov: Array, innovation: Array, H: Array, variance: Array
-) -> tuple[Array, Array]:
-    """Fuse m scalar rows, all linearised at ``mean``: fokin2020:eq.23-25 with diagonal R, row by
-    row in Joseph form.
+@leaf
+def predict(mean: Array, cov: Array, dt: float, motion: Array, bias: Array) -> None:
+    """Move mean (n,) and covariance (n, n) by ``dt`` seconds: fokin2020:eq.21, 22. Nothing
+    happens for dt <= 0.
 
-    mean (n,), cov (n, n), innovation (m,), H (m, n), variance (m,) > 0. The same posterior as one
-    update with the full S.
+    motion : (Parameter,); bias : (2, k) stationary sd and time constant of each bias state
     """
-    n = mean.size
-    P = cov.copy()
-    step = np.zeros(n)
-    Ph = np.empty(n)
-    K = np.empty(n)
-    for i in range(innovation.size):
-        h = H[i]
-        r = variance[i]
-        s = r
-        residual = innovation[i]
+    if dt <= 0.0:
+        return
+    if int(motion[Parameter.MODEL]) == Model.CONSTANT_VELOCITY and motion[Parameter.EXTRAS] == 0.0:
+        _predict_constant_velocity(cov, dt, motion, bias)
+    else:
+        _predict_dense(mean, cov, dt, motion, bias)
+    propagate(mean, dt, motion, bias)
+    add_noise(mean, dt, motion, bias, cov)
+    for i in range(mean.size):
+        for j in range(i):
+            cov[i, j] = cov[j, i] = (cov[i, j] + cov[j, i]) / 2.0
+
+
+@kernel
+def _predict_dense(mean: Array, cov: Array, dt: float, motion: Array, bias: Array) -> None:
+    F = np.empty_like(cov)
+    transition(mean, dt, motion, bias, F)
+    cov[:] = F @ cov @ F.T
+
+
+@leaf
+def _predict_constant_velocity(cov: Array, dt: float, motion: Array, bias: Array) -> None:
+    """F P F' by the few row and column operations F stands for."""
+    n = cov.shape[0]
+    for p, v in ((0, 2), (1, 3), (4, 5)):
+        for j in range(n):
+            cov[p, j] += dt * cov[v, j]
+        for i in range(n):
+            cov[i, p] += dt * cov[i, v]
+    for b in range(bias.shape[1]):
+        decay = math.exp(-dt / bias[1, b])
+        k = 6 + b
+        for j in range(n):
+            cov[k, j] *= decay
+        for i in range(n):
+            cov[i, k] *= decay
+
+
+@leaf
+def _small_nis(start: int, stop: int, work: Array, n: int, m: int) -> float:
+    """``group_nis`` of one or two rows of the workspace, where P H' is known."""
+    first, second, ph = W_COV + n + start, W_COV + n + start + 1, m
+    r0, r1 = work[W_INNOVATION, start], 0.0
+    s00, s01, s11 = work[W_GATE_VARIANCE, start], 0.0, 1.0
+    for a in range(n):
+        s00 += work[first, a] * work[first + ph, a]
+    if stop - start == 2:
+        r1, s11 = work[W_INNOVATION, start + 1], work[W_GATE_VARIANCE, start + 1]
         for a in range(n):
-            total = 0.0
-            for b in range(n):
-                total += P[a, b] * h[b]
-            Ph[a] = total
-            s += h[a] * total
-            residual -= h[a] * step[a]
-        hPh = s - r
-        for a in range(n):
-            K[a] = Ph[a] / s
-            step[a] += K[a] * residual
-        for a in range(n):
-            left_h = Ph[a] - K[a] * hPh  # (I - K h) P h
-            for b in range(a, n):
-                value = P[a, b] - K[a] * Ph[b] - left_h * K[b] + r * K[a] * K[b]
-                P[a, b] = value
-                P[b, a] = value
-    return mean + step, P
+            s01 += work[first, a] * work[second + ph, a]
+            s11 += work[second, a] * work[second + ph, a]
+    rest = r1 - s01 / s00 * r0
+    return float(r0 * r0 / s00 + rest * rest / (s11 - s01 * s01 / s00))
 
 
-@njit(cache=True)
-def distance2(cov: Array, d: Array) -> float:
-    """Squared Mahalanobis distance of ``d`` (n,) by elimination.
-
-    What is known exactly (a pivot of no more than rounding) is left out, so that ``cov`` (n, n)
-    may be singular.
-    """
-    A, y = cov.copy(), d.copy()
-    total = 0.0
-    for j in range(d.size):
-        pivot = A[j, j]
-        if pivot <= 1e-14 * cov[j, j]:
-            continue
-        total += y[j] * y[j] / pivot
-        for i in range(j + 1, d.size):
-            factor = A[i, j] / pivot
-            y[i] -= factor * y[j]
-            for k in range(j + 1, d.size):
-                A[i, k] -= factor * A[j, k]
-    return total
+@kernel
+def _large_nis(cov: Array, start: int, stop: int, work: Array, m: int) -> float:
+    """``group_nis`` of rows of the workspace."""
+    n = cov.shape[0]
+    H = work[W_COV + n + start : W_COV + n + stop, :n].copy()
+    innovation, variance = work[W_INNOVATION, start:stop], work[W_GATE_VARIANCE, start:stop]
+    return float(group_nis(cov, innovation, H, variance))
 
 
-@njit(cache=True)
-def misfit(
-    mean: Array, cov: Array, rows: Array, variance: Array, height_m: float, x: Array
-) -> float:
-    """Twice the negative log posterior of ``x`` (n,) but for a constant: prior and measurement
-    terms.
-
-    At the most probable ``x`` of a linear model this is the NIS, chi-square with one degree of
-    freedom
-    per row; unlike the NIS it stays so where the model bends over the width of the prior.
-    """
-    innovation, _ = linearise(rows, x, height_m)
-    return float(distance2(cov, x - mean) + (innovation * innovation / variance).sum())
-
-
-@njit(cache=True)
-def iterate(
-    mean: Array, cov: Array, rows: Array, variance: Array, height_m: float, iterations: int
-) -> tuple[Array, Array]:
-    """Posterior of ``rows`` (m, ROW_WIDTH) with ``variance`` (m,); each iteration linearises at
-    the last result.
-
-    One iteration is the extended Kalman filter; more are Gauss-Newton steps to the most probable
-    state (Bell and Cathey 1993), halved while they overshoot, ended when they move less than 1 %
-    of the sd or no longer downhill: the result is never less probable than the prior mean.
-    """
-    innovation, H = linearise(rows, mean, height_m)
-    x, P = fuse(mean, cov, innovation, H, variance)
-    if iterations <= 1:
-        return x, P
-    last, last_cost = mean, (innovation * innovation / variance).sum()
-    for remaining in range(iterations - 1, -1, -1):
-        cost = misfit(mean, cov, rows, variance, height_m, x)
-        halvings = 0
-        while cost > last_cost and halvings < 6:
-            x = (x + last) / 2.0
-            cost = misfit(mean, cov, rows, variance, height_m, x)
-            halvings += 1
-        if cost > last_cost:
-            return last, P
-        small = (np.abs(x - last) < 0.01 * np.sqrt(np.diag(P))).all()
-        if remaining == 0 or (halvings == 0 and small):
-            break
-        last, last_cost = x, cost
-        innovation, H = linearise(rows, x, height_m)
-        x, P = fuse(mean, cov, innovation + H @ (x - mean), H, variance)
-    return x, P
-
-
-@njit(cache=True)
-def passes(
-    mean: Array, cov: Array, rows: Array, height_m: float, threshold: float, iterations: int
+@leaf
+def _passes(
+    mean: Array,
+    cov: Array,
+    rows: Array,
+    start: int,
+    stop: int,
+    height_m: float,
+    threshold: float,
+    iterations: int,
+    work: Array,
 ) -> bool:
     """Whether one group lies within ``threshold`` of squared Mahalanobis distance of the
     prediction.
 
     Where the linear distance says no and iterating is allowed, the misfit of the group's most
-    probable
-    state decides.
+    probable state decides.
     """
-    innovation, H = linearise(rows, mean, height_m)
-    variance = rows[:, GATE_VARIANCE]
-    if group_nis(cov, innovation, H, variance) <= threshold:
+    if stop - start <= 2:
+        nis = _small_nis(start, stop, work, mean.size, rows.shape[0])
+    else:
+        nis = _large_nis(cov, start, stop, work, rows.shape[0])
+    if nis <= threshold:
         return True
     if iterations <= 1:
         return False
-    x, _ = iterate(mean, cov, rows, variance, height_m, iterations)
-    return bool(misfit(mean, cov, rows, variance, height_m, x) <= threshold)
+    return bool(
+        _least_misfit(mean, cov, rows, start, stop, height_m, iterations, work) <= threshold
+    )
 
 
-@njit(cache=True)
+@kernel
+def _least_misfit(
+    mean: Array,
+    cov: Array,
+    rows: Array,
+    start: int,
+    stop: int,
+    height_m: float,
+    iterations: int,
+    work: Array,
+) -> float:
+    """``misfit`` of the most probable state of one group."""
+    group, variance = rows[start:stop], work[W_GATE_VARIANCE, start:stop].copy()
+    x, _ = iterate(mean, cov, group, variance, height_m, iterations, work)
+    return float(misfit(mean, cov, group, variance, height_m, x))
+
+
+@leaf
+def gate(
+    mean: Array,
+    cov: Array,
+    rows: Array,
+    height_m: float,
+    gate_nis: Array,
+    iterations: int,
+    accepted: Array,
+    work: Array,
+) -> int:
+    """Linearise ``rows`` at the prior into the workspace and accept or reject each group as a
+    whole; returns the number of rows to fuse."""
+    n, m = mean.size, rows.shape[0]
+    is_open = math.isinf(gate_nis[gate_nis.size - 1])
+    for i in range(m):
+        h, ph = work[W_COV + n + i], work[W_COV + n + m + i]
+        extra = curvature_variance(rows[i], mean, cov, height_m)
+        work[W_VARIANCE, i] = rows[i, VARIANCE] + extra
+        work[W_GATE_VARIANCE, i] = rows[i, GATE_VARIANCE] + extra
+        work[W_INNOVATION, i] = innovation_row(rows[i], mean, height_m, h)
+        if not is_open:
+            for a in range(n):
+                total = 0.0
+                for b in range(n):
+                    total += cov[a, b] * h[b]
+                ph[a] = total
+    used, start = 0, 0
+    while start < m:
+        group = int(rows[start, GROUP])
+        stop = start + 1
+        while stop < m and int(rows[stop, GROUP]) == group:
+            stop += 1
+        threshold = gate_nis[min(stop - start, gate_nis.size - 1)]
+        taken = is_open or _passes(
+            mean, cov, rows, start, stop, height_m, threshold, iterations, work
+        )
+        accepted[group] = 1.0 if taken else 0.0
+        for i in range(start, stop):
+            work[W_USE, i] = accepted[group]
+        used += stop - start if taken else 0
+        start = stop
+    return used
+
+
+@leaf
 def update(
-    mean: Array, cov: Array, rows: Array, height_m: float, gate_nis: Array, iterations: int
-) -> tuple[Array, Array, Array, float, int]:
-    """One epoch: gate each group as a whole, fuse what passed.
+    mean: Array,
+    cov: Array,
+    rows: Array,
+    height_m: float,
+    gate_nis: Array,
+    iterations: int,
+    accepted: Array,
+    work: Array,
+) -> tuple[float, int]:
+    """One epoch, in place: gate each group as a whole, fuse what passed. Where three or more pass
+    one by one but not together, one without which the others agree is left out.
 
     rows : (m, ROW_WIDTH), rows of a group adjacent, groups numbered 0, 1, ... in order
     gate_nis : (d + 1,) largest accepted squared Mahalanobis distance for d degrees of freedom
-        (inf: no gate)
+        (last entry inf: no gate)
     iterations : linearisations at most; 1 is the extended Kalman filter
+    accepted : (groups,), filled with 0 or 1
+    work : of ``workspace``
 
-    Returns mean, cov, accepted (groups,) as 0/1, NIS of the accepted rows together, their number.
+    Returns the NIS of the accepted rows together and their number.
     """
-    rows = rows.copy()
-    m = rows.shape[0]
-    for i in range(m):
-        extra = curvature_variance(rows[i], mean, cov, height_m)
-        rows[i, VARIANCE] += extra
-        rows[i, GATE_VARIANCE] += extra
-    groups = int(rows[m - 1, GROUP]) + 1
-    accepted = np.zeros(groups)
-    keep = np.zeros(m, dtype=np.bool_)
-    start = 0
-    for g in range(groups):
-        stop = start
-        while stop < m and int(rows[stop, GROUP]) == g:
-            stop += 1
-        threshold = gate_nis[min(stop - start, gate_nis.size - 1)]
-        if passes(mean, cov, rows[start:stop], height_m, threshold, iterations):
-            accepted[g] = 1.0
-            keep[start:stop] = True
-        start = stop
-    used = int(keep.sum())
+    used = gate(mean, cov, rows, height_m, gate_nis, iterations, accepted, work)
     if used == 0:
-        return mean, cov, accepted, 0.0, 0
-    kept = rows[keep]
-    innovation, H = linearise(kept, mean, height_m)
-    nis = group_nis(cov, innovation, H, kept[:, GATE_VARIANCE])
-    new_mean, new_cov = iterate(mean, cov, kept, kept[:, VARIANCE], height_m, iterations)
-    return new_mean, new_cov, accepted, nis, used
+        return 0.0, 0
+    nis = _fuse_used(mean, cov, rows, work)
+    if used < gate_nis.size and nis > gate_nis[used]:
+        dropped = _odd_one_out(rows, mean.size, gate_nis, accepted, work)
+        if dropped > 0:
+            used -= dropped
+            for a in range(mean.size):
+                mean[a] = work[W_PRIOR, a]
+                for b in range(mean.size):
+                    cov[a, b] = work[W_COV + a, b]
+            nis = _fuse_used(mean, cov, rows, work)
+    if iterations > 1:
+        if bends(rows, mean, height_m, work):
+            iterate_used(mean, cov, rows, height_m, iterations, work)
+        if is_wide(rows, work):
+            refine_used(mean, cov, rows, height_m, work)
+    return nis, used
+
+
+@leaf
+def _fuse_used(mean: Array, cov: Array, rows: Array, work: Array) -> float:
+    """Fuse the rows used; their joint NIS."""
+    n, m = mean.size, rows.shape[0]
+    coloured = False
+    for i in range(m):
+        coloured |= work[W_USE, i] == 1.0 and work[W_VARIANCE, i] != work[W_GATE_VARIANCE, i]
+    nis = _coloured_nis(cov, m, work) if coloured else 0.0
+    for a in range(n):
+        work[W_PRIOR, a] = mean[a]
+        for b in range(n):
+            work[W_COV + a, b] = cov[a, b]
+    H = work[W_COV + n : W_COV + n + m]
+    distance = fuse(mean, cov, work[W_INNOVATION], H, work[W_VARIANCE], work[W_USE], work)
+    if not coloured:
+        nis = distance
+    if not is_definite(cov, work):
+        fuse_by_factor(mean, cov, rows.shape[0], work)
+    return nis
+
+
+@kernel
+def _odd_one_out(rows: Array, n: int, gate_nis: Array, accepted: Array, work: Array) -> int:
+    """Take the group out without which the others agree, where three or more pass one by one but
+    contradict each other; the number of its rows, 0 where there is none."""
+    m = rows.shape[0]
+    cov = work[W_COV : W_COV + n, :n].copy()
+    groups = 0
+    for g in range(int(rows[m - 1, GROUP]) + 1):
+        groups += int(accepted[g])
+    if groups < 3:
+        return 0
+    odd, least, odd_rows = -1, np.inf, 0
+    for g in range(int(rows[m - 1, GROUP]) + 1):
+        if accepted[g] == 0.0:
+            continue
+        keep = (work[W_USE, :m] == 1.0) & (rows[:, GROUP] != g)
+        H = work[W_COV + n : W_COV + n + m, :n][keep]
+        innovation, variance = work[W_INNOVATION, :m][keep], work[W_GATE_VARIANCE, :m][keep]
+        nis = group_nis(cov, innovation, H, variance)
+        if nis < least and nis <= gate_nis[innovation.size]:
+            odd, least = g, nis
+    if odd < 0:
+        return 0
+    accepted[odd] = 0.0
+    for i in range(m):
+        if int(rows[i, GROUP]) == odd:
+            work[W_USE, i] = 0.0
+            odd_rows += 1
+    return odd_rows
+
+
+@kernel
+def _coloured_nis(cov: Array, m: int, work: Array) -> float:
+    """NIS of the rows used where their gate variances differ from those of the update."""
+    n = cov.shape[0]
+    keep = work[W_USE, :m] == 1.0
+    H = work[W_COV + n : W_COV + n + m, :n][keep]
+    innovation, variance = work[W_INNOVATION, :m][keep], work[W_GATE_VARIANCE, :m][keep]
+    return float(group_nis(cov, innovation, H, variance))

@@ -7,7 +7,9 @@ array a compiled kernel can take:
     successive errors are correlated),
     BIAS, COMMON (state indices of the biases in it, or -1), GROUP (rows of one group are accepted
     or rejected together),
-    ORIGIN 3 (RSU position, m), AXES 9 (rotation map -> RSU axes, row-major)
+    ORIGIN 3 (RSU position, m), AXES 9 (rotation map -> RSU axes, row-major),
+    HEADING (state index of the device's heading, or -1), LEVER 3 (of the antenna in the device, m;
+    forward and left count only where there is a heading)
 
 For ``LINEAR`` rows the first six entries of ORIGIN and AXES hold H of the six core states.
 With d = p - origin and u = axes d:
@@ -29,9 +31,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numba import njit
-from scipy.spatial.transform import Rotation
 
+from netpos.filters.compile import kernel, leaf
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 
@@ -60,75 +61,103 @@ KIND, VALUE, VARIANCE, GATE_VARIANCE, BIAS, COMMON, GROUP, ORIGIN, AXES = (
     7,
     10,
 )
-ROW_WIDTH = 19
+HEADING, LEVER = 19, 20
+# Plain integers: arithmetic of flags costs ten times as much.
+_AZIMUTH, _ELEVATION, _TOA = int(Field.AZIMUTH), int(Field.ELEVATION), int(Field.TOA)
+_RANGE, _POSITION = int(Field.RANGE), int(Field.POSITION)
+ROW_WIDTH = 23
 
 
-@njit(cache=True)
+@leaf
 def wrap(angle: float) -> float:
     """Angle wrapped to [-pi, pi); constant time for any finite input."""
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+    if -math.pi <= angle < math.pi:
+        return angle
+    wrapped = (angle + math.pi) % (2.0 * math.pi) - math.pi
+    return -math.pi if wrapped >= math.pi else wrapped
 
 
-@njit(cache=True)
-def _direction_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
-    """Angles and direction cosines in the RSU's axes."""
-    A = row[AXES:].reshape(3, 3)
-    d = np.array([mean[0] - row[ORIGIN], mean[1] - row[ORIGIN + 1], height_m - row[ORIGIN + 2]])
-    u = A @ d
-    rho2 = max(u[0] * u[0] + u[1] * u[1], 1e-12)
-    r2 = rho2 + u[2] * u[2]
+@leaf
+def is_angle(row: Array) -> bool:
+    """Whether differences of the row's quantity are wrapped."""
+    return int(row[KIND]) <= Kind.ELEVATION
+
+
+@leaf
+def _direction(row: Array, dx: float, dy: float, dz: float, h: Array) -> float:
+    """Angle or direction cosine of the offset d in the RSU's axes; its gradient to h[:2]."""
+    a = AXES
+    ux = row[a] * dx + row[a + 1] * dy + row[a + 2] * dz
+    uy = row[a + 3] * dx + row[a + 4] * dy + row[a + 5] * dz
+    uz = row[a + 6] * dx + row[a + 7] * dy + row[a + 8] * dz
+    rho2 = max(ux * ux + uy * uy, 1e-12)
+    r2 = rho2 + uz * uz
     kind = int(row[KIND])
     if kind == Kind.AZIMUTH:
-        gradient = np.array([-u[1], u[0], 0.0]) / rho2
-        value = math.atan2(u[1], u[0])
+        gx, gy, gz = -uy / rho2, ux / rho2, 0.0
+        value = math.atan2(uy, ux)
     elif kind == Kind.ELEVATION:
         rho = math.sqrt(rho2)
-        gradient = np.array([-u[0] * u[2] / rho, -u[1] * u[2] / rho, rho]) / r2
-        value = math.atan2(u[2], rho)
+        gx, gy, gz = -ux * uz / (rho * r2), -uy * uz / (rho * r2), rho / r2
+        value = math.atan2(uz, rho)
     else:
-        axis = 1 if kind == Kind.COSINE_Y else 2
         r = math.sqrt(r2)
-        value = u[axis] / r
-        gradient = -value * u / r2
-        gradient[axis] += 1.0 / r
+        value = (uy if kind == Kind.COSINE_Y else uz) / r
+        gx, gy, gz = -value * ux / r2, -value * uy / r2, -value * uz / r2
+        if kind == Kind.COSINE_Y:
+            gy += 1.0 / r
+        else:
+            gz += 1.0 / r
     for i in range(2):
-        h[i] = gradient[0] * A[0, i] + gradient[1] * A[1, i] + gradient[2] * A[2, i]
+        h[i] = gx * row[a + i] + gy * row[a + 3 + i] + gz * row[a + 6 + i]
     return value
 
 
-@njit(cache=True)
-def _range_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
-    dx = mean[0] - row[ORIGIN]
-    dy = mean[1] - row[ORIGIN + 1]
-    dz = height_m - row[ORIGIN + 2]
-    d = max(math.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
-    h[0] = dx / d
-    h[1] = dy / d
-    if int(row[KIND]) == Kind.TOA:
-        h[4] = 1.0
-        return d + float(mean[4])
-    return d
+@leaf
+def _from_rsu(row: Array, mean: Array, height_m: float, h: Array) -> float:
+    """Quantities of the offset between the RSU and the device's antenna."""
+    x, y = mean[0], mean[1]
+    heading = int(row[HEADING])
+    lx = ly = 0.0
+    if heading >= 0:
+        c, s = math.cos(mean[heading]), math.sin(mean[heading])
+        lx, ly = c * row[LEVER] - s * row[LEVER + 1], s * row[LEVER] + c * row[LEVER + 1]
+    dx = x + lx - row[ORIGIN]
+    dy = y + ly - row[ORIGIN + 1]
+    dz = height_m + row[LEVER + 2] - row[ORIGIN + 2]
+    kind = int(row[KIND])
+    if kind == Kind.TOA or kind == Kind.RANGE:
+        value = max(math.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
+        h[0] = dx / value
+        h[1] = dy / value
+        if kind == Kind.TOA:
+            h[4] = 1.0
+            value += mean[4]
+    else:
+        value = _direction(row, dx, dy, dz, h)
+    if heading >= 0:
+        h[heading] = h[1] * lx - h[0] * ly
+    return float(value)
 
 
-@njit(cache=True)
+@leaf
 def predict_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
     """Predicted value of one row at ``mean`` (n,); fills its Jacobian ``h`` (n,). ``height_m``:
     device height in map."""
-    h[:] = 0.0
+    for i in range(mean.size):
+        h[i] = 0.0
     kind = int(row[KIND])
     value = 0.0
-    if kind == Kind.TOA or kind == Kind.RANGE:
-        value = _range_row(row, mean, height_m, h)
-    elif kind == Kind.LINEAR:
+    if kind == Kind.LINEAR:
         for i in range(6):
             h[i] = row[ORIGIN + i]
             value += h[i] * mean[i]
     elif kind == Kind.SPEED:
-        value = math.hypot(mean[2], mean[3])
+        value = math.sqrt(mean[2] * mean[2] + mean[3] * mean[3])
         h[2] = mean[2] / max(value, 1e-6)
         h[3] = mean[3] / max(value, 1e-6)
     else:
-        value = _direction_row(row, mean, height_m, h)
+        value = _from_rsu(row, mean, height_m, h)
     for column in (BIAS, COMMON):
         index = int(row[column])
         if index >= 0:
@@ -137,7 +166,14 @@ def predict_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
     return value
 
 
-@njit(cache=True)
+@leaf
+def innovation_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
+    """Measured minus predicted value of one row, wrapped where it is an angle; fills ``h``."""
+    innovation = row[VALUE] - predict_row(row, mean, height_m, h)
+    return wrap(innovation) if is_angle(row) else float(innovation)
+
+
+@leaf
 def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> float:
     """Variance of what linearising ``row`` at ``mean`` (n,) leaves out, for a prior ``cov`` (n,
     n).
@@ -147,14 +183,14 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
     that may be anywhere around an RSU from being placed on top of it.
     """
     kind = int(row[KIND])
-    if kind in (Kind.LINEAR, Kind.SPEED):
+    if kind == Kind.LINEAR or kind == Kind.SPEED:
         return 0.0
     dx = mean[0] - row[ORIGIN]
     dy = mean[1] - row[ORIGIN + 1]
-    dz = height_m - row[ORIGIN + 2]
+    dz = height_m + row[LEVER + 2] - row[ORIGIN + 2]
     rho2 = dx * dx + dy * dy
     r2 = max(rho2 + dz * dz, 1e-6)
-    if kind in (Kind.TOA, Kind.RANGE):
+    if kind == Kind.TOA or kind == Kind.RANGE:
         across = dy * dy * cov[0, 0] - 2.0 * dx * dy * cov[0, 1] + dx * dx * cov[1, 1]
         return float(0.5 * (across / max(rho2, 1e-6)) ** 2 / r2)
     square = cov[0, 0] ** 2 + 2.0 * cov[0, 1] ** 2 + cov[1, 1] ** 2
@@ -162,7 +198,7 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
     return float(0.5 * square / (d2 * d2))
 
 
-@njit(cache=True)
+@kernel
 def linearise(rows: Array, mean: Array, height_m: float) -> tuple[Array, Array]:
     """Innovations (m,) and Jacobian H (m, n) of ``rows`` (m, ROW_WIDTH) at ``mean``; angle
     innovations are wrapped."""
@@ -170,16 +206,26 @@ def linearise(rows: Array, mean: Array, height_m: float) -> tuple[Array, Array]:
     innovation = np.empty(m)
     H = np.empty((m, mean.size))
     for i in range(m):
-        innovation[i] = rows[i, VALUE] - predict_row(rows[i], mean, height_m, H[i])
-        if int(rows[i, KIND]) <= Kind.ELEVATION:
-            innovation[i] = wrap(innovation[i])
+        innovation[i] = innovation_row(rows[i], mean, height_m, H[i])
     return innovation, H
 
 
 def rsu_axes(info: RsuInfo) -> Array:
     """Rotation map -> RSU axes, row-major (9,), of the RSU's pose."""
-    axes: Array = Rotation.from_quat(info.quaternion).as_matrix().T.reshape(-1)
-    return axes
+    x, y, z, w = (info.quaternion / np.linalg.norm(info.quaternion)).tolist()
+    return np.array(  # by hand: SciPy's Rotation would cost every tracker 24 MB and 0.2 s
+        [
+            1.0 - 2.0 * (y * y + z * z),
+            2.0 * (x * y + z * w),
+            2.0 * (x * z - y * w),
+            2.0 * (x * y - z * w),
+            1.0 - 2.0 * (x * x + z * z),
+            2.0 * (y * z + x * w),
+            2.0 * (x * z + y * w),
+            2.0 * (y * z - x * w),
+            1.0 - 2.0 * (x * x + y * y),
+        ]
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,22 +245,22 @@ def scalar_values(
     m: RsuMeasurement, convention: AngleConvention
 ) -> Iterator[tuple[Kind, float, float]]:
     """Kind, value and variance of each scalar quantity in a measurement, in units of the rows."""
-    c = SPEED_OF_LIGHT_MPS
+    c, fields = SPEED_OF_LIGHT_MPS, int(m.fields)
     cone = convention is AngleConvention.CONE
-    if m.fields & Field.AZIMUTH:
+    if fields & _AZIMUTH:
         if cone:
             yield Kind.COSINE_Y, math.sin(m.azimuth_rad), _cosine_var(m.azimuth_rad, m.azimuth_var)
         else:
             yield Kind.AZIMUTH, m.azimuth_rad, m.azimuth_var
-    if m.fields & Field.ELEVATION:
+    if fields & _ELEVATION:
         if cone:
             variance = _cosine_var(m.elevation_rad, m.elevation_var)
             yield Kind.COSINE_Z, math.sin(m.elevation_rad), variance
         else:
             yield Kind.ELEVATION, m.elevation_rad, m.elevation_var
-    if m.fields & Field.TOA:
+    if fields & _TOA:
         yield Kind.TOA, c * m.toa_s, c * c * m.toa_var
-    if m.fields & Field.RANGE:
+    if fields & _RANGE:
         yield Kind.RANGE, m.range_m, m.range_var
 
 
@@ -224,29 +270,38 @@ def _cosine_var(angle: float, variance: float) -> float:
 
 
 def rsu_rows(
-    m: RsuMeasurement, info: RsuInfo, axes: Array, group: int, coupling: Coupling = UNCOUPLED
+    m: RsuMeasurement,
+    info: RsuInfo,
+    axes: Array,
+    group: int,
+    coupling: Coupling = UNCOUPLED,
+    heading: int = -1,
 ) -> Array:
     """Rows (m, ROW_WIDTH) of one RSU measurement; a position fix becomes two decorrelated LINEAR
     rows.
 
     axes : (9,) of ``rsu_axes``
+    heading : state index of the device's heading, by which its lever arm turns; -1: none
     """
-    rows = []
-    for kind, value, variance in scalar_values(m, info.angle_convention):
-        row = np.empty(ROW_WIDTH)
-        row[KIND], row[VALUE], row[GROUP] = kind, value, group
-        row[VARIANCE] = variance * coupling.inflation.get(kind, 1.0)
-        row[GATE_VARIANCE] = variance
-        row[BIAS] = coupling.bias.get(kind, -1)
-        row[COMMON] = coupling.common.get(kind, -1)
-        row[ORIGIN:AXES] = info.position
-        row[AXES:] = axes
-        rows.append(row)
-    out = np.array(rows).reshape(-1, ROW_WIDTH)
-    if m.fields & Field.POSITION:
+    scalars = list(scalar_values(m, info.angle_convention))
+    rows = np.empty((len(scalars), ROW_WIDTH))
+    rows[:, ORIGIN:AXES] = info.position
+    rows[:, AXES:HEADING] = axes
+    rows[:, HEADING:] = heading, *m.lever_arm
+    for row, (kind, value, variance) in zip(rows, scalars, strict=True):
+        row[:ORIGIN] = (
+            kind,
+            value,
+            variance * coupling.inflation.get(kind, 1.0),
+            variance,
+            coupling.bias.get(kind, -1),
+            coupling.common.get(kind, -1),
+            group,
+        )
+    if int(m.fields) & _POSITION:
         fix = linear_rows(m.position[:2], m.position_cov[:2, :2], np.eye(2, 6), group)
-        out = np.vstack([out, fix])
-    return out
+        rows = np.vstack([rows, fix])
+    return rows
 
 
 def linear_rows(value: Array, cov: Array, H: Array, group: int) -> Array:
@@ -256,12 +311,12 @@ def linear_rows(value: Array, cov: Array, H: Array, group: int) -> Array:
     value (m,), cov (m, m) positive definite, H (m, 6) of the core states. Raises ``LinAlgError``
     where cov is not.
     """
-    L = np.linalg.cholesky(cov)
+    L = np.linalg.cholesky((cov + cov.T) / 2.0)
     rows = np.zeros((len(value), ROW_WIDTH))
     rows[:, KIND] = Kind.LINEAR
     rows[:, VALUE] = np.linalg.solve(L, value)
     rows[:, VARIANCE] = rows[:, GATE_VARIANCE] = 1.0
-    rows[:, BIAS] = rows[:, COMMON] = -1
+    rows[:, BIAS] = rows[:, COMMON] = rows[:, HEADING] = -1
     rows[:, GROUP] = group
     rows[:, ORIGIN : ORIGIN + 6] = np.linalg.solve(L, H)
     return rows
@@ -271,4 +326,5 @@ def speed_row(speed_mps: float, variance: float, group: int) -> Array:
     """Row (1, ROW_WIDTH) of a ground-speed measurement."""
     row = np.zeros((1, ROW_WIDTH))
     row[0, :ORIGIN] = Kind.SPEED, speed_mps, variance, variance, -1, -1, group
+    row[0, HEADING] = -1
     return row

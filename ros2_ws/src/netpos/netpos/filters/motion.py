@@ -1,4 +1,8 @@
-"""Process models: nearly constant velocity, a two-state clock, first-order Gauss-Markov biases."""
+"""Process models f, F and Q: the motion of a device, its two-state clock, slow sensor biases.
+
+Entries of the state beyond the six of ``StateIndex`` belong to the motion model first
+(``extra_states``), then to the biases, first-order Gauss-Markov processes.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +10,15 @@ import math
 from enum import IntEnum
 
 import numpy as np
-from numba import njit
 
+from netpos.filters.compile import leaf
 from netpos.messages.values import Array
 
 SPEED_OF_LIGHT_MPS = 299_792_458.0
 
 
 class StateIndex(IntEnum):
-    """Order of the state; biases follow ``N_CORE`` entries."""
+    """Order of the core state."""
 
     X = 0
     Y = 1
@@ -27,76 +31,328 @@ class StateIndex(IntEnum):
 N_CORE = len(StateIndex)
 
 
+class Model(IntEnum):
+    """How a device moves."""
+
+    CONSTANT_VELOCITY = 0
+    CONSTANT_TURN = 1  # extra state: turn rate [rad/s]
+    CONSTANT_ACCELERATION = 2  # extra states: acceleration x, y [m/s^2]
+    STATIONARY = 3  # at rest; the stop model of an interacting set
+    INERTIAL = 4  # driven by yaw rate and forward acceleration; extra states: their biases
+    RIGID_BODY = 5  # constant velocity and a heading of its own; extra states: yaw, yaw rate
+
+
 class ProcessNoise(IntEnum):
-    """How Q follows from the elapsed time."""
+    """How Q of motion and clock follows from the elapsed time."""
 
     CONTINUOUS = 0  # continuous white acceleration and white + random-walk frequency noise
     WERNER = 1  # per step diag(0, 0, sv^2, sv^2, 0, seta^2), fokin2020:eq.4
     WHITE_ACCELERATION = 2  # per step G G' ss^2, fokin2020:eq.36; clock as WERNER
 
 
-@njit(cache=True)
-def transition(n: int, dt: float, bias_tau_s: Array) -> Array:
-    """Transition matrix F (n, n) over ``dt`` seconds (fokin2020:eq.35); biases decay with their
-    time constants (n - 6,)."""
-    F = np.eye(n)
-    F[0, 2] = dt
-    F[1, 3] = dt
-    F[4, 5] = dt
-    for i in range(bias_tau_s.size):
-        F[6 + i, 6 + i] = math.exp(-dt / bias_tau_s[i])
-    return F
+class Parameter(IntEnum):
+    """Entries of the vector ``motion`` that the kernels take."""
+
+    MODEL = 0
+    NOISE = 1
+    EXTRAS = 2  # state entries of the motion model
+    ACCEL = 3  # CONTINUOUS, INERTIAL: density [m/s^2/sqrt(Hz)]; WHITE_ACCELERATION: sd [m/s^2]
+    VELOCITY_STEP = 4  # WERNER: sd per step [m/s]
+    OFFSET_DENSITY = 5  # CONTINUOUS: clock white frequency noise [m/sqrt(s)]
+    DRIFT_DENSITY = 6  # CONTINUOUS: clock random-walk frequency noise [m/s/sqrt(s)]
+    DRIFT_STEP = 7  # WERNER, WHITE_ACCELERATION: sd per step [m/s]
+    TURN_RATE = 8  # CONSTANT_TURN, RIGID_BODY: walk of the turn or yaw rate [rad/s/sqrt(s)]
+    JERK = 9  # CONSTANT_ACCELERATION: density [m/s^3/sqrt(Hz)]
+    REST_SPEED = 10  # STATIONARY: speed sd [m/s]
+    GYRO = 11  # INERTIAL: angle random walk [rad/sqrt(s)]
+    GYRO_BIAS = 12  # INERTIAL: random walk of the yaw-rate bias [rad/s/sqrt(s)]
+    ACCEL_BIAS = 13  # INERTIAL: random walk of the acceleration bias [m/s^2/sqrt(s)]
+    YAW_INCREMENT = 14  # INERTIAL, input: integrated yaw rate over the step [rad]
+    SPEED_INCREMENT = 15  # INERTIAL, input: integrated forward acceleration over the step [m/s]
+    JUMP_SPEED = 16  # sd [m/s] of a velocity step the filter allowed for in this step; 0: none
+    JUMP_TIME = 17  # how long ago at most it happened [s]
 
 
-@njit(cache=True)
-def process_noise(
-    kind: int,
-    dt: float,
-    accel: float,
-    velocity_step: float,
-    offset_density: float,
-    drift_density: float,
-    drift_step: float,
-    bias_sd: Array,
-    bias_tau_s: Array,
+_EXTRAS = {
+    Model.CONSTANT_TURN: 1,
+    Model.CONSTANT_ACCELERATION: 2,
+    Model.INERTIAL: 2,
+    Model.RIGID_BODY: 2,
+}
+NO_BIAS = np.zeros((2, 0))
+# Below this speed [m/s] a forward acceleration says nothing about a direction.
+_CREEP_MPS = 0.2
+
+
+def extra_states(model: Model) -> int:
+    """Number of state entries a motion model adds to the core."""
+    return _EXTRAS.get(model, 0)
+
+
+def motion_parameters(
+    model: Model = Model.CONSTANT_VELOCITY,
+    noise: ProcessNoise = ProcessNoise.CONTINUOUS,
+    extras: int | None = None,
+    **values: float,
 ) -> Array:
-    """Process noise covariance Q (n, n) over ``dt`` seconds.
+    """Vector of ``Parameter``; ``values`` are named as its entries in lower case, 0 where absent.
 
-    accel : CONTINUOUS: acceleration density [m/s^2/sqrt(Hz)]; WHITE_ACCELERATION: acceleration sd
-        [m/s^2]
-    velocity_step : WERNER: velocity sd per step [m/s]
-    offset_density, drift_density : CONTINUOUS: clock white and random-walk frequency noise
-        [m/sqrt(s)], [m/s/sqrt(s)]
-    drift_step : WERNER, WHITE_ACCELERATION: drift sd per step [m/s]
-    bias_sd, bias_tau_s : (k,) stationary sd and correlation time of each bias
+    ``extras`` larger than the model's own number makes models share one state (interacting
+    models). Raises ``KeyError`` for an unknown name.
     """
-    n = 6 + bias_sd.size
-    Q = np.zeros((n, n))
-    if dt <= 0.0:
-        return Q
-    if kind == 0:
-        q = accel * accel
-        for p in range(2):
-            v = p + 2
-            Q[p, p] = q * dt**3 / 3.0
-            Q[p, v] = Q[v, p] = q * dt**2 / 2.0
-            Q[v, v] = q * dt
-        q1 = offset_density * offset_density
-        q2 = drift_density * drift_density
-        Q[4, 4] = q1 * dt + q2 * dt**3 / 3.0
-        Q[4, 5] = Q[5, 4] = q2 * dt**2 / 2.0
-        Q[5, 5] = q2 * dt
+    motion = np.zeros(len(Parameter))
+    motion[Parameter.MODEL] = model
+    motion[Parameter.NOISE] = noise
+    motion[Parameter.EXTRAS] = extra_states(model) if extras is None else extras
+    for name, value in values.items():
+        motion[Parameter[name.upper()]] = value
+    return motion
+
+
+@leaf
+def _turn(rate: float, dt: float) -> tuple[float, float, float, float]:
+    """sin(rate dt)/rate, (1 - cos(rate dt))/rate and their derivatives with respect to rate."""
+    angle = rate * dt
+    if abs(angle) < 1e-4:
+        along = dt * (1.0 - angle * angle / 6.0)
+        across = dt * angle / 2.0
+        return along, across, -dt * dt * angle / 3.0, dt * dt * (0.5 - angle * angle / 8.0)
+    s, c = math.sin(angle), math.cos(angle)
+    along, across = s / rate, (1.0 - c) / rate
+    return along, across, (dt * c - along) / rate, (dt * s - across) / rate
+
+
+@leaf
+def _inertial_velocity(mean: Array, dt: float, motion: Array) -> tuple[float, float, float]:
+    """Rotated velocity w and speed increment a of the INERTIAL model, biases removed."""
+    theta = motion[Parameter.YAW_INCREMENT] - mean[N_CORE] * dt
+    c, s = math.cos(theta), math.sin(theta)
+    wx = c * mean[2] - s * mean[3]
+    wy = s * mean[2] + c * mean[3]
+    return wx, wy, motion[Parameter.SPEED_INCREMENT] - mean[N_CORE + 1] * dt
+
+
+@leaf
+def propagate(mean: Array, dt: float, motion: Array, bias: Array) -> None:
+    """f: move ``mean`` (n,) by ``dt`` seconds in place; bias (2, k): stationary sd and time
+    constant of each bias."""
+    model = int(motion[Parameter.MODEL])
+    extras = int(motion[Parameter.EXTRAS])
+    vx, vy = mean[2], mean[3]
+    if model == Model.CONSTANT_TURN:
+        along, across, _, _ = _turn(mean[6], dt)
+        angle = mean[6] * dt
+        c, s = math.cos(angle), math.sin(angle)
+        mean[0] += along * vx - across * vy
+        mean[1] += across * vx + along * vy
+        mean[2] = c * vx - s * vy
+        mean[3] = s * vx + c * vy
+    elif model == Model.STATIONARY:
+        mean[2] = mean[3] = 0.0
+    elif model == Model.INERTIAL:
+        wx, wy, gain = _inertial_velocity(mean, dt, motion)
+        size = math.sqrt(wx * wx + wy * wy + _CREEP_MPS * _CREEP_MPS)
+        mean[2] = wx * (1.0 + gain / size)
+        mean[3] = wy * (1.0 + gain / size)
+        mean[0] += dt * (vx + mean[2]) / 2.0
+        mean[1] += dt * (vy + mean[3]) / 2.0
     else:
-        if kind == 1:
-            Q[2, 2] = Q[3, 3] = velocity_step * velocity_step
-        else:
-            q = accel * accel
-            for p in range(2):
-                v = p + 2
-                Q[p, p] = q * dt**4 / 4.0
-                Q[p, v] = Q[v, p] = q * dt**3 / 2.0
-                Q[v, v] = q * dt**2
-        Q[5, 5] = drift_step * drift_step
-    for i in range(bias_sd.size):
-        Q[6 + i, 6 + i] = bias_sd[i] ** 2 * (1.0 - math.exp(-2.0 * dt / bias_tau_s[i]))
-    return Q
+        mean[0] += dt * vx
+        mean[1] += dt * vy
+        if model == Model.CONSTANT_ACCELERATION:
+            for axis in range(2):
+                mean[axis] += dt * dt / 2.0 * mean[6 + axis]
+                mean[2 + axis] += dt * mean[6 + axis]
+        elif model == Model.RIGID_BODY:
+            mean[6] += dt * mean[7]
+    if model == Model.CONSTANT_VELOCITY or model == Model.STATIONARY:
+        for i in range(6, 6 + extras):
+            mean[i] = 0.0
+    mean[4] += dt * mean[5]
+    for i in range(bias.shape[1]):
+        mean[6 + extras + i] *= math.exp(-dt / bias[1, i])
+
+
+@leaf
+def transition(mean: Array, dt: float, motion: Array, bias: Array, F: Array) -> None:
+    """Jacobian of ``propagate`` at ``mean`` (n,), written to F (n, n); fokin2020:eq.35 for
+    constant velocity."""
+    model = int(motion[Parameter.MODEL])
+    extras = int(motion[Parameter.EXTRAS])
+    F[:] = 0.0
+    for i in range(mean.size):
+        F[i, i] = 1.0
+    F[4, 5] = dt
+    if model == Model.CONSTANT_TURN:
+        _turn_jacobian(mean, dt, F)
+    elif model == Model.STATIONARY:
+        F[2, 2] = F[3, 3] = 0.0
+    elif model == Model.INERTIAL:
+        _inertial_jacobian(mean, dt, motion, F)
+    else:
+        F[0, 2] = F[1, 3] = dt
+        if model == Model.CONSTANT_ACCELERATION:
+            for axis in range(2):
+                F[axis, 6 + axis] = dt * dt / 2.0
+                F[2 + axis, 6 + axis] = dt
+        elif model == Model.RIGID_BODY:
+            F[6, 7] = dt
+    if model == Model.CONSTANT_VELOCITY or model == Model.STATIONARY:
+        for i in range(6, 6 + extras):
+            F[i, i] = 0.0
+    for i in range(bias.shape[1]):
+        F[6 + extras + i, 6 + extras + i] = math.exp(-dt / bias[1, i])
+
+
+@leaf
+def _turn_jacobian(mean: Array, dt: float, F: Array) -> None:
+    vx, vy, rate = mean[2], mean[3], mean[6]
+    along, across, d_along, d_across = _turn(rate, dt)
+    c, s = math.cos(rate * dt), math.sin(rate * dt)
+    F[0, 2], F[0, 3], F[0, 6] = along, -across, d_along * vx - d_across * vy
+    F[1, 2], F[1, 3], F[1, 6] = across, along, d_across * vx + d_along * vy
+    F[2, 2], F[2, 3], F[2, 6] = c, -s, dt * (-s * vx - c * vy)
+    F[3, 2], F[3, 3], F[3, 6] = s, c, dt * (c * vx - s * vy)
+
+
+@leaf
+def _inertial_jacobian(mean: Array, dt: float, motion: Array, F: Array) -> None:
+    theta = motion[Parameter.YAW_INCREMENT] - mean[N_CORE] * dt
+    c, s = math.cos(theta), math.sin(theta)
+    wx, wy, gain = _inertial_velocity(mean, dt, motion)
+    size = math.sqrt(wx * wx + wy * wy + _CREEP_MPS * _CREEP_MPS)
+    cube = size * size * size
+    axx = 1.0 + gain * (1.0 / size - wx * wx / cube)
+    ayy = 1.0 + gain * (1.0 / size - wy * wy / cube)
+    axy = -gain * wx * wy / cube
+    F[2, 2], F[2, 3] = axx * c + axy * s, -axx * s + axy * c
+    F[3, 2], F[3, 3] = axy * c + ayy * s, -axy * s + ayy * c
+    F[2, 6], F[3, 6] = dt * (axx * wy - axy * wx), dt * (axy * wy - ayy * wx)
+    F[2, 7], F[3, 7] = -dt * wx / size, -dt * wy / size
+    for axis in range(2):
+        for column in range(2, 8):
+            if column < 4 or column > 5:
+                F[axis, column] = dt / 2.0 * F[2 + axis, column]
+        F[axis, 2 + axis] += dt / 2.0
+
+
+@leaf
+def add_noise(mean: Array, dt: float, motion: Array, bias: Array, cov: Array) -> None:
+    """Add the process noise covariance over ``dt`` > 0 seconds to ``cov`` (n, n) in place.
+
+    ``mean`` (n,) is the state after the step: the INERTIAL model's heading noise acts across it.
+    """
+    model = int(motion[Parameter.MODEL])
+    extras = int(motion[Parameter.EXTRAS])
+    if model == Model.STATIONARY:
+        rest = motion[Parameter.REST_SPEED] ** 2
+        for p in range(2):
+            cov[p, p] += rest * dt * dt / 4.0
+            cov[p, p + 2] += rest * dt / 2.0
+            cov[p + 2, p] += rest * dt / 2.0
+            cov[p + 2, p + 2] += rest
+    elif model == Model.CONSTANT_ACCELERATION:
+        _add_jerk(dt, motion[Parameter.JERK] ** 2, cov)
+    else:
+        _add_acceleration(dt, motion, cov)
+    _add_clock(dt, motion, cov)
+    add_jump(motion[Parameter.JUMP_SPEED], motion[Parameter.JUMP_TIME], cov)
+    if model == Model.CONSTANT_TURN:
+        cov[6, 6] += motion[Parameter.TURN_RATE] ** 2 * dt
+    elif model == Model.RIGID_BODY:
+        _add_walk(6, 7, dt, motion[Parameter.TURN_RATE] ** 2, cov)
+    elif model == Model.INERTIAL:
+        _add_inertial(mean, dt, motion, cov)
+    elif model == Model.CONSTANT_VELOCITY or model == Model.STATIONARY:
+        for i in range(6, 6 + extras):
+            cov[i, i] += motion[Parameter.TURN_RATE] ** 2 * dt
+    for i in range(bias.shape[1]):
+        k = 6 + extras + i
+        cov[k, k] += bias[0, i] ** 2 * (1.0 - math.exp(-2.0 * dt / bias[1, i]))
+
+
+@leaf
+def add_jump(sd: float, time_s: float, cov: Array) -> None:
+    """Add, in place, a velocity step of ``sd`` [m/s] per axis ``time_s`` ago, and the position it
+    leads to."""
+    for p in range(2):
+        cov[p, p] += (sd * time_s) ** 2
+        cov[p, p + 2] += sd * sd * time_s
+        cov[p + 2, p] += sd * sd * time_s
+        cov[p + 2, p + 2] += sd * sd
+
+
+@leaf
+def _add_acceleration(dt: float, motion: Array, cov: Array) -> None:
+    kind = int(motion[Parameter.NOISE])
+    continuous = kind == ProcessNoise.CONTINUOUS
+    if int(motion[Parameter.MODEL]) == Model.INERTIAL:
+        continuous = True
+    elif kind == ProcessNoise.WERNER:
+        step = motion[Parameter.VELOCITY_STEP] ** 2
+        cov[2, 2] += step
+        cov[3, 3] += step
+        return
+    q = motion[Parameter.ACCEL] ** 2
+    if continuous:
+        pp, pv, vv = q * dt**3 / 3.0, q * dt**2 / 2.0, q * dt
+    else:
+        pp, pv, vv = q * dt**4 / 4.0, q * dt**3 / 2.0, q * dt**2
+    for p in range(2):
+        cov[p, p] += pp
+        cov[p, p + 2] += pv
+        cov[p + 2, p] += pv
+        cov[p + 2, p + 2] += vv
+
+
+@leaf
+def _add_jerk(dt: float, q: float, cov: Array) -> None:
+    for p in range(2):
+        v, a = p + 2, p + 6
+        cov[p, p] += q * dt**5 / 20.0
+        cov[v, v] += q * dt**3 / 3.0
+        cov[a, a] += q * dt
+        for i, j, value in (
+            (p, v, q * dt**4 / 8.0),
+            (p, a, q * dt**3 / 6.0),
+            (v, a, q * dt**2 / 2.0),
+        ):
+            cov[i, j] += value
+            cov[j, i] += value
+
+
+@leaf
+def _add_clock(dt: float, motion: Array, cov: Array) -> None:
+    if int(motion[Parameter.NOISE]) != ProcessNoise.CONTINUOUS:
+        cov[5, 5] += motion[Parameter.DRIFT_STEP] ** 2
+        return
+    cov[4, 4] += motion[Parameter.OFFSET_DENSITY] ** 2 * dt
+    _add_walk(4, 5, dt, motion[Parameter.DRIFT_DENSITY] ** 2, cov)
+
+
+@leaf
+def _add_walk(value: int, rate: int, dt: float, q: float, cov: Array) -> None:
+    """Noise of a value whose rate does a random walk of density ``q``."""
+    cov[value, value] += q * dt**3 / 3.0
+    cov[value, rate] += q * dt**2 / 2.0
+    cov[rate, value] += q * dt**2 / 2.0
+    cov[rate, rate] += q * dt
+
+
+@leaf
+def _add_inertial(mean: Array, dt: float, motion: Array, cov: Array) -> None:
+    angle = motion[Parameter.GYRO] ** 2 * dt
+    across = (-mean[3] * dt / 2.0, mean[2] * dt / 2.0, -mean[3], mean[2])
+    for i in range(4):
+        for j in range(4):
+            cov[i, j] += angle * across[i] * across[j]
+    cov[6, 6] += motion[Parameter.GYRO_BIAS] ** 2 * dt
+    cov[7, 7] += motion[Parameter.ACCEL_BIAS] ** 2 * dt
+
+
+@leaf
+def noise(mean: Array, dt: float, motion: Array, bias: Array, Q: Array) -> None:
+    """Process noise covariance over ``dt`` seconds, written to Q (n, n); 0 for dt <= 0."""
+    Q[:] = 0.0
+    if dt > 0.0:
+        add_noise(mean, dt, motion, bias, Q)

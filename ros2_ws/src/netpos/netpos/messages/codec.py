@@ -19,6 +19,7 @@ from netpos.messages.fields import (
     embed,
     flat,
     imu_covariance,
+    lever_arm,
     square,
     stamp_ns,
     vue_of_frame,
@@ -68,7 +69,7 @@ class Codec:
     def _to_point(self, v: Array) -> Any:
         return self._point(x=float(v[0]), y=float(v[1]), z=float(v[2]))
 
-    def _to_vector(self, v: Array) -> Any:
+    def _to_vector(self, v: Array | tuple[float, float, float]) -> Any:
         return self._vector(x=float(v[0]), y=float(v[1]), z=float(v[2]))
 
     def _to_quaternion(self, q: Array) -> Any:
@@ -168,6 +169,7 @@ class Codec:
             range_var=float(m.range_var),
             phase_difference=float(m.phase_difference_rad),
             phase_difference_var=float(m.phase_difference_var),
+            lever_arm=self._to_vector(m.lever_arm),
             position=self._to_point(m.position),
             position_covariance=flat(m.position_cov),
         )
@@ -194,6 +196,7 @@ class Codec:
             range_var=float(msg.range_var),
             phase_difference_rad=float(msg.phase_difference),
             phase_difference_var=float(msg.phase_difference_var),
+            lever_arm=lever_arm(msg),
             position=xyz(msg.position),
             position_cov=square(msg.position_covariance, 3),
         )
@@ -316,11 +319,11 @@ class Codec:
         )
 
     @staticmethod
-    def imu_from_msg(msg: Any) -> ImuSample:
-        """ImuSample value of a sensor_msgs/Imu."""
+    def imu_from_msg(msg: Any, vue_id: str | None = None) -> ImuSample:
+        """ImuSample value of a sensor_msgs/Imu of a device (default: the one its frame names)."""
         return ImuSample(
             stamp_ns=stamp_ns(msg.header.stamp),
-            vue_id=vue_of_frame(msg.header.frame_id),
+            vue_id=vue_id or vue_of_frame(msg.header.frame_id),
             angular_velocity=xyz(msg.angular_velocity),
             specific_force=xyz(msg.linear_acceleration),
             angular_velocity_var=float(msg.angular_velocity_covariance[0]),

@@ -56,3 +56,9 @@ def imu_covariance(variance: float) -> Array:
     if variance < 0.0:
         cov[4] = cov[8] = 0.0
     return cov
+
+
+def lever_arm(msg: Any) -> tuple[float, float, float]:
+    """Lever arm of a netpos_msgs/RsuMeasurement; recordings made before it had one have none."""
+    arm = getattr(msg, "lever_arm", None)
+    return (0.0, 0.0, 0.0) if arm is None else (float(arm.x), float(arm.y), float(arm.z))

@@ -19,10 +19,11 @@ STEP_VELOCITY = "step_velocity"
 GROUND_SPEED = "ground_speed"
 INITIAL_POSE = "initialpose"
 ODOMETRY = "odometry"
+ODOMETRY_SMOOTHED = "odometry_smoothed"
 CLOCK_STATE = "clock_state"
 TRACK_STATUS = "track_status"
 
-TRACKER_OUTPUTS = (ODOMETRY, CLOCK_STATE, TRACK_STATUS)
+TRACKER_OUTPUTS = (ODOMETRY, ODOMETRY_SMOOTHED, CLOCK_STATE, TRACK_STATUS)
 
 
 def is_vue_id(text: str) -> bool:

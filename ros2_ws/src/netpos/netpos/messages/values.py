@@ -1,7 +1,8 @@
 """What flows between the parts of netpos, as plain values.
 
 Stamps are integer nanoseconds of network time. Positions are metres in ``map`` (east, north, up),
-angles radians.
+angles radians. Nobody changes a value that exists; what streams is not frozen all the same, as
+that would make it five times as slow to build.
 """
 
 from __future__ import annotations
@@ -71,10 +72,10 @@ class RsuInfo:
     stamp_ns: int = 0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class RsuMeasurement:
     """What one RSU measured of one device at one instant; ``fields`` names the quantities that
-    count."""
+    count. ``lever_arm`` [m]: antenna that was measured, in the device's base_link."""
 
     stamp_ns: int
     rsu_id: str
@@ -94,11 +95,12 @@ class RsuMeasurement:
     range_var: float = 0.0
     phase_difference_rad: float = 0.0
     phase_difference_var: float = 0.0
+    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     position: Array = field(default_factory=lambda: np.zeros(3))
     position_cov: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class Velocity:
     """A horizontal velocity in the axes of ``frame_id``. velocity (2,) m/s, cov (2, 2)."""
 
@@ -110,7 +112,7 @@ class Velocity:
     source: str = "step_velocity"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class GroundSpeed:
     """Speed over ground of a device [m/s] with its variance, whatever the direction (wheels,
     Doppler)."""
@@ -122,7 +124,7 @@ class GroundSpeed:
     source: str = "ground_speed"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class InitialPose:
     """A position handed to the tracker from outside. position (3,) m, cov (3, 3) m^2."""
 
@@ -143,7 +145,7 @@ class Beacon:
     clock_offset_s: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class Odometry:
     """Pose and twist of a device, true or estimated.
 
@@ -162,7 +164,7 @@ class Odometry:
     twist_cov: Array = field(default_factory=lambda: np.zeros((6, 6)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class ClockState:
     """Device clock against network time: offset s, drift s/s, cov (2, 2)."""
 
@@ -173,7 +175,7 @@ class ClockState:
     cov: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class TrackStatus:
     """Health of one track at one epoch; counts since start."""
 
@@ -190,7 +192,7 @@ class TrackStatus:
     protection_level_m: float = -1.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class ImuSample:
     """angular_velocity (3,) rad/s and specific_force (3,) m/s^2 in base_link; variances per axis
     (0: unknown)."""

@@ -32,8 +32,11 @@ from netpos.world.buildings import segment_blocked
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
+Direction = tuple[float, float, float]
+
 AZIMUTH, ELEVATION, TOA, RANGE = range(4)  # columns of values and variances
 ALWAYS_VISIBLE = -1
+_ROUNDING = 1.0 + 1e-12  # squared distances may be compared within this factor only
 
 
 class Sites(NamedTuple):
@@ -86,47 +89,123 @@ def los_model_number(model: LosModel | None) -> int:
 
 
 @njit(cache=True)
-def _sees(position: Array, site: Array, plane_m: float, sight: Sight, key: Key) -> bool:
+def _in_axes(position: Array, k: int, sites: Sites) -> tuple[float, float, float]:
+    """Offset of a device from RSU k in the RSU's axes [m]."""
+    x = position[0] - sites.position[k, 0]
+    y = position[1] - sites.position[k, 1]
+    z = position[2] - sites.position[k, 2]
+    turn = sites.rotation[k]
+    return (
+        turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z,
+        turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z,
+        turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z,
+    )
+
+
+@njit(cache=True)
+def _hears(
+    position: Array, k: int, plane_m: float, sites: Sites, sight: Sight, half_view_rad: float
+) -> bool:
+    """Whether RSU k, ``plane_m`` away, sees the device and serves its direction."""
     if plane_m > sight.max_distance_m:
         return False
+    site = sites.position[k]
     if segment_blocked(position[0], position[1], site[0], site[1], sight.buildings):
         return False
-    if sight.model < 0:
+    if sight.model >= 0:
+        chance = los_chance(sight.model, plane_m, sight.device_height_m)
+        key = sites.sight_key[k]
+        if smooth_uniform(position[0], position[1], sight.correlation_m, key) >= chance:
+            return False
+    if plane_m > 0.0 and half_view_rad >= math.pi:
         return True
-    chance = los_chance(sight.model, plane_m, sight.device_height_m)
-    return bool(smooth_uniform(position[0], position[1], sight.correlation_m, key) < chance)
+    x, y, z = _in_axes(position, k, sites)
+    return x * x + y * y + z * z > 0.0 and abs(math.atan2(y, x)) <= half_view_rad
+
+
+@njit(cache=True)
+def _nearest_hearing(
+    position: Array,
+    sites: Sites,
+    sight: Sight,
+    half_view_rad: float,
+    hint: Ints,
+    found: Ints,
+    plane: Array,
+) -> int:
+    """Fill ``found`` and ``plane`` (nearest,) with the nearest RSUs that hear the device and their
+    plane distances; returns their number. Equal distances: lower index first.
+
+    The RSUs of ``hint`` (those of the last beacon; -1: none) are tried first: they make the circle
+    small, and only RSUs inside it need their line of sight tested.
+    """
+    nearest, count = found.size, 0
+    reach2 = sight.max_distance_m**2 * _ROUNDING
+    for step in range(hint.size + sites.position.shape[0]):
+        k = hint[step] if step < hint.size else step - hint.size
+        if k < 0:
+            continue
+        x, y = position[0] - sites.position[k, 0], position[1] - sites.position[k, 1]
+        square = x * x + y * y
+        if square > reach2:
+            continue
+        away = math.sqrt(square)
+        place = count  # where k belongs among those found
+        known = False
+        for j in range(count):
+            known |= found[j] == k
+            if place == count and (away < plane[j] or (away == plane[j] and k < found[j])):
+                place = j
+        if known or place == nearest:
+            continue
+        if not _hears(position, k, away, sites, sight, half_view_rad):
+            continue
+        count = min(count + 1, nearest)
+        for j in range(count - 1, place, -1):
+            found[j], plane[j] = found[j - 1], plane[j - 1]
+        found[place], plane[place] = k, away
+        if count == nearest:
+            reach2 = plane[nearest - 1] ** 2 * _ROUNDING
+    return count
+
+
+@njit(cache=True)
+def _cross_moment(moment: Array, a: Direction, b: Direction) -> float:
+    """a' moment b."""
+    total = 0.0
+    for i in range(3):
+        total += a[i] * (moment[i, 0] * b[0] + moment[i, 1] * b[1] + moment[i, 2] * b[2])
+    return total
 
 
 @njit(cache=True)
 def _variances(
-    azimuth: float, elevation: float, distance: float, errors: Errors, out: Array
-) -> float:
-    """Fill ``out`` (4,); returns the received power [dBm], 0 where not modelled."""
+    azimuth: float, elevation: float, distance: float, errors: Errors
+) -> tuple[tuple[float, float, float, float], float]:
+    """Variances of the four quantities, and the received power [dBm], 0 where not modelled."""
     if errors.snr_at_0_db_loss == 0.0:
-        out[:] = errors.fixed
-        return 0.0
+        fixed = errors.fixed
+        return (fixed[0], fixed[1], fixed[2], fixed[3]), 0.0
     loss_db = path_loss_db(distance, errors.path_loss)
     snr = errors.snr_at_0_db_loss * 10.0 ** (-loss_db / 10.0)
     scale = 2.0 * snr * (2.0 * math.pi) ** 2
     ca, sa = math.cos(azimuth), math.sin(azimuth)
-    ce, se = math.cos(elevation), math.sin(elevation)
+    moment = errors.second_moment
+    toa = 1.0 / (2.0 * snr * (2.0 * math.pi * errors.rms_bandwidth_hz) ** 2)
+    by_distance = SPEED_OF_LIGHT_MPS**2 * toa
+    power = errors.tx_power_dbm - loss_db
     if not errors.with_elevation:
-        ce, se = 1.0, 0.0
-    by_azimuth = np.array([-sa * ce, ca * ce, 0.0])
-    by_elevation = np.array([-ca * se, -sa * se, ce])
-    along = scale * np.sum(by_azimuth * (errors.second_moment @ by_azimuth))
-    up = scale * np.sum(by_elevation * (errors.second_moment @ by_elevation))
-    cross = scale * np.sum(by_azimuth * (errors.second_moment @ by_elevation))
-    if errors.with_elevation:
-        determinant = along * up - cross * cross
-        out[AZIMUTH] = up / determinant
-        out[ELEVATION] = along / determinant
-    else:
-        out[AZIMUTH] = 1.0 / along
-        out[ELEVATION] = 0.0
-    out[TOA] = 1.0 / (2.0 * snr * (2.0 * math.pi * errors.rms_bandwidth_hz) ** 2)
-    out[RANGE] = SPEED_OF_LIGHT_MPS**2 * out[TOA]
-    return float(errors.tx_power_dbm - loss_db)
+        by_azimuth = (-sa, ca, 0.0)
+        along = scale * _cross_moment(moment, by_azimuth, by_azimuth)
+        return (1.0 / along, 0.0, toa, by_distance), power
+    ce, se = math.cos(elevation), math.sin(elevation)
+    by_azimuth = (-sa * ce, ca * ce, 0.0)
+    by_elevation = (-ca * se, -sa * se, ce)
+    along = scale * _cross_moment(moment, by_azimuth, by_azimuth)
+    up = scale * _cross_moment(moment, by_elevation, by_elevation)
+    cross = scale * _cross_moment(moment, by_azimuth, by_elevation)
+    determinant = along * up - cross * cross
+    return (up / determinant, along / determinant, toa, by_distance), power
 
 
 @njit(cache=True)
@@ -146,34 +225,28 @@ def observe(
     values = np.zeros((n, nearest, 4))
     variances = np.zeros((n, nearest, 4))
     rssi = np.zeros((n, nearest))
+    plane = np.empty(nearest)
+    hint = np.full(nearest, -1, dtype=np.int64)
     for i in range(n):
-        offset = positions[i] - sites.position
-        plane = np.sqrt(offset[:, 0] ** 2 + offset[:, 1] ** 2)
-        for k in np.argsort(plane, kind="mergesort"):
-            j = heard_by[i]
-            if j == nearest:
-                break
-            if not _sees(positions[i], sites.position[k], plane[k], sight, sites.sight_key[k]):
-                continue
-            d = np.zeros(3)
-            for row in range(3):
-                for column in range(3):
-                    d[row] += sites.rotation[k, row, column] * offset[k, column]
-            distance = math.sqrt(d[0] ** 2 + d[1] ** 2 + d[2] ** 2)
-            azimuth = math.atan2(d[1], d[0])
-            if distance == 0.0 or abs(azimuth) > errors.half_view_rad:
-                continue
-            elevation = math.atan2(d[2], math.hypot(d[0], d[1]))
-            rssi[i, j] = _variances(azimuth, elevation, distance, errors, variances[i, j])
+        position = positions[i]
+        heard_by[i] = _nearest_hearing(
+            position, sites, sight, errors.half_view_rad, hint, rsu[i], plane
+        )
+        hint = rsu[i]
+        for j in range(heard_by[i]):
+            k = rsu[i, j]
+            x, y, z = _in_axes(position, k, sites)
+            distance = math.sqrt(x * x + y * y + z * z)
+            azimuth = math.atan2(y, x)
+            elevation = math.atan2(z, math.hypot(x, y)) if z != 0.0 else z
+            var, rssi[i, j] = _variances(azimuth, elevation, distance, errors)
             noise = draw_normals(stamps_ns[i], 0, 0, sites.noise_key[k])
-            sd = np.sqrt(variances[i, j])
-            turned = azimuth + sd[AZIMUTH] * noise[AZIMUTH]
+            turned = azimuth + math.sqrt(var[AZIMUTH]) * noise[AZIMUTH]
             values[i, j, AZIMUTH] = (turned + math.pi) % (2.0 * math.pi) - math.pi
-            values[i, j, ELEVATION] = elevation + sd[ELEVATION] * noise[ELEVATION]
-            values[i, j, TOA] = (
-                distance / SPEED_OF_LIGHT_MPS + clock_offsets_s[i] + sd[TOA] * noise[TOA]
-            )
-            values[i, j, RANGE] = distance + sd[RANGE] * noise[RANGE]
-            rsu[i, j] = k
-            heard_by[i] += 1
+            values[i, j, ELEVATION] = elevation + math.sqrt(var[ELEVATION]) * noise[ELEVATION]
+            delay = distance / SPEED_OF_LIGHT_MPS + clock_offsets_s[i]
+            values[i, j, TOA] = delay + math.sqrt(var[TOA]) * noise[TOA]
+            values[i, j, RANGE] = distance + math.sqrt(var[RANGE]) * noise[RANGE]
+            for quantity in range(4):
+                variances[i, j, quantity] = var[quantity]
     return Observations(heard_by, rsu, values, variances, rssi)

@@ -49,13 +49,18 @@ def rsus_of(scenario: Scenario) -> tuple[RsuInfo, ...]:
     )
 
 
-def sites_of(rsus: tuple[RsuInfo, ...], seed: int, vue_id: str) -> Sites:
-    """The RSUs as one device meets them: places and noise streams."""
+def rotations_of(rsus: tuple[RsuInfo, ...]) -> Array:
+    """(m, 3, 3) from map to the RSUs' axes."""
     rotations = np.empty((len(rsus), 3, 3))
     for i, rsu in enumerate(rsus):
         yaw = float(yaw_from_quaternion(rsu.quaternion))
         c, s = math.cos(yaw), math.sin(yaw)
         rotations[i] = [[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]
+    return rotations
+
+
+def sites_of(rsus: tuple[RsuInfo, ...], rotations: Array, seed: int, vue_id: str) -> Sites:
+    """The RSUs as one device meets them: places, rotations of ``rotations_of``, noise streams."""
     return Sites(
         position=np.array([rsu.position for rsu in rsus]),
         rotation=rotations,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -26,9 +27,18 @@ from netpos.messages.values import (
     RsuMeasurement,
 )
 from netpos.radio.clocks import simulate_clock
-from netpos.radio.measure import AZIMUTH, ELEVATION, RANGE, TOA, Observations, observe
+from netpos.radio.measure import (
+    AZIMUTH,
+    ELEVATION,
+    RANGE,
+    TOA,
+    Observations,
+    Sight,
+    Sites,
+    observe,
+)
 from netpos.radio.noise import generator
-from netpos.scenario.build import errors_of, rsus_of, sight_of, sites_of
+from netpos.scenario.build import errors_of, rotations_of, rsus_of, sight_of, sites_of
 from netpos.scenario.schema import Device, Scenario
 from netpos.world.frames import quaternion_from_yaw
 
@@ -63,11 +73,32 @@ class Simulation:
         self.scenario = scenario
         self.rsus: tuple[RsuInfo, ...] = rsus_of(scenario)
         """The RSUs, in the order of ``Observations.rsu``."""
+        self.fields = Field(sum(_FIELDS[q] for q in scenario.measurement.quantities))
+        """The quantities every measurement carries."""
+        self._rotations = rotations_of(self.rsus)
         self._errors = errors_of(scenario)
-        self._fields = Field(sum(_FIELDS[q] for q in scenario.measurement.quantities))
+        self._sights = {vue: sight_of(scenario, device) for vue, device in scenario.each_device}
+        self._place_devices()
+
+    def _place_devices(self) -> None:
         self._vues = {
-            vue: _Vue(scenario, vue, device, self.rsus) for vue, device in scenario.each_device
+            vue: _Vue(
+                self.scenario,
+                vue,
+                device,
+                sites_of(self.rsus, self._rotations, self.scenario.seed, vue),
+                self._sights[vue],
+            )
+            for vue, device in self.scenario.each_device
         }
+
+    def with_seed(self, seed: int) -> Simulation:
+        """The same scenario under another seed (>= 0), without building the world anew; for many
+        runs."""
+        other = copy(self)
+        other.scenario = self.scenario.model_copy(update={"seed": seed})
+        other._place_devices()
+        return other
 
     def events(self) -> Iterator[Event]:
         """Everything the devices emit, in time order."""
@@ -130,12 +161,16 @@ class Simulation:
         )
         return seen
 
+    def imu(self, vue_id: str) -> list[ImuSample]:
+        """All samples of a device's IMU; none where it has none."""
+        return list(self._vues[vue_id].imu())
+
     def initial_pose(self, vue_id: str) -> InitialPose | None:
         """The position handed to the tracker, where the scenario asks for one."""
         return self._vues[vue_id].initial_pose
 
     def _measurement(self, beacon: Beacon, seen: Observations, j: int) -> RsuMeasurement:
-        value, variance, fields = seen.values[0, j], seen.variances[0, j], self._fields
+        value, variance, fields = seen.values[0, j], seen.variances[0, j], self.fields
         masked = np.array([bool(fields & f) for f in _FIELDS.values()])
         value, variance = np.where(masked, value, 0.0), np.where(masked, variance, 0.0)
         return RsuMeasurement(
@@ -161,7 +196,7 @@ class _Vue:
     """One device of a simulation."""
 
     def __init__(
-        self, scenario: Scenario, vue_id: str, device: Device, rsus: tuple[RsuInfo, ...]
+        self, scenario: Scenario, vue_id: str, device: Device, sites: Sites, sight: Sight
     ) -> None:
         self._vue_id = vue_id
         self._device = device
@@ -170,8 +205,8 @@ class _Vue:
         self._motion = device.motion(scenario.seed, vue_id)
         limit_s = scenario.max_duration_s or self._motion.duration_s
         self._duration_ns = int(min(limit_s, self._motion.duration_s) * NS)
-        self.sites = sites_of(rsus, scenario.seed, vue_id)
-        self.sight = sight_of(scenario, device)
+        self.sites = sites
+        self.sight = sight
 
     def _grid(self, step_ns: int) -> Stamps:
         return np.arange(self._duration_ns // step_ns + 1, dtype=np.int64) * step_ns
@@ -209,7 +244,7 @@ class _Vue:
         first: Iterator[Event] = iter([pose] if pose else [])
         streams = [first, self._truth(), self._clock()]
         if self._device.imu:
-            streams.append(self._imu())
+            streams.append(self.imu())
         if self._device.magnetometer:
             streams.append(self._magnetometer())
         return [*streams, self._beacons()]
@@ -243,8 +278,10 @@ class _Vue:
                 drift=float(b.clock_drift[i]),
             )
 
-    def _imu(self) -> Iterator[Event]:
-        assert self._device.imu is not None
+    def imu(self) -> Iterator[ImuSample]:
+        """All samples; none without an IMU."""
+        if self._device.imu is None:
+            return
         imu: ImuSamples = simulate_imu(
             self._device.imu, self._motion, self._start_ns, self._seed, self._vue_id
         )

@@ -10,11 +10,25 @@ from typing import Any
 
 from netpos.filters.motion import ProcessNoise
 
-FILTER_ITERATIONS = {"ekf": 1, "iekf": 8}
+FILTERS = ("ekf", "iekf", "ukf", "srukf", "kf")
+BACKENDS = ("compiled", "filterpy")
+MOTION_MODELS = (
+    "constant_velocity",
+    "constant_turn",
+    "constant_acceleration",
+    "interacting",
+    "inertial",
+    "rigid_body",
+)
+ROBUST = ("none", "huber", "student_t")
 
 
 def _real(default: float, low: float, high: float, text: str) -> Any:
     return field(default=default, metadata={"low": low, "high": high, "text": text})
+
+
+def _choice(default: str, choices: tuple[str, ...], text: str) -> Any:
+    return field(default=default, metadata={"choices": choices, "text": text})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,12 +39,26 @@ class TrackerConfig:
     Raises ``ValueError`` naming the parameter, its value and the accepted range.
     """
 
-    filter: str = field(
-        default="iekf", metadata={"text": "ekf | iekf (linearised again at its own result)"}
+    filter: str = _choice(
+        "iekf",
+        FILTERS,
+        "ekf | iekf (linearised again at its own result) | ukf | srukf (square root) | kf (linear:"
+        " position fixes and velocities only)",
     )
-    process_noise: str = field(
-        default="continuous",
-        metadata={"text": "continuous | werner (fokin2020:eq.4) | white_acceleration (eq.36)"},
+    backend: str = _choice(
+        "compiled", BACKENDS, "compiled | filterpy (reference for ekf and ukf, slow)"
+    )
+    motion_model: str = _choice(
+        "constant_velocity",
+        MOTION_MODELS,
+        "constant_velocity | constant_turn | constant_acceleration | interacting (stop, straight,"
+        " turn) | inertial (driven by the device's IMU) | rigid_body (several antennas give a"
+        " heading of its own)",
+    )
+    process_noise: str = _choice(
+        "continuous",
+        tuple(noise.name.lower() for noise in ProcessNoise),
+        "continuous | werner (fokin2020:eq.4) | white_acceleration (eq.36)",
     )
     accel_density_mps2_sqrthz: float = _real(
         1.0, 1e-6, 1e3, "continuous: density of the white acceleration [m/s^2/sqrt(Hz)]"
@@ -39,6 +67,46 @@ class TrackerConfig:
     velocity_step_sd_mps: float = _real(0.1, 1e-9, 1e3, "werner: velocity sd per step")
     drift_step_sd: float = _real(
         1e-4, 0.0, 1.0, "werner, white_acceleration: clock drift sd per step [s/s]"
+    )
+    turn_rate_density: float = _real(
+        0.3, 1e-9, 1e3, "not constant_velocity: walk of the turn rate [rad/s/sqrt(s)]"
+    )
+    jerk_density: float = _real(
+        1.0, 0.0, 1e4, "constant_acceleration: density of the white jerk [m/s^3/sqrt(Hz)]"
+    )
+    accel_state_sd_mps2: float = _real(
+        2.0, 1e-6, 1e3, "constant_acceleration: initial acceleration sd per axis"
+    )
+    rest_speed_sd_mps: float = _real(0.05, 1e-6, 1e3, "interacting: speed sd of a device at rest")
+    sojourn_s: float = _real(
+        5.0, 1e-3, 1e6, "interacting: mean time a device keeps to one of the models"
+    )
+    inertial_accel_density_mps2_sqrthz: float = _real(
+        0.1, 1e-6, 1e3, "inertial: noise of the forward acceleration and side slip"
+    )
+    gyro_noise_density: float = _real(
+        5e-3, 1e-9, 10.0, "inertial: noise of the yaw rate [rad/s/sqrt(Hz)]"
+    )
+    gyro_bias_sd_radps: float = _real(
+        0.01, 1e-9, 10.0, "inertial: initial sd of the yaw-rate bias"
+    )
+    gyro_bias_walk: float = _real(
+        1e-4, 0.0, 1.0, "inertial: walk of the yaw-rate bias [rad/s/sqrt(s)]"
+    )
+    accel_bias_sd_mps2: float = _real(
+        0.2, 1e-9, 100.0, "inertial: initial sd of the forward acceleration's bias"
+    )
+    accel_bias_walk: float = _real(
+        1e-2, 0.0, 10.0, "inertial: walk of the forward acceleration's bias [m/s^2/sqrt(s)]"
+    )
+    position_gain_min: float = _real(
+        0.0, 0.0, 1.0, "kf: floor of the position gain (dvornikov2017: 0.0926)"
+    )
+    velocity_gain_min: float = _real(
+        0.0, 0.0, 10.0, "kf: floor of the velocity gain [1/s] (dvornikov2017: 0.008)"
+    )
+    accel_gain_min: float = _real(
+        0.0, 0.0, 10.0, "kf: floor of the acceleration gain [1/s^2] (dvornikov2017: 0.0003)"
     )
     clock_white_density: float = _real(
         1e-10, 0.0, 1.0, "continuous: clock white frequency noise [s/sqrt(s)]"
@@ -63,6 +131,19 @@ class TrackerConfig:
     device_height_m: float = _real(0.0, -1e4, 1e4, "height of the device's antenna in map")
     gate_probability: float = _real(
         0.9999, 0.5, 1.0, "share of true measurements the chi-square gate accepts; 1: no gate"
+    )
+    robust: str = _choice(
+        "none", ROBUST, "none | huber | student_t: what fits badly is fused with a larger variance"
+    )
+    robust_parameter: float = _real(
+        4.0, 0.1, 1e3, "huber: distance [sd] from which it grows; student_t: degrees of freedom"
+    )
+    nlos_probability: float = _real(
+        0.0, 0.0, 0.99, "share of ranges and times that come late by a blocked path; 0: none"
+    )
+    nlos_mean_excess_m: float = _real(20.0, 1e-3, 1e5, "mean excess of a blocked path")
+    isolate_rsus: bool = field(
+        default=True, metadata={"text": "refuse an RSU that at least two others contradict"}
     )
     manoeuvre_speed_sd_mps: float = _real(
         0.0, 0.0, 1e3, "velocity step a measurement that fails the gate may reveal; 0: none"
@@ -89,21 +170,55 @@ class TrackerConfig:
         0.25, 0.0, 10.0, "longest wait for measurements still missing at an epoch; 0: do not wait"
     )
 
+    history_s: float = _real(
+        1.0, 0.0, 60.0, "how late a measurement may come and still be applied in order"
+    )
+    max_future_s: float = _real(
+        60.0, 0.1, 1e9, "a stamp this far ahead counts only once a second one confirms it"
+    )
+    fixed_lag_s: float = _real(
+        0.0, 0.0, 60.0, "smoothed odometry is given out this long after the epoch; 0: none"
+    )
+    integrity_risk: float = _real(
+        1e-4, 1e-12, 0.5, "probability with which the error may exceed the protection level"
+    )
+
     def __post_init__(self) -> None:
-        names = [n.name.lower() for n in ProcessNoise]
-        if self.process_noise not in names:
-            raise ValueError(
-                f"process_noise must be one of {', '.join(names)}, got {self.process_noise!r}"
-            )
-        if self.filter not in FILTER_ITERATIONS:
-            names = list(FILTER_ITERATIONS)
-            raise ValueError(f"filter must be one of {', '.join(names)}, got {self.filter!r}")
         for entry in fields(self):
+            value = getattr(self, entry.name)
+            choices = entry.metadata.get("choices")
+            if choices is not None and value not in choices:
+                raise ValueError(
+                    f"{entry.name} must be one of {', '.join(choices)}, got {value!r}"
+                )
             if "low" in entry.metadata:
                 low, high = entry.metadata["low"], entry.metadata["high"]
-                value = getattr(self, entry.name)
                 if not (math.isfinite(value) and low <= value <= high):
                     raise ValueError(f"{entry.name} must be in [{low:g}, {high:g}], got {value!r}")
+        self._check_combination()
+
+    def _check_combination(self) -> None:
+        if self.backend == "filterpy" and self.filter not in ("ekf", "ukf"):
+            raise ValueError(f"backend filterpy has filter ekf or ukf, not {self.filter!r}")
+        if self.backend == "filterpy" and self.motion_model == "interacting":
+            raise ValueError("backend filterpy has no motion_model interacting; use compiled")
+        if self.motion_model == "interacting" and self.fixed_lag_s > 0.0:
+            raise ValueError("fixed_lag_s must be 0 with motion_model interacting")
+        plain = self.robust == "none" and self.nlos_probability == 0.0
+        if not plain and (self.backend == "filterpy" or self.motion_model == "interacting"):
+            raise ValueError(
+                "robust and nlos_probability need backend compiled and a single motion model;"
+                " leave them at none and 0"
+            )
+        if self.motion_model == "interacting" and self.filter not in ("ekf", "iekf"):
+            raise ValueError(
+                f"motion_model interacting takes filter ekf or iekf, not {self.filter!r}"
+            )
+
+    @property
+    def use_imu(self) -> bool:
+        """Whether the device's IMU is an input."""
+        return self.motion_model == "inertial"
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> TrackerConfig:

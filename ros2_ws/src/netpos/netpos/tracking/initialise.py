@@ -14,13 +14,19 @@ import math
 from collections import deque
 
 import numpy as np
-from numba import njit
+from scipy.special import chdtri
 
+from netpos.filters import ekf
+from netpos.filters.compile import kernel
+from netpos.filters.fit import misfit
 from netpos.filters.measurement import (
     AXES,
     BIAS,
     COMMON,
+    GROUP,
+    HEADING,
     KIND,
+    LEVER,
     ORIGIN,
     VALUE,
     VARIANCE,
@@ -39,11 +45,13 @@ _ATTEMPT_NS = 100_000_000
 # A second solution this much worse in cost (chi-square 0.99, 2 dof) does not count as a rival.
 _RIVAL_COST = 9.21
 _NEAREST_M = 1.0
+_HEADINGS = 16
+_HEADING_SD_MAX = 0.5
 _RAY_M = (2.0, 6.0, 15.0, 40.0, 100.0)
 _CIRCLE = tuple(2.0 * math.pi * i / 12 for i in range(12))
 
 
-@njit(cache=True)
+@kernel
 def _normal_equations(
     state: Array, ages_s: Array, rows: Array, height_m: float, prior: Array, prior_var: Array
 ) -> tuple[float, Array, Array]:
@@ -115,18 +123,29 @@ class Initialiser:
         self._window: deque[tuple[int, Array, tuple[Rsu, ...]]] = deque()
         self._next_attempt_ns = 0
 
+    def copy(self) -> Initialiser:
+        """An independent copy."""
+        twin = Initialiser(self._config)
+        twin._window = self._window.copy()
+        twin._next_attempt_ns = self._next_attempt_ns
+        return twin
+
     def add(self, stamp_ns: int, rows: Array, bias_var: Array, rsus: tuple[Rsu, ...]) -> None:
         """Take the rows (m, ROW_WIDTH) of one epoch; ``bias_var`` (m,) is the variance of the
         biases in each."""
         rows = rows.copy()
-        rows[:, BIAS] = rows[:, COMMON] = -1
+        rows[:, BIAS] = rows[:, COMMON] = rows[:, HEADING] = -1
         self._window.append((stamp_ns, np.column_stack([rows, bias_var]), rsus))
         oldest = stamp_ns - int(self._config.initial_window_s * 1e9)
         while self._window[0][0] < oldest:
             self._window.popleft()
 
     def solve(self) -> tuple[Array, Array] | None:
-        """Mean (6,) and covariance (6, 6) at the newest stamp; None while the position is open."""
+        """Mean (6,) and covariance (6, 6) at the newest stamp; None while the position is open.
+
+        Where the measurements contradict each other and leaving out one of three or more RSUs
+        makes them agree, the fix is that of the others.
+        """
         newest = self._window[-1][0]
         if newest < self._next_attempt_ns:
             return None
@@ -135,8 +154,9 @@ class Initialiser:
         ages = np.concatenate(
             [np.full(len(entry[1]), (entry[0] - newest) * 1e-9) for entry in self._window]
         )
-        problem = self._problem(rows, ages)
-        fits = self._fits(rows, problem)
+        fits = self._fits(rows, self._problem(rows, ages))
+        if fits and not self._consistent(fits[0], len(rows)):
+            fits = self._without_one(rows, ages) or fits
         if not fits:
             return None
         cost, mean, cov = fits[0]
@@ -148,6 +168,23 @@ class Initialiser:
         if waited_s < 0.8 * self._config.initial_window_s and _has_rival(fits):
             return None
         return mean, cov * misfit
+
+    def _consistent(self, fit: tuple[float, Array, Array], rows: int) -> bool:
+        """Whether the cost of a fit is one that true measurements have."""
+        return bool(fit[0] <= chdtri(rows, 1.0 - self._config.gate_probability))
+
+    def _without_one(self, rows: Array, ages: Array) -> list[tuple[float, Array, Array]]:
+        """Consistent fits without one of the RSUs, best first; none of fewer than three RSUs."""
+        fits = []
+        placed = ~np.isin(rows[:, KIND], (Kind.LINEAR, Kind.SPEED))
+        origins = np.unique(rows[placed, ORIGIN:AXES], axis=0)
+        if len(origins) < 3:
+            return []
+        for origin in origins:
+            keep = ~placed | (rows[:, ORIGIN:AXES] != origin).any(axis=1)
+            rest = self._fits(rows[keep], self._problem(rows[keep], ages[keep]))
+            fits += [fit for fit in rest if self._consistent(fit, int(keep.sum()))]
+        return sorted(fits, key=lambda fit: fit[0])
 
     def _problem(self, rows: Array, ages: Array) -> tuple[Array, Array, float, Array, Array]:
         cfg = self._config
@@ -177,15 +214,55 @@ class Initialiser:
         return sorted(fits, key=lambda fit: fit[0])
 
     def _plausible(self, state: Array) -> bool:
-        """Not behind an array without a back, and not on top of an RSU, where an angle fits
-        anything."""
+        """Not behind an array without a back, and not on top of an RSU that measures angles only,
+        where an angle fits anything."""
         heard = {r.info.rsu_id: r for e in self._window for r in e[2]}
+        ranged = {
+            tuple(row[ORIGIN:AXES])
+            for e in self._window
+            for row in e[1]
+            if int(row[KIND]) in (Kind.RANGE, Kind.TOA)
+        }
         for rsu in heard.values():
             dx, dy = state[:2] - rsu.info.position[:2]
             dz = self._config.device_height_m - rsu.info.position[2]
-            if not rsu.in_front(dx, dy) or dx * dx + dy * dy + dz * dz < _NEAREST_M**2:
+            near = dx * dx + dy * dy + dz * dz < _NEAREST_M**2
+            if not rsu.in_front(dx, dy) or (near and tuple(rsu.info.position) not in ranged):
                 return False
         return True
+
+
+def with_heading(
+    mean: Array, cov: Array, rows: Array, height_m: float
+) -> tuple[Array, Array] | None:
+    """A fix mean (6,), cov (6, 6) that ignored the lever arms of ``rows`` (m, ROW_WIDTH), and the
+    heading they speak for: mean (7,), cov (7, 7); None where they leave it open."""
+    levers = rows[rows[:, HEADING] >= 0, LEVER:]
+    if not levers.any():
+        return None
+    rows = rows.copy()
+    rows[:, BIAS] = rows[:, COMMON] = -1
+    rows[rows[:, HEADING] >= 0, HEADING] = 6
+    rows[:, GROUP] = 0
+    reach = 30.0 * float(np.hypot(levers[:, 0], levers[:, 1]).max())  # the fix tells no heading
+    prior = np.zeros((7, 7))
+    prior[:6, :6] = cov + reach**2 * np.diag([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+    prior[6, 6] = math.pi**2
+    variance, work = rows[:, VARIANCE].copy(), ekf.workspace(7, len(rows))
+    candidates = []
+    for k in range(_HEADINGS):
+        start = np.append(mean, 2.0 * math.pi * k / _HEADINGS)
+        x, P = ekf.iterate_from(start, start, prior, rows, variance, height_m, 30, work)
+        candidates.append((misfit(x, P, rows, variance, height_m, x), k, x, P))
+    candidates.sort(key=lambda c: c[:2])
+    cost, _, x, P = candidates[0]
+    far = 5.0 * math.sqrt(P[6, 6])
+    if P[6, 6] > _HEADING_SD_MAX**2 or any(
+        c[0] < cost + _RIVAL_COST and abs(wrap(c[2][6] - x[6])) > far for c in candidates
+    ):
+        return None
+    x[6] = wrap(float(x[6]))
+    return x, P
 
 
 def _is_sound(fit: tuple[float, Array, Array]) -> bool:

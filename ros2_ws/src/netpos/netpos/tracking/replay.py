@@ -3,20 +3,33 @@ node."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from netpos.bags import BagError, BagReader, BagWriter, codec
+from netpos.bags import (
+    BagEntry,
+    BagError,
+    BagReader,
+    BagWriter,
+    TopicInfo,
+    cdr_codec,
+    codec,
+    has_common_definition,
+)
 from netpos.messages import topics
+from netpos.messages.values import ImuSample, Odometry
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.sequencer import Item
 from netpos.tracking.settings import TRACKER_METADATA, bag_settings
+from netpos.tracking.smoothing import Smoother
 from netpos.tracking.track import TrackOutput
 from netpos.tracking.tracker import Tracker
+
+_ODOMETRY = "nav_msgs/msg/Odometry"
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,15 +46,16 @@ def replay_bag(
     bag_out: Path,
     overrides: Mapping[str, Any] | None = None,
     progress: Callable[[int], None] | None = None,
+    *,
+    smooth: bool = False,
 ) -> ReplaySummary:
     """Run a bag's measurements through the tracker and write a bag with all input and the new
     output.
 
     Parameters come from the bag's own metadata, then ``overrides``. ``progress`` is called with
-    the
-    number of messages done. Raises ``BagError`` for a bag without measurements, ``ValueError`` for
-    a
-    bad parameter, ``FileExistsError`` where ``bag_out`` exists.
+    the number of messages done. ``smooth`` adds the odometry of every epoch given all
+    measurements. Raises ``BagError`` for a bag without measurements, ``ValueError`` for a bad
+    parameter, ``FileExistsError`` where ``bag_out`` exists.
     """
     with BagReader(bag_in) as source:
         parameters = {**bag_settings(source.metadata).parameters, **(overrides or {})}
@@ -51,7 +65,7 @@ def replay_bag(
                 f"{bag_in} has no {topics.RSU_MEASUREMENTS}: record that topic to replay"
             )
         metadata = {**source.metadata, TRACKER_METADATA: yaml.safe_dump(asdict(config))}
-        tracker = Tracker(config)
+        tracker = Tracker(config, keep_posteriors=smooth)
         epochs = 0
         with BagWriter(bag_out, metadata=metadata) as out:
             for name, info in source.topics.items():
@@ -63,6 +77,8 @@ def replay_bag(
                     write_output(out, output)
                 if progress is not None:
                     progress(done)
+            for vue_id, posteriors in tracker.posteriors().items() if smooth else ():
+                _write_smoothed(out, vue_id, Smoother(vue_id, config).interval(posteriors))
         return ReplaySummary(epochs, {v: dict(c) for v, c in tracker.rejected().items()})
 
 
@@ -70,43 +86,79 @@ def _through(tracker: Tracker, source: BagReader, out: BagWriter) -> Iterator[li
     """Feed every message to the tracker and copy it, unless a tracker wrote it."""
     for entry in source.messages([topics.RSU_INFO]):
         tracker.add_rsu(codec().rsu_info_from_msg(entry.message))
-    for entry in source.messages():
-        if topics.is_tracker_output(entry.topic):
-            continue
+    read = {name: reading_of(name, info, tracker.config) for name, info in source.topics.items()}
+    for entry in source.messages([t for t in source.topics if not topics.is_tracker_output(t)]):
         out.write_raw(entry.topic, entry.type_name, entry.cdr, entry.log_time_ns)
-        item = item_of(entry.topic, entry)
-        if item is not None:
-            tracker.add(item)
+        item_of = read[entry.topic]
+        if item_of is not None:
+            tracker.add(item_of(entry))
             yield tracker.process()
     yield tracker.flush()
 
 
-def item_of(topic: str, entry: Any) -> Item | None:
-    """Tracker input of a bag entry (``entry.message`` is decoded only for input), else None."""
+def reading_of(
+    topic: str, info: TopicInfo, config: TrackerConfig
+) -> Callable[[BagEntry], Item | ImuSample] | None:
+    """What makes tracker input of the entries of a topic; None where the tracker takes none."""
+    make, fast = codec(), cdr_codec()
     if topic == topics.RSU_MEASUREMENTS:
-        return codec().measurement_from_msg(entry.message)
+        return _short_cut(info, fast.measurement, make.measurement_from_msg)
     vue_id, name = topics.split(topic)
     match name:
         case topics.STEP_VELOCITY:
-            return codec().velocity_from_msg(entry.message, vue_id)
+            return lambda entry: make.velocity_from_msg(entry.message, vue_id)
         case topics.GROUND_SPEED:
-            return codec().ground_speed_from_msg(entry.message, vue_id)
+            return lambda entry: make.ground_speed_from_msg(entry.message, vue_id)
         case topics.INITIAL_POSE:
-            return codec().initial_pose_from_msg(entry.message, vue_id)
+            return lambda entry: make.initial_pose_from_msg(entry.message, vue_id)
+        case topics.IMU if config.use_imu:
+            return _short_cut(
+                info,
+                lambda cdr: fast.imu(cdr, vue_id),
+                lambda msg: make.imu_from_msg(msg, vue_id),
+            )
     return None
+
+
+def _short_cut(
+    info: TopicInfo, fast: Callable[[bytes], Any], from_msg: Callable[[Any], Any]
+) -> Callable[[BagEntry], Any]:
+    """Read the bytes where they are as usual and the bag's definition is ours."""
+    if not has_common_definition(info.type_name, info.definition):
+        return lambda entry: from_msg(entry.message)
+
+    def read(entry: BagEntry) -> Any:
+        value = fast(entry.cdr)
+        return from_msg(entry.message) if value is None else value
+
+    return read
+
+
+def _write_smoothed(out: BagWriter, vue_id: str, odometry: Iterable[Odometry]) -> None:
+    topic = topics.of_vue(vue_id, topics.ODOMETRY_SMOOTHED)
+    for value in odometry:
+        out.write_raw(topic, _ODOMETRY, cdr_codec().odometry(value), value.stamp_ns)
 
 
 def write_output(out: BagWriter, output: TrackOutput) -> None:
     """Write what the live node would publish, logged at its stamp."""
-    make = codec()
+    make = cdr_codec()
     status = output.status
     stamp, vue_id = status.stamp_ns, status.vue_id
+
+    def write(topic: str, type_name: str, cdr: bytes) -> None:
+        out.write_raw(topic, type_name, cdr, stamp)
+
     if output.odometry is not None:
-        message = make.odometry_to_msg(output.odometry)
-        out.write(topics.of_vue(vue_id, topics.ODOMETRY), message, stamp)
-        out.write(topics.TF, make.transform_to_msg(output.odometry), stamp)
+        topic = topics.of_vue(vue_id, topics.ODOMETRY)
+        write(topic, _ODOMETRY, make.odometry(output.odometry))
+        if not output.revised:
+            write(topics.TF, "tf2_msgs/msg/TFMessage", make.transform(output.odometry))
     if output.clock is not None:
-        message = make.clock_state_to_msg(output.clock)
-        out.write(topics.of_vue(vue_id, topics.CLOCK_STATE), message, stamp)
-    message = make.track_status_to_msg(status)
-    out.write(topics.of_vue(vue_id, topics.TRACK_STATUS), message, stamp)
+        topic = topics.of_vue(vue_id, topics.CLOCK_STATE)
+        write(topic, "netpos_msgs/msg/ClockState", make.clock_state(output.clock))
+    topic = topics.of_vue(vue_id, topics.TRACK_STATUS)
+    write(topic, "netpos_msgs/msg/TrackStatus", make.track_status(status))
+    for odometry in output.smoothed:
+        topic = topics.of_vue(vue_id, topics.ODOMETRY_SMOOTHED)
+        write(topic, _ODOMETRY, make.odometry(odometry))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from netpos.filters.measurement import Coupling, Kind, rsu_axes, scalar_values
+import numpy as np
+
+from netpos.filters.measurement import UNCOUPLED, Coupling, Kind, rsu_axes, scalar_values
 from netpos.filters.motion import N_CORE
 from netpos.messages.values import AngleConvention, Array, RsuInfo, RsuMeasurement
 
@@ -18,11 +20,20 @@ class Rsu:
 
     info: RsuInfo
     axes: Array
+    plain: bool
+    """Its errors are white and unbiased."""
 
     @classmethod
     def of(cls, info: RsuInfo) -> Rsu:
         """Rsu of its description."""
-        return cls(info, rsu_axes(info))
+        slow = (
+            info.range_bias_sd_m,
+            info.azimuth_bias_sd_rad,
+            info.elevation_bias_sd_rad,
+            info.common_range_bias_sd_m,
+            info.noise_correlation_time_s,
+        )
+        return cls(info, rsu_axes(info), not any(slow))
 
     def bias_sd(self, kind: Kind) -> float:
         """Standard deviation of the RSU's own bias in rows of a kind; 0 where it has none."""
@@ -46,15 +57,29 @@ class Rsu:
 
 @dataclass(slots=True)
 class BiasStates:
-    """State entries for the slow sensor errors of one track, added when an RSU is first heard."""
+    """State entries for the slow sensor errors of one track, added when an RSU is first heard;
+    the first has the index ``first``."""
 
+    first: int = N_CORE
     sd: list[float] = field(default_factory=list)
     tau_s: list[float] = field(default_factory=list)
     _slots: dict[tuple[str, str], int] = field(default_factory=dict)
     _last_ns: dict[tuple[str, Kind], int] = field(default_factory=dict)
 
+    def copy(self) -> BiasStates:
+        """An independent copy."""
+        return BiasStates(
+            self.first, self.sd.copy(), self.tau_s.copy(), self._slots.copy(), self._last_ns.copy()
+        )
+
+    def arrays(self) -> Array:
+        """(2, k): standard deviation and time constant of each."""
+        return np.array([self.sd, self.tau_s]).reshape(2, -1)
+
     def coupling(self, rsu: Rsu, m: RsuMeasurement) -> Coupling:
         """Coupling of the rows of ``m``; new biases are appended to ``sd`` and ``tau_s``."""
+        if rsu.plain:
+            return UNCOUPLED
         info = rsu.info
         bias: dict[Kind, int] = {}
         common: dict[Kind, int] = {}
@@ -73,12 +98,14 @@ class BiasStates:
 
     def accepted(self, rsu: Rsu, m: RsuMeasurement) -> None:
         """Note that ``m`` was fused: correlated noise is counted from here."""
+        if rsu.plain:
+            return
         for kind in rsu.kinds(m):
             self._last_ns[rsu.info.rsu_id, kind] = m.stamp_ns
 
     def _slot(self, name: tuple[str, str], sd: float, tau_s: float) -> int:
         if name not in self._slots:
-            self._slots[name] = N_CORE + len(self.sd)
+            self._slots[name] = self.first + len(self.sd)
             self.sd.append(sd)
             self.tau_s.append(tau_s)
         return self._slots[name]

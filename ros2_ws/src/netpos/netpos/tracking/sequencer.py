@@ -4,8 +4,9 @@ Messages of one channel (one topic) arrive in stamp order, those of different ch
 epoch, all items of one stamp, is
 released once nothing older or equal can be missing: its RSU measurements are complete and every
 live channel has reached its stamp.
-What is still missing is waited for until the newest stamp is ``hold`` ahead. The result depends on
-stamps alone, never on a clock.
+What is still missing is waited for until the newest stamp is ``hold`` ahead. What comes later
+than that belongs to an epoch already applied: it is kept apart, for the track to go back to that
+epoch, unless it is older than the history. The result depends on stamps alone, never on a clock.
 """
 
 from __future__ import annotations
@@ -18,8 +19,10 @@ from netpos.messages.values import GroundSpeed, InitialPose, RsuMeasurement, Vel
 Item = RsuMeasurement | Velocity | GroundSpeed | InitialPose
 
 RSU = "rsu"
+IMU = "imu"
 POSE = "initial_pose"  # before RSU in the order of application
 _LIVE_NS = 1_000_000_000
+_SET_BACK_AFTER = 10  # stamps in a row from before the history: the device's time was set back
 
 
 def channel_and_source(item: Item) -> tuple[str, str]:
@@ -40,53 +43,131 @@ class Epoch:
 
     stamp_ns: int
     items: dict[tuple[str, str], Item] = field(default_factory=dict)
+    _measured: int = 0
+    _expected: int = 0
+    _poses: int = 0
+
+    def put(self, key: tuple[str, str], item: Item) -> None:
+        """Take an item under its channel and source."""
+        self.items[key] = item
+        if key[0] == RSU:
+            self._measured += 1
+            self._expected = max(self._expected, item.expected)  # type: ignore[union-attr]
+        elif key[0] == POSE:
+            self._poses += 1
 
     def sorted(self) -> Iterator[Item]:
         """Items in the order in which they are applied."""
+        if len(self.items) == 1:
+            return iter(self.items.values())
         return (self.items[key] for key in sorted(self.items))
 
     def rsu_complete(self) -> bool:
         """Every RSU measurement announced by ``expected`` is here; False where the number is not
         announced."""
-        measured = [i for i in self.items.values() if isinstance(i, RsuMeasurement)]
-        if not measured:
-            return True
-        expected = max(m.expected for m in measured)
-        return 0 < expected <= len(measured)
+        return not self._measured or 0 < self._expected <= self._measured
+
+    def is_late_pose(self) -> bool:
+        """Nothing but an initial pose of an older stamp: it came after what else is of this
+        one."""
+        return self.only_a_pose() and any(i.stamp_ns != self.stamp_ns for i in self.items.values())
 
     def only_a_pose(self) -> bool:
         """Nothing but an initial pose: measurements of its stamp may be under way."""
-        return all(isinstance(item, InitialPose) for item in self.items.values())
+        return self._poses == len(self.items)
 
 
 class Sequencer:
     """Collects the items of one device and releases epochs in stamp order."""
 
-    def __init__(self, hold_ns: int, needs_pose: bool = False) -> None:
-        """``needs_pose``: nothing is complete before an initial pose, so that it is waited for."""
+    def __init__(
+        self,
+        hold_ns: int,
+        needs_pose: bool = False,
+        history_ns: int = 0,
+        future_ns: int = 1 << 62,
+    ) -> None:
+        """``needs_pose``: nothing is complete before an initial pose, so that it is waited for.
+
+        ``history_ns``: how much older than the newest applied epoch an item may be.
+        ``future_ns``: a stamp this far ahead of all others counts once a second one confirms it.
+        """
         self._hold_ns = hold_ns
         self._needs_pose = needs_pose
+        self._history_ns = history_ns
+        self._future_ns = future_ns
         self._pending: dict[int, Epoch] = {}
+        self._applied: dict[int, Epoch] = {}
+        self._late: list[tuple[int, Item]] = []
         self._watermark: dict[str, int] = {}
         self._released_ns = -1
         self._last_of: dict[tuple[str, str], int] = {}
+        self._suspect_ns: int | None = None
+        self._late_in_row = 0
+        self.set_back = False
+        """The device's time was set back: start anew."""
 
     def add(self, item: Item) -> str | None:
-        """Take an item; returns the reason when it is refused (``late`` or ``duplicate``)."""
+        """Take an item; returns the reason when it is refused (``late``, ``future_stamp`` or
+        ``duplicate``)."""
         stamp = item.stamp_ns
-        key = channel_and_source(item)
-        channel = key[0]
         if isinstance(item, InitialPose) and stamp <= self._released_ns:
             stamp = max(self._released_ns, 1)
-        elif stamp < self._released_ns:
-            return "late"
+        else:
+            reason = self._time_fault(stamp)
+            if reason is not None:
+                return reason
+        key = channel_and_source(item)
+        in_past = stamp <= self._released_ns and not isinstance(item, InitialPose)
+        if in_past and self._history_ns > 0:
+            return self._add_late(stamp, key, item)
         epoch = self._pending.get(stamp)
         if self._last_of.get(key) == stamp or (epoch is not None and key in epoch.items):
             return "duplicate"
         if epoch is None:
             epoch = self._pending[stamp] = Epoch(stamp)
-        epoch.items[key] = item
-        self._watermark[channel] = max(stamp, self._watermark.get(channel, stamp))
+        epoch.put(key, item)
+        self.mark(key[0], stamp)
+        return None
+
+    @property
+    def newest_ns(self) -> int:
+        """Newest stamp heard; 0 before the first."""
+        return max(self._watermark.values(), default=0)
+
+    def mark(self, channel: str, stamp_ns: int) -> None:
+        """Note that a channel has reached a stamp."""
+        self._watermark[channel] = max(stamp_ns, self._watermark.get(channel, stamp_ns))
+
+    def take_late(self) -> list[tuple[int, Item]]:
+        """Late items and their stamps, oldest first, to be merged into epochs applied before."""
+        late, self._late = self._late, []
+        return sorted(late, key=lambda entry: (entry[0], channel_and_source(entry[1])))
+
+    def applied(self, epoch: Epoch) -> None:
+        """Note that a late item made a new epoch in the past."""
+        self._applied[epoch.stamp_ns] = epoch
+
+    def _time_fault(self, stamp: int) -> str | None:
+        newest = max(self._watermark.values(), default=None)
+        if newest is None:
+            return None
+        if stamp > newest + self._future_ns:
+            suspect, self._suspect_ns = self._suspect_ns, stamp
+            if suspect is None or abs(stamp - suspect) > self._future_ns:
+                return "future_stamp"
+        self._suspect_ns = None
+        too_old = stamp < self._released_ns - self._history_ns
+        self._late_in_row = self._late_in_row + 1 if too_old else 0
+        self.set_back = self._late_in_row >= _SET_BACK_AFTER
+        return "late" if too_old else None
+
+    def _add_late(self, stamp: int, key: tuple[str, str], item: Item) -> str | None:
+        epoch = self._applied.get(stamp)
+        waiting = any((stamp, key) == (s, channel_and_source(i)) for s, i in self._late)
+        if waiting or (epoch is not None and key in epoch.items):
+            return "duplicate"
+        self._late.append((stamp, item))
         return None
 
     def release(self) -> list[Epoch]:
@@ -105,7 +186,7 @@ class Sequencer:
         A pose that nothing has followed stays: it waits for the first measurement, however long
         that takes, so that both are one epoch.
         """
-        newest = max(self._watermark.values(), default=0)
+        newest = self.newest_ns
         return [
             self._take(stamp)
             for stamp, epoch in sorted(self._pending.items())
@@ -115,6 +196,11 @@ class Sequencer:
     def _take(self, stamp: int) -> Epoch:
         epoch = self._pending.pop(stamp)
         self._released_ns = max(self._released_ns, stamp)
+        if self._history_ns > 0:
+            if not (stamp in self._applied and epoch.is_late_pose()):
+                self._applied[stamp] = epoch
+            for old in [s for s in self._applied if s < self._released_ns - self._history_ns]:
+                del self._applied[old]
         for key in epoch.items:
             self._last_of[key] = stamp
         return epoch
@@ -125,7 +211,9 @@ class Sequencer:
         newest = max(self._watermark.values())
         if newest >= epoch.stamp_ns + self._hold_ns:
             return True
-        live = [c for c, w in self._watermark.items() if w >= newest - _LIVE_NS]
-        reached = all(self._watermark[c] >= epoch.stamp_ns for c in live if c != POSE)
+        stamp = epoch.stamp_ns
+        reached = all(
+            w >= stamp or w < newest - _LIVE_NS for c, w in self._watermark.items() if c != POSE
+        )
         closed = epoch.rsu_complete() or self._watermark.get(RSU, 0) > epoch.stamp_ns
         return reached and closed and (newest > epoch.stamp_ns or not epoch.only_a_pose())

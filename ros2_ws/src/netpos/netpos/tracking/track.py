@@ -1,293 +1,414 @@
-"""One device: predict, gate, update, recover, report."""
+"""One device: order, first fix, estimate, recovery, report."""
 
 from __future__ import annotations
 
+import copy
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.stats import chi2
 
-from netpos.filters import ekf
-from netpos.filters.measurement import BIAS, COMMON, KIND, Kind, linear_rows, rsu_rows, speed_row
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS, ProcessNoise, process_noise, transition
+from netpos.filters.measurement import (
+    BIAS,
+    COMMON,
+    GROUP,
+    KIND,
+    VARIANCE,
+    Kind,
+)
 from netpos.messages.values import (
     Array,
     ClockState,
-    GroundSpeed,
     InitialPose,
     Odometry,
     RsuMeasurement,
     TrackState,
     TrackStatus,
-    Velocity,
 )
-from netpos.tracking import output
-from netpos.tracking.config import FILTER_ITERATIONS, TrackerConfig
-from netpos.tracking.initialise import Initialiser
+from netpos.tracking import estimates, output
+from netpos.tracking.batch import Batch, Source, batch_of
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.engine import GATE_SIZE
+from netpos.tracking.estimates import Estimate
+from netpos.tracking.fit import observe, row_fits, widen
+from netpos.tracking.health import RsuHealth
+from netpos.tracking.history import History, merge
+from netpos.tracking.imu_buffer import ImuBuffer
+from netpos.tracking.initialise import Initialiser, with_heading
+from netpos.tracking.models import gate_thresholds, heading_index, initial_extra_sd, pose_state
+from netpos.tracking.protection import NisWindow, protection_level, unnoticed_shift
 from netpos.tracking.rsus import BiasStates, Rsu
-from netpos.tracking.sequencer import Epoch
+from netpos.tracking.sequencer import Epoch, Item
+from netpos.tracking.smoothing import FixedLag, Posterior
 
-_MAX_DOF = 12
-_VELOCITY_H = np.eye(2, 6, k=2)
+_IMU_HOLE_S = 0.05
+_LEVEL_MAX_M = 1e6
+_BLIND_GYRO = 1.0  # rad/s/sqrt(Hz): what the heading does while the IMU is silent
 
 
 @dataclass(frozen=True, slots=True)
 class TrackOutput:
     """What a track says at one epoch; odometry is None until the first fix, clock until the first
-    TOA."""
+    TOA. ``revised``: said before of the same epoch, without what came late. ``smoothed``: earlier
+    epochs that are now ``fixed_lag_s`` old."""
 
     odometry: Odometry | None
     clock: ClockState | None
     status: TrackStatus
+    revised: bool = False
+    smoothed: tuple[Odometry, ...] = ()
 
 
 @dataclass(slots=True)
-class _Estimate:
-    stamp_ns: int
-    mean: Array
-    cov: Array
+class _State:
+    """All of a track that changes with an epoch."""
 
+    biases: BiasStates
+    initialiser: Initialiser
+    segment: int = 0
+    estimate: Estimate | None = None
+    bias: Array = field(default_factory=lambda: np.zeros((2, 0)))
+    pose: tuple[Array, Array] | None = None
+    nis_window: NisWindow = field(default_factory=NisWindow)
+    yaw: float = 0.0
+    has_clock: bool = False
+    rejected_in_row: int = 0
+    unnoticed_m: float = 0.0
+    last_accepted_ns: int = 0
+    accepted: int = 0
+    rejected: Counter[str] = field(default_factory=Counter)
 
-@dataclass(frozen=True, slots=True)
-class _Batch:
-    """Rows of one epoch and, per group, the item they come from."""
-
-    rows: Array
-    items: tuple[RsuMeasurement | Velocity | GroundSpeed, ...]
-
-
-def gate_thresholds(probability: float) -> Array:
-    """Largest accepted squared Mahalanobis distance for 0, 1, ... degrees of freedom (chi-square
-    quantiles)."""
-    thresholds: Array = np.append(0.0, chi2.ppf(probability, np.arange(1, _MAX_DOF + 1)))
-    return thresholds
+    def copy(self) -> _State:
+        twin = copy.copy(self)
+        twin.biases = self.biases.copy()
+        if self.estimate is None:
+            twin.initialiser = self.initialiser.copy()
+        else:
+            twin.estimate = self.estimate.copy()
+        twin.nis_window = self.nis_window.copy()
+        twin.rejected = self.rejected.copy()
+        return twin
 
 
 class Track:
     """Estimator of one device. Epochs come in stamp order; time is theirs."""
 
-    def __init__(self, vue_id: str, config: TrackerConfig, rsus: Mapping[str, Rsu]) -> None:
+    def __init__(
+        self,
+        vue_id: str,
+        config: TrackerConfig,
+        rsus: Mapping[str, Rsu],
+        health: RsuHealth | None = None,
+    ) -> None:
         self._vue_id = vue_id
         self._config = config
         self._rsus = rsus
+        self._health = health or RsuHealth()
         self._gate = gate_thresholds(config.gate_probability)
-        self._noise_kind = int(ProcessNoise[config.process_noise.upper()])
-        self.rejected: Counter[str] = Counter()
-        self._accepted = 0
-        self.reset()
+        self._extra_sd = initial_extra_sd(config)
+        self._heading = heading_index(config)
+        self._history: History[_State] = History(int(config.history_s * 1e9))
+        self._fixed_lag = FixedLag(vue_id, config) if config.fixed_lag_s > 0.0 else None
+        self.posteriors: list[Posterior] | None = None
+        """Where every epoch's posterior is kept, for a smoother; None: nowhere."""
+        self.imu = ImuBuffer()
+        self.refused: Counter[str] = Counter()
+        """Measurements refused at the door, by reason."""
+        self._state = self._fresh()
+
+    def _fresh(self) -> _State:
+        first = 6 + self._extra_sd.size
+        return _State(BiasStates(first), Initialiser(self._config))
+
+    @property
+    def rejected(self) -> Counter[str]:
+        """Measurements refused at the door or rejected by the track, by reason."""
+        return self.refused + self._state.rejected
 
     def reset(self) -> None:
         """Forget the estimate and start anew; the counts of accepted and rejected measurements go
         on."""
-        self._estimate: _Estimate | None = None
-        self._biases = BiasStates()
-        self._initialiser = Initialiser(self._config)
-        self._yaw = 0.0
-        self._has_clock = False
-        self._rejected_in_row = 0
-        self._last_accepted_ns = 0
+        self._history.clear()
+        self.imu = ImuBuffer()
+        self._forget()
+
+    def _forget(self) -> None:
+        old = self._state
+        self._state = self._fresh()
+        self._state.accepted, self._state.rejected = old.accepted, old.rejected
+        self._state.segment = old.segment + 1
 
     def step(self, epoch: Epoch) -> TrackOutput:
         """Apply one epoch and report."""
-        items = []
+        self._history.remember(epoch, self._state)
+        items: list[Source] = []
         for item in epoch.sorted():
             if isinstance(item, InitialPose):
                 self._start_from_pose(epoch.stamp_ns, item)
             else:
                 items.append(item)
-        batch = self._batch(items)
         nis, dof = 0.0, 0
         sources: tuple[str, ...] = ()
-        if batch is not None:
-            if self._estimate is not None and self._gap_s(epoch.stamp_ns) > self._config.max_gap_s:
-                self.reset()
-                batch = self._batch(items)
-                assert batch is not None
-            if self._estimate is None:
-                sources = self._try_first_fix(epoch.stamp_ns, batch)
-            else:
-                nis, dof, sources = self._update(epoch.stamp_ns, batch)
-        return self._report(epoch.stamp_ns, nis, dof, sources)
+        if items:
+            estimate = self._state.estimate
+            if estimate is not None:
+                gap_s = (epoch.stamp_ns - estimate.stamp_ns) * 1e-9
+                if gap_s > self._config.max_gap_s:
+                    self._forget()
+            items, watched = self._split(epoch.stamp_ns, items)
+            if items:
+                nis, dof, sources = self._apply(epoch.stamp_ns, items)
+            self._watch(epoch.stamp_ns, watched)
+        result = self._report(epoch.stamp_ns, nis, dof, sources)
+        return self._smooth(result)
 
-    def _gap_s(self, stamp_ns: int) -> float:
-        assert self._estimate is not None
-        return (stamp_ns - self._estimate.stamp_ns) * 1e-9
+    def _smooth(self, result: TrackOutput) -> TrackOutput:
+        """Keep the posterior and add what the smoother makes of it."""
+        state, estimate = self._state, self._state.estimate
+        if estimate is None or (self._fixed_lag is None and self.posteriors is None):
+            return result
+        posterior = Posterior(
+            stamp_ns=estimate.stamp_ns,
+            segment=state.segment,
+            mean=estimate.mean.copy(),
+            cov=estimate.cov.copy(),
+            motion=estimate.motion.copy(),
+            bias=state.bias,
+        )
+        if self.posteriors is not None:
+            self.posteriors.append(posterior)
+        if self._fixed_lag is None:
+            return result
+        return replace(result, smoothed=tuple(self._fixed_lag.add(posterior)))
 
-    def _batch(self, items: list[RsuMeasurement | Velocity | GroundSpeed]) -> _Batch | None:
-        blocks = []
-        for group, item in enumerate(items):
-            if isinstance(item, RsuMeasurement):
-                rsu = self._rsus[item.rsu_id]
-                coupling = self._biases.coupling(rsu, item)
-                blocks.append(rsu_rows(item, rsu.info, rsu.axes, group, coupling))
-            elif isinstance(item, Velocity):
-                blocks.append(linear_rows(item.velocity, item.cov, _VELOCITY_H, group))
+    def revise(self, late: list[tuple[int, Item]]) -> tuple[list[Epoch], TrackOutput]:
+        """Go back to the oldest of the late items and apply all epochs since then once more.
+
+        late : stamps within the history and items, oldest first
+        Returns the epochs that are new, and the report of the newest epoch.
+        """
+        epochs, state = self._history.go_back(late[0][0])
+        self._state = state or self._state
+        made = [merge(epochs, stamp_ns, item) for stamp_ns, item in late]
+        self._health.rewind(self._vue_id, epochs[0].stamp_ns)
+        smoothed: list[Odometry] = []
+        for epoch in epochs:
+            result = self.step(epoch)
+            smoothed += result.smoothed
+        new = [epoch for epoch in made if epoch is not None]
+        return new, replace(result, revised=True, smoothed=tuple(smoothed))
+
+    def _apply(self, stamp_ns: int, items: list[Source]) -> tuple[float, int, tuple[str, ...]]:
+        batch = self._batch(items)
+        if self._state.estimate is None:
+            return 0.0, 0, self._try_first_fix(stamp_ns, batch)
+        return self._update(stamp_ns, batch)
+
+    def _split(
+        self, stamp_ns: int, items: list[Source]
+    ) -> tuple[list[Source], list[RsuMeasurement]]:
+        """What may be fused, and what comes from an isolated RSU and is only looked at."""
+        if not self._config.isolate_rsus:
+            return items, []
+        used: list[Source] = []
+        watched = []
+        for item in items:
+            if isinstance(item, RsuMeasurement) and self._health.isolated(item.rsu_id, stamp_ns):
+                watched.append(item)
+                self._state.rejected["isolated_rsu"] += 1
             else:
-                blocks.append(speed_row(item.speed_mps, item.speed_var, group))
-        return _Batch(np.vstack(blocks), tuple(items)) if blocks else None
+                used.append(item)
+        return used, watched
+
+    def _batch(self, items: list[Source]) -> Batch:
+        biases = self._state.biases
+        batch = batch_of(items, self._rsus, biases, self._heading)
+        if len(biases.sd) > self._state.bias.shape[1]:
+            self._state.bias = biases.arrays()
+        return batch
 
     def _start_from_pose(self, stamp_ns: int, pose: InitialPose) -> None:
-        """Initial state and covariance: fokin2020:eq.32, 33."""
-        self.reset()
-        cfg, c = self._config, SPEED_OF_LIGHT_MPS
-        mean = np.zeros(6)
-        mean[:2] = pose.position[:2]
-        mean[5] = c * cfg.clock_drift_mean
-        sd = [1.0, 1.0, *([cfg.initial_speed_sd_mps] * 2)]
-        cov = np.diag(np.array([*sd, c * cfg.clock_offset_sd_s, c * cfg.clock_drift_sd]) ** 2)
-        cov[:2, :2] = pose.cov[:2, :2]
-        self._estimate = _Estimate(stamp_ns, mean, cov)
-        self._last_accepted_ns = stamp_ns
+        self._forget()
+        mean, cov = pose_state(self._config, pose.position[:2], pose.cov[:2, :2])
+        if self._heading >= 0:
+            self._state.pose = (mean, cov)  # the first antennas tell the heading
+            return
+        self._state.estimate = estimates.start(self._config, stamp_ns, mean, cov)
+        self._state.last_accepted_ns = stamp_ns
 
-    def _try_first_fix(self, stamp_ns: int, batch: _Batch) -> tuple[str, ...]:
-        if self._config.require_initial_pose and not self._accepted:
-            self.rejected["no_initial_pose"] += len(batch.items)
+    def _try_first_fix(self, stamp_ns: int, batch: Batch) -> tuple[str, ...]:
+        state = self._state
+        if self._config.require_initial_pose and not state.accepted and state.pose is None:
+            state.rejected["no_initial_pose"] += len(batch.items)
             return ()
         heard = tuple(self._rsus[i.rsu_id] for i in batch.items if isinstance(i, RsuMeasurement))
         bias_var = np.zeros(len(batch.rows))
         for column in (BIAS, COMMON):
             for i, index in enumerate(batch.rows[:, column].astype(int)):
-                bias_var[i] += self._biases.sd[index - 6] ** 2 if index >= 0 else 0.0
-        self._initialiser.add(stamp_ns, batch.rows, bias_var, heard)
-        solution = self._initialiser.solve()
+                if index >= 0:
+                    bias_var[i] += state.biases.sd[index - state.biases.first] ** 2
+        solution = state.pose
+        if solution is None:
+            state.initialiser.add(stamp_ns, batch.rows, bias_var, heard)
+            solution = state.initialiser.solve()
         if solution is None:
             return ()
-        self._estimate = _Estimate(stamp_ns, *solution)
-        self._has_clock = bool((batch.rows[:, KIND] == Kind.TOA).any())
+        if self._heading >= 0:
+            rows = batch.rows.copy()
+            rows[:, VARIANCE] += bias_var
+            solution = with_heading(*solution, rows, self._config.device_height_m)
+            if solution is None:
+                state.rejected["heading_open"] += len(batch.items)
+                return ()
+        state.estimate = estimates.start(self._config, stamp_ns, *solution)
+        state.has_clock = bool((batch.rows[:, KIND] == Kind.TOA).any())
         return self._note_accepted(stamp_ns, batch, np.ones(len(batch.items)))
 
-    def _update(self, stamp_ns: int, batch: _Batch) -> tuple[float, int, tuple[str, ...]]:
-        estimate = self._predict(stamp_ns)
-        if self._rejected_in_row >= self._config.inflate_after_epochs:
-            estimate = self._opened(estimate, self._config.initial_speed_sd_mps)
-        result = self._gated_update(estimate, batch)
-        if not result[2].all() and self._config.manoeuvre_speed_sd_mps > 0.0:
-            opened = self._opened(estimate, self._config.manoeuvre_speed_sd_mps)
-            after_manoeuvre = self._gated_update(opened, batch)
-            if after_manoeuvre[2].sum() > result[2].sum():
-                result = after_manoeuvre
-        mean, cov, accepted, nis, dof = result
-        if not accepted.any():
-            cov = self._predict(stamp_ns).cov
-        self._estimate = _Estimate(stamp_ns, mean, cov)
+    def _update(self, stamp_ns: int, batch: Batch) -> tuple[float, int, tuple[str, ...]]:
+        state = self._state
+        estimate = self._prepare(stamp_ns)
+        unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
+        nis, dof, accepted = estimate.step(
+            stamp_ns, unheard_s, state.rejected_in_row, batch.rows, state.bias
+        )
+        state.has_clock |= bool((batch.rows[:, KIND] == Kind.TOA).any()) and dof > 0
+        self._note_fit(stamp_ns, batch, accepted, nis, dof)
         refused = int(len(batch.items) - accepted.sum())
         if refused:
-            self.rejected["gate"] += refused
-        if not accepted.any():
-            self._rejected_in_row += 1
-            if self._rejected_in_row >= self._config.max_rejected_epochs:
-                self.rejected["track_lost"] += 1
-                self.reset()
-            return nis, dof, ()
-        self._rejected_in_row = 0
-        self._has_clock |= bool((batch.rows[:, KIND] == Kind.TOA).any())
-        return nis, dof, self._note_accepted(stamp_ns, batch, accepted)
+            state.rejected["gate"] += refused
+        sources = self._note_accepted(stamp_ns, batch, accepted) if dof > 0 else ()
+        if _mostly_accepted(batch, accepted):
+            state.rejected_in_row = 0
+            return nis, dof, sources
+        state.rejected_in_row += 1
+        if state.rejected_in_row >= self._config.max_rejected_epochs:
+            state.rejected["track_lost"] += 1
+            self._forget()
+        return nis, dof, sources
 
-    def _gated_update(
-        self, estimate: _Estimate, batch: _Batch
-    ) -> tuple[Array, Array, Array, float, int]:
-        return ekf.update(  # type: ignore[no-any-return]
-            estimate.mean,
-            estimate.cov,
-            batch.rows,
-            self._config.device_height_m,
-            self._gate,
-            FILTER_ITERATIONS[self._config.filter],
-        )
+    def _prepare(self, stamp_ns: int) -> Estimate:
+        """The estimate with the biases heard of and the IMU up to ``stamp_ns``, not yet moved."""
+        estimate = self._state.estimate
+        assert estimate is not None
+        if estimate.mean.size < self._state.biases.first + len(self._state.biases.sd):
+            estimate.grow(np.append(self._extra_sd, self._state.bias[0]))
+        if self._config.use_imu:
+            yaw, speed, uncovered_s = self.imu.increments(estimate.stamp_ns, stamp_ns)
+            blind = uncovered_s > _IMU_HOLE_S
+            estimate.drive(yaw, speed, _BLIND_GYRO if blind else self._config.gyro_noise_density)
+        return estimate
 
-    def _opened(self, estimate: _Estimate, sd: float) -> _Estimate:
-        """The estimate as if the velocity had changed by ``sd`` [m/s] since the last update."""
-        elapsed = (estimate.stamp_ns - self._last_accepted_ns) * 1e-9
-        cov = estimate.cov.copy()
-        for p in range(2):
-            cov[p, p] += (sd * elapsed) ** 2
-            cov[p, p + 2] += sd * sd * elapsed
-            cov[p + 2, p] += sd * sd * elapsed
-            cov[p + 2, p + 2] += sd * sd
-        return _Estimate(estimate.stamp_ns, estimate.mean, cov)
+    def _note_fit(
+        self, stamp_ns: int, batch: Batch, accepted: Array, nis: float, dof: int
+    ) -> None:
+        """Tell the protection level and the health of the RSUs how the epoch fitted."""
+        state = self._state
+        if dof < len(batch.rows):
+            sizes = np.bincount(batch.rows[:, GROUP].astype(int), minlength=len(accepted))
+            for size, taken in zip(sizes.tolist(), accepted, strict=True):
+                if not taken:
+                    nis += float(self._gate[min(size, GATE_SIZE - 1)])
+                    dof += size
+        if math.isfinite(nis):
+            state.nis_window.add(nis, dof)
+        assert state.estimate is not None
+        if self._config.manoeuvre_speed_sd_mps > 0.0:
+            prior, height_m = state.estimate.prior, self._config.device_height_m
+            state.unnoticed_m = unnoticed_shift(*prior, batch.rows, height_m, self._gate[2])
+        if not self._config.isolate_rsus:
+            return
+        fits = row_fits(*state.estimate.prior, batch.rows, self._config.device_height_m)
+        observe(self._health, self._vue_id, stamp_ns, batch, fits, accepted)
 
-    def _note_accepted(self, stamp_ns: int, batch: _Batch, accepted: Array) -> tuple[str, ...]:
+    def _watch(self, stamp_ns: int, watched: list[RsuMeasurement]) -> None:
+        """Compare what isolated RSUs say with the estimate, without fusing it."""
+        if not watched or self._state.estimate is None:
+            return
+        self._predict(stamp_ns)
+        mean, cov = self._state.estimate.mean, self._state.estimate.cov
+        for item in watched:
+            batch = batch_of([item], self._rsus, None, self._heading)
+            fits = row_fits(mean, cov, batch.rows, self._config.device_height_m)
+            widen(fits, batch.rows, self._rsus[item.rsu_id])
+            fitting = bool(((fits[:, 0] / fits[:, 1]) ** 2 <= self._gate[1]).all())
+            observe(self._health, self._vue_id, stamp_ns, batch, fits, np.array([fitting]))
+
+    def _note_accepted(self, stamp_ns: int, batch: Batch, accepted: Array) -> tuple[str, ...]:
+        state = self._state
         sources = []
         for item, taken in zip(batch.items, accepted, strict=True):
             if taken:
-                self._accepted += 1
+                state.accepted += 1
                 if isinstance(item, RsuMeasurement):
-                    self._biases.accepted(self._rsus[item.rsu_id], item)
+                    state.biases.accepted(self._rsus[item.rsu_id], item)
                     sources.append(item.rsu_id)
                 else:
                     sources.append(item.source)
-        self._last_accepted_ns = stamp_ns
+        state.last_accepted_ns = stamp_ns
         return tuple(sources)
 
-    def _predict(self, stamp_ns: int) -> _Estimate:
-        """Estimate at ``stamp_ns``, with the biases heard of since the last epoch appended."""
-        assert self._estimate is not None
-        cfg, c = self._config, SPEED_OF_LIGHT_MPS
-        mean, cov = self._estimate.mean, self._estimate.cov
-        sd, tau = np.array(self._biases.sd), np.array(self._biases.tau_s)
-        new = sd[mean.size - 6 :]
-        if new.size:
-            mean = np.append(mean, np.zeros(new.size))
-            grown = np.zeros((mean.size, mean.size))
-            grown[: len(cov), : len(cov)] = cov
-            grown[len(cov) :, len(cov) :] = np.diag(new**2)
-            cov = grown
-        dt = self._gap_s(stamp_ns)
-        if dt <= 0.0:
-            return _Estimate(stamp_ns, mean, cov)
-        white = cfg.process_noise == "white_acceleration"
-        Q = process_noise(
-            self._noise_kind,
-            dt,
-            cfg.accel_sd_mps2 if white else cfg.accel_density_mps2_sqrthz,
-            cfg.velocity_step_sd_mps,
-            c * cfg.clock_white_density,
-            c * cfg.clock_walk_density,
-            c * cfg.drift_step_sd,
-            sd,
-            tau,
-        )
-        return _Estimate(stamp_ns, *ekf.predict(mean, cov, transition(mean.size, dt, tau), Q))
+    def _predict(self, stamp_ns: int) -> None:
+        estimate = self._state.estimate
+        if estimate is not None and stamp_ns > estimate.stamp_ns:
+            self._prepare(stamp_ns).predict(stamp_ns, self._state.bias)
 
     def _report(
         self, stamp_ns: int, nis: float, dof: int, sources: tuple[str, ...]
     ) -> TrackOutput:
-        position_sd = 0.0
-        if self._estimate is not None:
-            self._estimate = self._predict(stamp_ns)
-            cov = self._estimate.cov
-            position_sd = math.sqrt(max(float(np.linalg.eigvalsh(cov[:2, :2])[-1]), 0.0))
+        self._predict(stamp_ns)
+        state = self._state
+        estimate = state.estimate
+        position_sd, level = 0.0, -1.0
+        if estimate is not None:
+            mean, cov = estimate.mean, estimate.cov
+            position_sd = output.largest_sd(cov)
+            risk, inflation = self._config.integrity_risk, state.nis_window.inflation()
+            level = protection_level(cov[:2, :2], risk, inflation)
+            unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
+            moved = state.unnoticed_m + self._config.manoeuvre_speed_sd_mps * unheard_s
+            level = max(level, min(moved, _LEVEL_MAX_M))
         status = TrackStatus(
             stamp_ns=stamp_ns,
             vue_id=self._vue_id,
-            state=self._state(stamp_ns, position_sd),
+            state=self._track_state(stamp_ns, position_sd),
             nis=nis,
             nis_dof=dof,
             used=len(sources),
-            accepted=self._accepted,
+            accepted=state.accepted,
             rejected=dict(self.rejected),
             sources=sources,
             position_sd_m=position_sd,
+            protection_level_m=level,
         )
-        if self._estimate is None:
+        if estimate is None:
             return TrackOutput(None, None, status)
-        mean, cov = self._estimate.mean, self._estimate.cov
-        self._yaw, yaw_var = output.heading(mean, cov, self._yaw)
+        state.yaw, yaw_var = output.heading(mean, cov, state.yaw, self._heading)
         height = self._config.device_height_m
-        odometry = output.odometry(stamp_ns, self._vue_id, mean, cov, height, self._yaw, yaw_var)
+        odometry = output.odometry(stamp_ns, self._vue_id, mean, cov, height, state.yaw, yaw_var)
+        if self._heading >= 0:
+            odometry = output.with_yaw_rate(odometry, mean, cov, self._heading)
         clock = None
-        if self._has_clock:
+        if state.has_clock:
             clock = output.clock_state(stamp_ns, self._vue_id, mean, cov)
         return TrackOutput(odometry, clock, status)
 
-    def _state(self, stamp_ns: int, position_sd: float) -> TrackState:
-        if self._estimate is None:
+    def _track_state(self, stamp_ns: int, position_sd: float) -> TrackState:
+        if self._state.estimate is None:
             return TrackState.WAITING
-        if stamp_ns - self._last_accepted_ns > self._config.coast_after_s * 1e9:
+        if stamp_ns - self._state.last_accepted_ns > self._config.coast_after_s * 1e9:
             return TrackState.COASTING
         if position_sd > self._config.initial_position_sd_max_m:
             return TrackState.INITIALISING
         return TrackState.TRACKING
+
+
+def _mostly_accepted(batch: Batch, accepted: Array) -> bool:
+    """Whether at least half of the RSUs, or of all where there is none, were accepted."""
+    votes = [
+        bool(taken)
+        for item, taken in zip(batch.items, accepted, strict=True)
+        if isinstance(item, RsuMeasurement)
+    ] or [bool(taken) for taken in accepted]
+    return 2 * sum(votes) >= len(votes)

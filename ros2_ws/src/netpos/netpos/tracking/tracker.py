@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
-from netpos.messages.values import GroundSpeed, InitialPose, RsuInfo, RsuMeasurement, Velocity
+from netpos.messages.values import (
+    GroundSpeed,
+    ImuSample,
+    InitialPose,
+    RsuInfo,
+    RsuMeasurement,
+    Velocity,
+)
 from netpos.tracking import validation
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.health import HealthConfig, RsuHealth, RsuReport
 from netpos.tracking.rsus import Rsu
-from netpos.tracking.sequencer import Epoch, Item, Sequencer
+from netpos.tracking.sequencer import IMU, Epoch, Item, Sequencer
+from netpos.tracking.smoothing import Posterior, check_smoothable
 from netpos.tracking.track import Track, TrackOutput
 
 
@@ -17,11 +26,23 @@ class Tracker:
     """Turns measurements into tracks. ``add`` what arrives, then ``process`` and publish what
     comes back."""
 
-    def __init__(self, config: TrackerConfig | None = None) -> None:
+    def __init__(
+        self, config: TrackerConfig | None = None, *, keep_posteriors: bool = False
+    ) -> None:
+        """``keep_posteriors``: for ``posteriors``, the memory of a whole recording.
+
+        Raises ``ValueError`` where they are wanted of a tracker that cannot be smoothed.
+        """
         self._config = config or TrackerConfig()
+        self._keep_posteriors = keep_posteriors
+        if keep_posteriors:
+            check_smoothable(self._config)
         self._rsus: dict[str, Rsu] = {}
         self._tracks: dict[str, Track] = {}
         self._sequencers: dict[str, Sequencer] = {}
+        settle_s = max(2.0, self._config.history_s + 1.0)
+        self._health = RsuHealth(HealthConfig(settle_s=settle_s))
+        self._touched: set[str] = set()
         self.enabled = True
 
     @property
@@ -41,40 +62,85 @@ class Tracker:
             raise ValueError(f"RSU refused: {fault}")
         self._rsus[info.rsu_id] = Rsu.of(info)
 
-    def add(self, item: Item) -> str | None:
+    def add(self, item: Item | ImuSample) -> str | None:
         """Take a measurement; returns the reason when it is refused (also counted in the track's
         status)."""
+        if isinstance(item, ImuSample):
+            return self._add_imu(item)
         reason = self._fault(item)
+        self._touched.add(item.vue_id)
         if reason is None:
-            reason = self._sequencer(item.vue_id).add(item)
+            sequencer = self._sequencer(item.vue_id)
+            reason = sequencer.add(item)
+            if sequencer.set_back:
+                self.reset(item.vue_id)
         if reason is not None:
-            self._track(item.vue_id).rejected[reason] += 1
+            self.track(item.vue_id).refused[reason] += 1
+        return reason
+
+    def _add_imu(self, sample: ImuSample) -> str | None:
+        if not self._config.use_imu:
+            return None
+        reason = validation.imu_fault(sample) if self.enabled else "disabled"
+        track = self.track(sample.vue_id)
+        if reason is None:
+            reason = track.imu.add(sample)
+        if reason is None:
+            self._sequencer(sample.vue_id).mark(IMU, sample.stamp_ns)
+            self._touched.add(sample.vue_id)
+        else:
+            track.refused[f"imu_{reason}"] += 1
         return reason
 
     def process(self) -> list[TrackOutput]:
         """Apply every epoch that is complete, oldest first, device by device."""
-        return self._apply(Sequencer.release)
+        touched, self._touched = self._touched, set()
+        return self._apply(Sequencer.release, touched)
 
     def flush(self) -> list[TrackOutput]:
         """Apply all that is pending: the recording has ended, or nothing has come for a while."""
-        return self._apply(Sequencer.flush)
+        return self._apply(Sequencer.flush, self._sequencers.keys())
 
-    def reset(self) -> None:
-        """Forget all tracks and what is pending; RSUs stay known. For a clock that jumped back."""
-        self._sequencers.clear()
-        for track in self._tracks.values():
-            track.reset()
+    def reset(self, vue_id: str | None = None) -> None:
+        """Forget all tracks, or one, and what is pending; RSUs stay known. For a clock that jumped
+        back."""
+        if vue_id is None:
+            self._health.reset()
+        for name in [vue_id] if vue_id is not None else list(self._tracks):
+            self._sequencers.pop(name, None)
+            self.track(name).reset()
 
     def rejected(self) -> dict[str, Counter[str]]:
         """Refused and rejected measurements by device and reason."""
         return {vue: track.rejected for vue, track in self._tracks.items()}
 
-    def _apply(self, take: Callable[[Sequencer], list[Epoch]]) -> list[TrackOutput]:
-        return [
-            self._track(vue).step(epoch)
-            for vue in sorted(self._sequencers)
-            for epoch in take(self._sequencers[vue])
-        ]
+    def posteriors(self) -> dict[str, list[Posterior]]:
+        """What the tracks knew after every epoch, by device, where they were asked to keep it."""
+        return {vue: track.posteriors or [] for vue, track in self._tracks.items()}
+
+    def rsu_reports(self) -> list[RsuReport]:
+        """Health of the RSUs as of the newest measurement."""
+        newest = max((s.newest_ns for s in self._sequencers.values()), default=0)
+        return self._health.reports(newest)
+
+    def _apply(
+        self, take: Callable[[Sequencer], list[Epoch]], vue_ids: Iterable[str]
+    ) -> list[TrackOutput]:
+        outputs = []
+        for vue in sorted(vue_ids):
+            if vue not in self._sequencers:
+                continue
+            sequencer, track = self._sequencers[vue], self._tracks[vue]
+            late = sequencer.take_late()
+            epochs = take(sequencer)
+            if late:
+                new, revised = track.revise(late)
+                for epoch in new:
+                    sequencer.applied(epoch)
+                if not epochs:
+                    outputs.append(revised)
+            outputs += [track.step(epoch) for epoch in epochs]
+        return outputs
 
     def _fault(self, item: Item) -> str | None:
         if not self.enabled:
@@ -94,12 +160,19 @@ class Tracker:
 
     def _sequencer(self, vue_id: str) -> Sequencer:
         if vue_id not in self._sequencers:
+            self.track(vue_id)
             self._sequencers[vue_id] = Sequencer(
-                int(self._config.hold_s * 1e9), self._config.require_initial_pose
+                int(self._config.hold_s * 1e9),
+                self._config.require_initial_pose,
+                int(self._config.history_s * 1e9),
+                int(self._config.max_future_s * 1e9),
             )
         return self._sequencers[vue_id]
 
-    def _track(self, vue_id: str) -> Track:
+    def track(self, vue_id: str) -> Track:
+        """Track of a device, new where there is none."""
         if vue_id not in self._tracks:
-            self._tracks[vue_id] = Track(vue_id, self._config, self._rsus)
+            track = Track(vue_id, self._config, self._rsus, self._health)
+            track.posteriors = [] if self._keep_posteriors else None
+            self._tracks[vue_id] = track
         return self._tracks[vue_id]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from operator import attrgetter
 
 import numpy as np
 
@@ -13,24 +14,30 @@ from netpos.messages.values import (
     Array,
     Field,
     GroundSpeed,
+    ImuSample,
     InitialPose,
     RsuInfo,
     RsuMeasurement,
     Velocity,
 )
+from netpos.tracking.output import eigenvalues
 
+# Plain integers: arithmetic of flags costs ten times as much
 _SCALARS = (
-    (Field.AZIMUTH, "azimuth_rad", "azimuth_var", 1.0),
-    (Field.ELEVATION, "elevation_rad", "elevation_var", 1.0),
-    (Field.TOA, "toa_s", "toa_var", SPEED_OF_LIGHT_MPS),
-    (Field.RANGE, "range_m", "range_var", 1.0),
-    (Field.PHASE, "phase_difference_rad", "phase_difference_var", 1.0),
+    (int(Field.AZIMUTH), attrgetter("azimuth_rad", "azimuth_var"), 1.0),
+    (int(Field.ELEVATION), attrgetter("elevation_rad", "elevation_var"), 1.0),
+    (int(Field.TOA), attrgetter("toa_s", "toa_var"), SPEED_OF_LIGHT_MPS),
+    (int(Field.RANGE), attrgetter("range_m", "range_var"), 1.0),
+    (int(Field.PHASE), attrgetter("phase_difference_rad", "phase_difference_var"), 1.0),
 )
-_FUSED = Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE | Field.POSITION
-_KNOWN = _FUSED | Field.PHASE
+_RANGE, _POSITION = int(Field.RANGE), int(Field.POSITION)
+_FUSED = int(Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE | Field.POSITION)
+_KNOWN = _FUSED | int(Field.PHASE)
 _LARGEST = 1e9
-# Standard deviations (m, rad, m/s) beyond which double precision cannot fuse with metres.
-_SD_MIN, _SD_MAX = 1e-6, 1e6
+_LEVER_ARM_MAX_M = 1e3
+# Variances (m, rad, m/s) beyond which double precision cannot fuse with metres.
+_VAR_MIN, _VAR_MAX = 1e-6**2, 1e6**2
+_ASYMMETRY_MAX = 1e-6  # relative
 _CONDITION_MIN = 1e-12  # smallest over largest eigenvalue; below it a Cholesky factor is rounding
 
 
@@ -40,21 +47,24 @@ def measurement_fault(m: RsuMeasurement) -> str | None:
         return "vue_id"
     if m.stamp_ns <= 0:
         return "zero_stamp"
-    if not m.fields or int(m.fields) & ~int(_KNOWN):
-        return "no_fields" if not m.fields else "unknown_fields"
-    if not m.fields & _FUSED:
+    fields = int(m.fields)
+    if not fields or fields & ~_KNOWN:
+        return "no_fields" if not fields else "unknown_fields"
+    if not fields & _FUSED:
         return "unsupported_fields"
-    for flag, name, var_name, scale in _SCALARS:
-        if m.fields & flag:
-            value, variance = getattr(m, name), getattr(m, var_name)
+    for flag, quantity, scale in _SCALARS:
+        if fields & flag:
+            value, variance = quantity(m)
             if not (math.isfinite(value) and abs(value) < _LARGEST and math.isfinite(variance)):
                 return "not_finite"
             if not _variance_in_range(scale * scale * variance):
                 return "variance"
-    if m.fields & Field.RANGE and m.range_m < 0.0:
+    if not all(abs(arm) < _LEVER_ARM_MAX_M for arm in m.lever_arm):
+        return "lever_arm"
+    if fields & _RANGE and m.range_m < 0.0:
         return "negative_range"
-    if m.fields & Field.POSITION:
-        return _gaussian_fault(m.position[:2], m.position_cov[:2, :2])
+    if fields & _POSITION:
+        return _gaussian_fault(m.position, m.position_cov)
     return None
 
 
@@ -76,9 +86,17 @@ def speed_fault(v: GroundSpeed) -> str | None:
     return None if _variance_in_range(v.speed_var) else "variance"
 
 
+def imu_fault(sample: ImuSample) -> str | None:
+    """Reason to refuse an IMU sample."""
+    if sample.stamp_ns <= 0:
+        return "zero_stamp"
+    values = (*sample.angular_velocity.tolist(), *sample.specific_force.tolist())
+    return None if all(abs(v) < _LARGEST for v in values) else "not_finite"
+
+
 def pose_fault(p: InitialPose) -> str | None:
     """Reason to refuse an initial pose; its stamp may be 0 (tools send it so)."""
-    return _gaussian_fault(p.position[:2], p.cov[:2, :2])
+    return _gaussian_fault(p.position, p.cov)
 
 
 def rsu_fault(info: RsuInfo) -> str | None:
@@ -103,17 +121,20 @@ def rsu_fault(info: RsuInfo) -> str | None:
 
 
 def _gaussian_fault(value: Array, cov: Array) -> str | None:
-    if not (np.isfinite(value).all() and np.isfinite(cov).all()):
+    """Judges the first two components."""
+    x, y = value[:2].tolist()
+    (xx, xy), (yx, yy) = cov[:2, :2].tolist()
+    if not all(map(math.isfinite, (x, y, xx, xy, yx, yy))):
         return "not_finite"
-    if (np.abs(value) >= _LARGEST).any():
+    if abs(x) >= _LARGEST or abs(y) >= _LARGEST:
         return "not_finite"
-    if not np.allclose(cov, cov.T, rtol=1e-6, atol=0.0):
+    if abs(xy - yx) > _ASYMMETRY_MAX * min(abs(xy), abs(yx)):
         return "variance"
-    smallest, largest = np.linalg.eigvalsh(cov)
+    smallest, largest = eigenvalues(xx, (xy + yx) / 2.0, yy)
     definite = smallest > _CONDITION_MIN * largest
     sound = definite and _variance_in_range(smallest) and _variance_in_range(largest)
     return None if sound else "variance"
 
 
 def _variance_in_range(variance: float) -> bool:
-    return bool(_SD_MIN**2 <= variance <= _SD_MAX**2)
+    return _VAR_MIN <= variance <= _VAR_MAX

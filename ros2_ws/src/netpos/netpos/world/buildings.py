@@ -19,6 +19,14 @@ def segment_blocked(ax: float, ay: float, bx: float, by: float, buildings: Array
     start = (ax, ay)
     step = (bx - ax, by - ay)
     for k in range(buildings.shape[0]):
+        if (ax <= buildings[k, 0] and bx <= buildings[k, 0]) or (
+            ax >= buildings[k, 2] and bx >= buildings[k, 2]
+        ):
+            continue  # wholly on one side: most buildings, and no division needed
+        if (ay <= buildings[k, 1] and by <= buildings[k, 1]) or (
+            ay >= buildings[k, 3] and by >= buildings[k, 3]
+        ):
+            continue
         enter = 0.0
         leave = 1.0
         for axis in range(2):

@@ -9,7 +9,14 @@ import pytest
 from filterpy.kalman import ExtendedKalmanFilter
 from netpos.filters import ekf
 from netpos.filters.measurement import VALUE, VARIANCE, linearise, rsu_axes, rsu_rows
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS, ProcessNoise, process_noise, transition
+from netpos.filters.motion import (
+    NO_BIAS,
+    SPEED_OF_LIGHT_MPS,
+    ProcessNoise,
+    motion_parameters,
+    noise,
+    transition,
+)
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 
 T = 0.1
@@ -72,9 +79,17 @@ def residual(a: Array, b: Array) -> Array:
 @pytest.mark.parametrize("kind", list(ProcessNoise))
 def test_whole_track_equals_filterpy(kind: ProcessNoise, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    none = np.zeros(0)
-    F = transition(6, T, none)
-    Q = process_noise(kind.value, T, 1.0, 0.1, 1e-2, 0.1, 1e-4 * SPEED_OF_LIGHT_MPS, none, none)
+    motion = motion_parameters(
+        noise=kind,
+        accel=1.0,
+        velocity_step=0.1,
+        offset_density=1e-2,
+        drift_density=0.1,
+        drift_step=1e-4 * SPEED_OF_LIGHT_MPS,
+    )
+    F, Q, work = np.empty((6, 6)), np.empty((6, 6)), ekf.workspace(6, 4)
+    transition(np.zeros(6), T, motion, NO_BIAS, F)
+    noise(np.zeros(6), T, motion, NO_BIAS, Q)
     truth = np.array([-30.0, 0.0, 20.0, 0.3, 6000.0, 7500.0])
     x = np.array([-27.0, 2.0, 0.0, 0.0, 0.0, 7500.0])
     P = np.diag([25.0, 25.0, 200.0, 25.0, 3e4**2, 9e3**2])
@@ -86,10 +101,10 @@ def test_whole_track_equals_filterpy(kind: ProcessNoise, seed: int) -> None:
         rows = np.vstack(
             [rsu_rows(m, RSUS[i], axes[i], i) for i, m in enumerate(measurements(rng, truth))]
         )
-        x, P = ekf.predict(x, P, F, Q)
+        ekf.predict(x, P, T, motion, NO_BIAS)
         reference.predict()
         innovation, H = linearise(rows, x, 0.0)
-        x, P = ekf.fuse(x, P, innovation, H, rows[:, VARIANCE])
+        ekf.fuse(x, P, innovation, H, rows[:, VARIANCE].copy(), np.ones(4), work)
         z, R = rows[:, VALUE][:, None], np.diag(rows[:, VARIANCE])
         reference.update(z, jacobian_of, h_of, R=R, residual=residual)
         assert np.abs(x - reference.x[:, 0]).max() < 1e-9 * STATE_SCALE
@@ -113,8 +128,11 @@ def test_nis_equals_filterpys() -> None:
         ]
     )
     innovation, H = linearise(rows, x, 0.0)
-    nis = ekf.group_nis(P, innovation, H, rows[:, VARIANCE])
+    variance = rows[:, VARIANCE].copy()
+    nis = ekf.group_nis(P, innovation, H, variance)
+    fused = ekf.fuse(x.copy(), P.copy(), innovation, H, variance, np.ones(4), ekf.workspace(6, 4))
     reference.update(
         rows[:, VALUE][:, None], jacobian_of, h_of, R=np.diag(rows[:, VARIANCE]), residual=residual
     )
     assert nis == pytest.approx(reference.mahalanobis**2, rel=1e-9)
+    assert fused == pytest.approx(reference.mahalanobis**2, rel=1e-9)

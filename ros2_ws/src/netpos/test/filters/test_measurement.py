@@ -13,13 +13,16 @@ from netpos.filters.measurement import (
     BIAS,
     COMMON,
     GATE_VARIANCE,
+    HEADING,
     KIND,
+    LEVER,
     ORIGIN,
     ROW_WIDTH,
     VALUE,
     VARIANCE,
     Kind,
     curvature_variance,
+    is_angle,
     linearise,
     predict_row,
     rsu_axes,
@@ -49,21 +52,27 @@ def random_state(rng: np.random.Generator, n: int = 9) -> Array:
     return rng.normal(size=n) * scale
 
 
-def random_row(rng: np.random.Generator, kind: Kind) -> Array:
-    """A row of an RSU with tilted axes (LINEAR: random H), own bias 6, common bias 8."""
+def random_row(rng: np.random.Generator, kind: Kind, heading: int = -1) -> Array:
+    """A row of an RSU with tilted axes (LINEAR: random H), own bias 6, common bias 8, and the
+    device's antenna off its centre, which counts sideways only with a heading."""
     row = np.zeros(ROW_WIDTH)
     row[KIND], row[VALUE], row[VARIANCE], row[GATE_VARIANCE] = kind, 0.3, 1.0, 1.0
     row[BIAS], row[COMMON] = 6, 8
     info = random_info(rng, AngleConvention.SPHERICAL)
     row[ORIGIN:AXES] = info.position
-    row[AXES:] = rsu_axes(info)
+    row[AXES:HEADING] = rsu_axes(info)
+    row[HEADING], row[LEVER:] = heading, rng.uniform(-2, 2, 3)
     return row
 
 
 def closed_form(row: Array, x: Array, height_m: float) -> float:
     """h written with SciPy and NumPy only."""
     d = np.array([x[0], x[1], height_m]) - row[ORIGIN:AXES]
-    ux, uy, uz = Rotation.from_matrix(row[AXES:].reshape(3, 3)).apply(d)
+    if row[HEADING] >= 0:
+        turn = Rotation.from_euler("z", x[int(row[HEADING])])
+        d += turn.apply([row[LEVER], row[LEVER + 1], 0.0])
+    d[2] += row[LEVER + 2]
+    ux, uy, uz = Rotation.from_matrix(row[AXES:HEADING].reshape(3, 3)).apply(d)
     r = float(np.linalg.norm(d))
     value = {
         Kind.AZIMUTH: lambda: np.arctan2(uy, ux),
@@ -78,21 +87,23 @@ def closed_form(row: Array, x: Array, height_m: float) -> float:
     return float(value) + x[6] + x[8]
 
 
+@pytest.mark.parametrize("heading", [-1, 7])
 @pytest.mark.parametrize("kind", list(Kind))
 @pytest.mark.parametrize("seed", range(20))
-def test_value_matches_closed_form(kind: Kind, seed: int) -> None:
+def test_value_matches_closed_form(kind: Kind, seed: int, heading: int) -> None:
     rng = np.random.default_rng(seed)
-    row, x, height = random_row(rng, kind), random_state(rng), rng.uniform(-3, 3)
+    row, x, height = random_row(rng, kind, heading), random_state(rng), rng.uniform(-3, 3)
     h = np.full(9, 99.0)
     value = predict_row(row, x, height, h)
     assert value == pytest.approx(closed_form(row, x, height), rel=1e-12, abs=1e-11)
 
 
+@pytest.mark.parametrize("heading", [-1, 7])
 @pytest.mark.parametrize("kind", list(Kind))
 @pytest.mark.parametrize("seed", range(20))
-def test_jacobian_matches_central_differences(kind: Kind, seed: int) -> None:
+def test_jacobian_matches_central_differences(kind: Kind, seed: int, heading: int) -> None:
     rng = np.random.default_rng(100 + seed)
-    row, x, height = random_row(rng, kind), random_state(rng), rng.uniform(-3, 3)
+    row, x, height = random_row(rng, kind, heading), random_state(rng), rng.uniform(-3, 3)
     h = np.full(9, 99.0)
     predict_row(row, x, height, h)
     eps = 1e-5
@@ -124,6 +135,24 @@ def test_jacobian_of_the_paper() -> None:
     np.testing.assert_allclose(H[1], [3 / 5, 4 / 5, 0, 0, 1, 0], rtol=1e-14)
 
 
+def test_antenna_ahead_of_a_device_heading_north() -> None:
+    """Device at (3, 2), antenna 2 m ahead of it at (3, 4): turning left moves it west, that is
+    nearer by 3/5 of 2 m per rad; all kinds see the same move."""
+    row, x, h = np.zeros(ROW_WIDTH), np.array([3.0, 2.0, 0, 0, 7.0, 0, math.pi / 2]), np.empty(7)
+    row[[BIAS, COMMON, HEADING]], row[AXES:HEADING] = (-1, -1, 6), np.eye(3).reshape(-1)
+    row[LEVER:] = 2.0, 0.0, 0.0
+    for kind, value, gradient in (
+        (Kind.RANGE, 5.0, [0.6, 0.8, 0, 0, 0, 0, -1.2]),
+        (Kind.TOA, 12.0, [0.6, 0.8, 0, 0, 1, 0, -1.2]),
+        (Kind.AZIMUTH, math.atan2(4, 3), [-4 / 25, 3 / 25, 0, 0, 0, 0, 8 / 25]),
+    ):
+        row[KIND] = kind
+        assert predict_row(row, x, 0.0, h) == pytest.approx(value, rel=1e-15)
+        np.testing.assert_allclose(h, gradient, rtol=1e-14, atol=1e-15)
+    row[KIND], row[LEVER:] = Kind.RANGE, (0.0, 1.0, 0.0)  # on its left: at (2, 2)
+    assert predict_row(row, x, 0.0, h) == pytest.approx(math.sqrt(8), rel=1e-15)
+
+
 def test_unbiased_row_leaves_bias_states_alone() -> None:
     rng = np.random.default_rng(5)
     row, x = random_row(rng, Kind.RANGE), random_state(rng)
@@ -138,8 +167,8 @@ def test_unbiased_row_leaves_bias_states_alone() -> None:
 def test_directly_above_the_rsu_stays_finite(kind: Kind) -> None:
     info = RsuInfo(rsu_id="r", position=np.array([1.0, 2.0, 5.0]))
     row = np.zeros(ROW_WIDTH)
-    row[KIND], row[BIAS], row[COMMON] = kind, -1, -1
-    row[ORIGIN:AXES], row[AXES:] = info.position, rsu_axes(info)
+    row[KIND], row[BIAS], row[COMMON], row[HEADING] = kind, -1, -1, -1
+    row[ORIGIN:AXES], row[AXES:HEADING] = info.position, rsu_axes(info)
     h = np.zeros(6)
     value = predict_row(row, np.array([1.0, 2.0, 0, 0, 0, 0]), 1.0, h)
     expected = {
@@ -156,8 +185,8 @@ def test_floors_at_the_rsu_and_at_rest() -> None:
     """At the RSU itself and at standstill the gradient is 0 or finite, never NaN."""
     h = np.zeros(6)
     row = np.zeros(ROW_WIDTH)
-    row[BIAS] = row[COMMON] = -1
-    row[AXES:] = np.eye(3).reshape(-1)
+    row[BIAS] = row[COMMON] = row[HEADING] = -1
+    row[AXES:HEADING] = np.eye(3).reshape(-1)
     row[KIND] = Kind.RANGE
     assert predict_row(row, np.zeros(6), 0.0, h) == pytest.approx(1e-6)
     np.testing.assert_array_equal(h, 0.0)
@@ -194,11 +223,34 @@ def test_wrap_at_its_boundaries(angle: float, wrapped: float) -> None:
     assert -math.pi <= wrap(angle) < math.pi
 
 
+@pytest.mark.parametrize("turns", [-3, -1, 1, 3, 1001])
+def test_wrap_beside_its_boundaries(turns: int) -> None:
+    """Odd multiples of pi and the floats about them: within [-pi, pi), and the same angle."""
+    angle = turns * math.pi
+    below, above = math.nextafter(angle, -math.inf), math.nextafter(angle, math.inf)
+    for a in (math.nextafter(below, -math.inf), below, angle, above):
+        wrapped = wrap(a)
+        assert -math.pi <= wrapped < math.pi
+        assert abs(math.remainder(wrapped - a, 2 * math.pi)) <= 1e-15 * max(abs(a), 1.0)
+        if -math.pi <= a < math.pi:
+            assert wrapped == a
+
+
+def test_only_azimuth_and_elevation_are_wrapped() -> None:
+    row = np.zeros(ROW_WIDTH)
+    angles = []
+    for kind in Kind:
+        row[KIND] = kind
+        if is_angle(row):
+            angles.append(kind)
+    assert tuple(angles) == ANGLE_KINDS
+
+
 @settings(max_examples=300, deadline=None)
 @given(st.floats(-1e12, 1e12))
 def test_wrap_is_the_ieee_remainder(angle: float) -> None:
     wrapped = wrap(angle)
-    assert -math.pi <= wrapped <= math.pi
+    assert -math.pi <= wrapped < math.pi
     apart = math.remainder(wrapped - math.remainder(angle, 2 * math.pi), 2 * math.pi)
     assert abs(apart) <= 1e-15 * abs(angle) + 1e-14
 
@@ -208,8 +260,8 @@ def test_wrap_is_the_ieee_remainder(angle: float) -> None:
 def test_angle_innovation_crosses_pi(kind: Kind, side: int) -> None:
     """Measured just one side of +-pi, predicted just the other: a small innovation."""
     row = np.zeros((1, ROW_WIDTH))
-    row[0, [KIND, BIAS, COMMON]] = kind, -1, -1
-    row[0, AXES:] = np.eye(3).reshape(-1)
+    row[0, [KIND, BIAS, COMMON, HEADING]] = kind, -1, -1, -1
+    row[0, AXES:HEADING] = np.eye(3).reshape(-1)
     x = np.array([-10.0, -side * 0.1, 0, 0, 0, 0])
     predicted = predict_row(row[0], x, 0.0, np.empty(6))
     row[0, VALUE] = predicted + 0.02 + side * 2 * math.pi
@@ -269,8 +321,16 @@ def half_trace(row: Array, x: Array, cov: Array, height_m: float) -> float:
 
 def level_row(kind: Kind, origin: Array) -> Array:
     row = random_row(np.random.default_rng(0), kind)
-    row[ORIGIN:AXES], row[AXES:] = origin, np.eye(3).reshape(-1)
+    row[ORIGIN:AXES], row[AXES:HEADING] = origin, np.eye(3).reshape(-1)
+    row[LEVER:] = 0.0
     return row
+
+
+def test_an_antenna_above_the_device_is_a_higher_device() -> None:
+    row, x = level_row(Kind.RANGE, np.array([1.0, 1.0, 4.0])), np.full(9, 2.0)
+    plain = curvature_variance(row, x, np.eye(9), 1.5)
+    row[LEVER + 2] = 1.5
+    assert curvature_variance(row, x, np.eye(9), 0.0) == pytest.approx(plain, rel=1e-12)
 
 
 @pytest.mark.parametrize("kind", [Kind.RANGE, Kind.TOA])

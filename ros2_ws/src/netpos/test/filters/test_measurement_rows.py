@@ -12,7 +12,9 @@ from netpos.filters.measurement import (
     COMMON,
     GATE_VARIANCE,
     GROUP,
+    HEADING,
     KIND,
+    LEVER,
     ORIGIN,
     ROW_WIDTH,
     VALUE,
@@ -93,7 +95,8 @@ def test_noise_free_measurement_has_no_innovation(convention: AngleConvention, s
     np.testing.assert_allclose(innovation, 0.0, atol=2e-6)
     assert rows.shape == (6, ROW_WIDTH)
     assert set(rows[:, GROUP]) == {3.0}
-    assert set(rows[:, BIAS]) == set(rows[:, COMMON]) == {-1.0}
+    assert set(rows[:, BIAS]) == set(rows[:, COMMON]) == set(rows[:, HEADING]) == {-1.0}
+    np.testing.assert_array_equal(rows[:, LEVER:], 0.0)
 
 
 def test_spherical_rows_keep_values_and_variances() -> None:
@@ -174,13 +177,15 @@ def test_linear_rows_equal_the_update_with_the_full_covariance(seed: int) -> Non
     rows = linear_rows(z, R, H, 4)
     no_gate = np.full(5, np.inf)
     rows[:, GROUP] = 0
-    mean, cov, _, nis, used = ekf.update(x, P, rows, 0.0, no_gate, 1)
+    mean, cov, accepted = x.copy(), P.copy(), np.full(1, 9.0)
+    nis, used = ekf.update(mean, cov, rows, 0.0, no_gate, 1, accepted, ekf.workspace(6, 3))
     S = H @ P @ H.T + R
     K = P @ H.T @ np.linalg.inv(S)
     np.testing.assert_allclose(mean, x + K @ (z - H @ x), rtol=1e-9)
     np.testing.assert_allclose(cov, P - K @ S @ K.T, rtol=1e-8, atol=1e-10)
     assert nis == pytest.approx((z - H @ x) @ np.linalg.solve(S, z - H @ x), rel=1e-9)
     assert used == 3
+    assert accepted.tolist() == [1.0]
 
 
 def test_linear_rows_fill_the_whole_row() -> None:
@@ -188,7 +193,7 @@ def test_linear_rows_fill_the_whole_row() -> None:
     np.testing.assert_array_equal(rows[:, GROUP], 5)
     np.testing.assert_array_equal(rows[:, KIND], Kind.LINEAR)
     np.testing.assert_array_equal(rows[:, [VARIANCE, GATE_VARIANCE]], 1.0)
-    np.testing.assert_array_equal(rows[:, [BIAS, COMMON]], -1.0)
+    np.testing.assert_array_equal(rows[:, [BIAS, COMMON, HEADING]], -1.0)
     np.testing.assert_allclose(rows[:, VALUE], [0.5, 2 / 3])
     np.testing.assert_allclose(
         rows[:, ORIGIN : ORIGIN + 6], [[0, 0, 1 / 2, 0, 0, 0], [0, 0, 0, 1 / 3, 0, 0]]
@@ -202,4 +207,4 @@ def test_linear_rows_refuse_a_covariance_that_is_none() -> None:
 
 def test_speed_row() -> None:
     (row,) = speed_row(3.0, 0.04, 2)
-    assert row.tolist() == [Kind.SPEED, 3.0, 0.04, 0.04, -1, -1, 2, *([0.0] * 12)]
+    assert row.tolist() == [Kind.SPEED, 3.0, 0.04, 0.04, -1, -1, 2, *([0.0] * 12), -1, 0, 0, 0]

@@ -60,6 +60,22 @@ def test_another_seed_gives_other_noise_on_the_same_road() -> None:
     assert a.measure(first)[0].azimuth_rad != b.measure(second)[0].azimuth_rad
 
 
+@pytest.mark.parametrize("name", ["metis_madrid", "intersection_turn"])
+def test_with_seed_is_the_scenario_loaded_with_that_seed(name: str) -> None:
+    first = Simulation(_short(name))
+    before = first.observations("vue_1")
+    other, loaded = first.with_seed(41), Simulation(load_scenario(name, 41, {"max_duration_s": 8}))
+    assert other.scenario == loaded.scenario
+    assert all(_same(a, b) for a, b in zip(other.events(), loaded.events(), strict=True))
+    for ours, theirs in zip(
+        other.observations("vue_1"), loaded.observations("vue_1"), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+    np.testing.assert_array_equal(first.observations("vue_1").values, before.values)
+    with pytest.raises(ValueError, match="seed must be >= 0, got -1"):
+        first.with_seed(-1)
+
+
 def test_order_epoch_and_grid() -> None:
     scenario = _short("metis_madrid")
     events = list(Simulation(scenario).events())

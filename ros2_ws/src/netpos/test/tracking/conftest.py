@@ -75,6 +75,36 @@ def feed(tracker: Tracker, items: Iterable[Any]) -> list[TrackOutput]:
     return tracker.process() + tracker.flush()
 
 
+def matrices(
+    kind: str,
+    dt: float,
+    accel: float,
+    velocity_step: float,
+    offset_density: float,
+    drift_density: float,
+    drift_step: float,
+) -> tuple[Array, Array]:
+    """F and Q of a constant velocity and a two-state clock in metres, written out (6, 6)."""
+    F, Q = np.eye(6), np.zeros((6, 6))
+    pairs = {"x": [0, 2], "y": [1, 3], "clock": [4, 5]}
+    integrated = np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
+    for name, (i, j) in pairs.items():
+        F[i, j] = dt
+        block = np.ix_([i, j], [i, j])
+        if kind == "continuous":
+            Q[block] = integrated * (drift_density if name == "clock" else accel) ** 2
+        elif name == "clock":
+            Q[j, j] = drift_step**2
+        elif kind == "werner":
+            Q[j, j] = velocity_step**2
+        else:
+            g = np.array([dt**2 / 2.0, dt])
+            Q[block] = accel**2 * np.outer(g, g)
+    if kind == "continuous":
+        Q[4, 4] += offset_density**2 * dt
+    return F, Q
+
+
 @pytest.fixture
 def world() -> World:
     """Three RSUs along a street."""
@@ -87,3 +117,8 @@ def world() -> World:
 @pytest.fixture(name="feed")
 def feed_fixture() -> Any:
     return feed
+
+
+@pytest.fixture(name="matrices")
+def matrices_fixture() -> Any:
+    return matrices

@@ -7,7 +7,8 @@ from dataclasses import fields
 from typing import Any
 
 import pytest
-from netpos.tracking.config import FILTER_ITERATIONS, TrackerConfig
+from netpos.tracking.config import FILTERS, TrackerConfig
+from netpos.tracking.models import FILTER_ITERATIONS
 
 RANGED = [entry for entry in fields(TrackerConfig) if "low" in entry.metadata]
 
@@ -32,7 +33,7 @@ def test_every_parameter_is_described() -> None:
 def test_choices(name: str) -> None:
     with pytest.raises(ValueError, match=rf"{name} must be one of .*, got 'best'"):
         TrackerConfig(**{name: "best"})  # type: ignore[arg-type]
-    for choice in FILTER_ITERATIONS if name == "filter" else ("continuous", "werner"):
+    for choice in FILTERS if name == "filter" else ("continuous", "werner"):
         assert getattr(TrackerConfig(**{name: choice}), name) == choice  # type: ignore[arg-type]
 
 

@@ -241,11 +241,16 @@ def test_clock_drift_within_the_window_is_part_of_the_fit() -> None:
 
 
 def test_a_fit_on_top_of_an_rsu_is_refused() -> None:
-    """A device is never within a metre of an antenna; the other solution is taken, or none."""
+    """Where angles alone place a device within a metre of an antenna, anything fits: the other
+    solution is taken, or none. Ranges may place it there."""
     config = TrackerConfig(initial_position_sd_max_m=50.0)
     stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40)]
-    for distance, found in ((0.9, False), (1.1, True)):
-        solution = solve(config, stations, at(0.0, distance), Field.RANGE)
+    for fields, distance, found in (
+        (Field.AZIMUTH, 0.9, False),
+        (Field.AZIMUTH, 1.1, True),
+        (Field.RANGE, 0.9, True),
+    ):
+        solution = solve(config, stations, at(0.0, distance), fields)
         assert (solution is not None) is found
     # the distance is from the antenna, wherever it and the device are
     level = TrackerConfig(initial_position_sd_max_m=50.0, device_height_m=3.0)
@@ -253,7 +258,7 @@ def test_a_fit_on_top_of_an_rsu_is_refused() -> None:
         rsu(x, y, position=np.array([x, y, 3.0])) for x, y in ((40, 20), (80, 20), (40, 60))
     ]
     for distance, found in ((0.9, False), (1.1, True)):
-        solution = solve(level, shifted, at(40.0, 20.0 + distance), Field.RANGE)
+        solution = solve(level, shifted, at(40.0, 20.0 + distance), Field.AZIMUTH)
         assert (solution is not None) is found
     # straight below an RSU on a mast is no such place
     high = [rsu(x, y, position=np.array([x, y, 5.0])) for x, y in ((0, 0), (40, 0), (0, 40))]

@@ -312,11 +312,12 @@ def test_covariance_is_consistent_over_many_seeds() -> None:
 
 
 def test_inconsistent_measurements_widen_the_covariance() -> None:
-    """Three ranges that do not meet by far more than their noise."""
+    """Four ranges that do not meet by far more than their noise, whichever one is left out."""
     stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40), rsu(40, 40)]
     rows = np.vstack([measure(s, at(20.0, 21.0), Field.RANGE) for s in stations])
     good, bad = rows.copy(), rows.copy()
     bad[0, 1] += 6.0
+    bad[1, 1] += 6.0
     results = []
     for values in (good, bad):
         initialiser = Initialiser(TrackerConfig(initial_position_sd_max_m=50.0))
@@ -333,6 +334,30 @@ def test_inconsistent_measurements_widen_the_covariance() -> None:
     error = results[1][0][:2] - [20.0, 21.0]
     assert error @ np.linalg.solve(results[0][1][:2, :2], error) > 20.0
     assert error @ np.linalg.solve(results[1][1][:2, :2], error) < 9.0
+
+
+@pytest.mark.parametrize("liar", range(4))
+def test_the_one_of_four_that_contradicts_the_others_is_left_out(liar: int) -> None:
+    """The fix is that of the three others, with the covariance of three."""
+    stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40), rsu(40, 40)]
+    fields = Field.AZIMUTH | Field.RANGE
+    rows = np.vstack([measure(s, at(20.0, 21.0), fields, group=i) for i, s in enumerate(stations)])
+    rows[2 * liar + 1, 1] += 30.0
+    full = Initialiser(TrackerConfig(initial_position_sd_max_m=50.0))
+    full.add(T0, rows, np.zeros(8), tuple(stations))
+    solution = full.solve()
+    assert solution is not None
+    np.testing.assert_allclose(solution[0][:2], [20.0, 21.0], atol=0.02)
+    information = np.eye(2) / 150.0**2
+    for i, s in enumerate(stations):
+        d = np.array([20.0, 21.0]) - s.info.position[:2]
+        r, across = np.hypot(*d), np.array([-d[1], d[0]])
+        if i != liar:
+            information += np.outer(d, d) / (0.3 * r) ** 2
+            information += np.outer(across, across) / (0.02 * r * r) ** 2
+    np.testing.assert_allclose(
+        solution[1][:2, :2], np.linalg.inv(information), rtol=0.02, atol=1e-4
+    )
 
 
 def test_averaging_never_beats_the_bias() -> None:

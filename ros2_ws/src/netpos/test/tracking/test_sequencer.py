@@ -92,8 +92,8 @@ def test_expected_counts(measured: list[int], complete: bool) -> None:
     epoch = Epoch(MS)
     for i, expected in enumerate(measured):
         item = rsu(1, str(i), expected)
-        epoch.items[channel_and_source(item)] = item
-    epoch.items[channel_and_source(velocity(1))] = velocity(1)
+        epoch.put(channel_and_source(item), item)
+    epoch.put(channel_and_source(velocity(1)), velocity(1))
     assert epoch.rsu_complete() is complete
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters.motion import process_noise, transition
 from netpos.messages.values import (
     Array,
     Field,
@@ -16,7 +15,7 @@ from netpos.messages.values import (
     TrackState,
 )
 from netpos.tracking import TrackOutput
-from netpos.tracking.track import gate_thresholds
+from netpos.tracking.models import gate_thresholds
 from scipy.constants import speed_of_light
 from scipy.stats import chi2
 
@@ -106,14 +105,9 @@ def test_one_kind_of_measurement_is_enough(
     assert (outputs[-1].clock is not None) is (fields is Field.TOA)
 
 
-def model_track(seed: int, kind: str) -> list[Array]:
+def model_track(seed: int, F: Array, Q: Array) -> list[Array]:
     """Truth drawn from the tracker's own model: 25 states, 0.2 s apart."""
     rng = np.random.default_rng(seed)
-    none = np.zeros(0)
-    index = {"continuous": 0, "werner": 1, "white_acceleration": 2}[kind]
-    args = (0.8, 0.4, 0.05, 0.5, 0.3)
-    Q = process_noise(index, 0.2, *args, none, none)
-    F = transition(6, 0.2, none)
     state = np.array([30.0, 0.0, 0.0, 0.0, 0.0, 0.0]) + rng.normal(size=6) * [2, 2, 3, 3, 30, 9]
     states = []
     w, V = np.linalg.eigh(Q)
@@ -124,10 +118,10 @@ def model_track(seed: int, kind: str) -> list[Array]:
     return states
 
 
-@pytest.mark.parametrize("filter_name", ["ekf", "iekf"])
+@pytest.mark.parametrize("filter_name", ["ekf", "iekf", "ukf", "srukf"])
 @pytest.mark.parametrize("kind", ["continuous", "werner", "white_acceleration"])
 def test_covariance_is_consistent_when_truth_follows_the_model(
-    world: Any, feed: Any, kind: str, filter_name: str
+    world: Any, feed: Any, matrices: Any, kind: str, filter_name: str
 ) -> None:
     """Mean NEES of position, velocity and clock at the last epoch of 60 runs, in its bounds."""
     c, runs, nees = speed_of_light, 60, []
@@ -147,13 +141,13 @@ def test_covariance_is_consistent_when_truth_follows_the_model(
         "gate_probability": 1.0,
     }
     for seed in range(runs):
-        states = model_track(seed, kind)
+        states = model_track(seed, *matrices(kind, 0.2, 0.8, 0.4, 0.05, 0.5, 0.3))
         tracker = world.tracker(**config)
         world.rng = np.random.default_rng(10_000 + seed)
         feed(tracker, [pose(0.0, 30.0, 0.0, 4.0)])
         for k, state in enumerate(states):
             feed(tracker, world.measure(0.2 * (k + 1), state))
-        estimate = tracker._tracks["vue_1"]._estimate
+        estimate = tracker._tracks["vue_1"]._state.estimate
         e = estimate.mean - states[-1]
         nees.append(e @ np.linalg.solve(estimate.cov, e))
     low, high = chi2.ppf([0.0005, 0.9995], 6 * runs) / runs
@@ -211,7 +205,7 @@ def test_initial_pose_starts_the_track_as_the_paper_does(world: Any, feed: Any) 
     (output,) = feed(tracker, [p])
     assert output.status.stamp_ns == T0
     assert (output.status.used, output.status.accepted) == (0, 0)
-    estimate = tracker._tracks["vue_1"]._estimate
+    estimate = tracker._tracks["vue_1"]._state.estimate
     c = speed_of_light
     np.testing.assert_allclose(estimate.mean, [3.0, 4.0, 0, 0, 0, 25e-6 * c])
     expected = np.diag([4.0, 9.0, 25.0, 25.0, (1e-4 * c) ** 2, (30e-6 * c) ** 2])
@@ -251,7 +245,7 @@ def test_require_initial_pose_waits_after_no_reset_but_the_first(world: Any, fee
 def test_gate_thresholds_are_chi_square_quantiles() -> None:
     t = gate_thresholds(0.95)
     np.testing.assert_allclose(t[:4], [0.0, 3.841459, 5.991465, 7.814728], atol=1e-6)
-    assert len(t) == 13
+    assert len(t) == 65
     assert np.isinf(gate_thresholds(1.0)[1:]).all()
 
 

@@ -38,7 +38,9 @@ def bits(outputs: list[TrackOutput]) -> list[bytes]:
     """Every number an output carries, bit by bit."""
     out = []
     for o in outputs:
-        numbers = [o.status.stamp_ns, o.status.nis, o.status.position_sd_m, o.status.accepted]
+        status = o.status
+        numbers = [status.stamp_ns, status.nis, status.position_sd_m, status.accepted]
+        numbers.append(status.protection_level_m)
         parts = [
             np.array(numbers, dtype=float),
             *(
@@ -55,7 +57,6 @@ def bits(outputs: list[TrackOutput]) -> list[bytes]:
         ]
         if o.clock is not None:
             parts += [np.array([o.clock.offset_s, o.clock.drift]), o.clock.cov]
-        status = o.status
         text = str((status.vue_id, status.state, status.sources, sorted(status.rejected.items())))
         out.append(b"".join(np.ascontiguousarray(p).tobytes() for p in parts) + text.encode())
     return out
@@ -112,11 +113,14 @@ def test_refused_with_its_reason_and_counted(world: Any, reason: str, item: Any)
     assert tracker.flush() == []
 
 
-def test_late_and_duplicate_are_counted_in_the_status(world: Any, feed: Any) -> None:
-    tracker = world.tracker()
+@pytest.mark.parametrize("history_s", [0.0, 0.1])
+def test_late_and_duplicate_are_counted_in_the_status(
+    world: Any, feed: Any, history_s: float
+) -> None:
+    tracker = world.tracker(history_s=history_s)
     feed(tracker, world.measure(1.0, at(1.0)))
     assert tracker.add(world.measure(1.0, at(1.0))[0]) == "duplicate"
-    assert tracker.add(world.measure(0.9, at(0.9))[0]) == "late"
+    assert tracker.add(world.measure(1.0 - history_s - 1e-9, at(1.0))[0]) == "late"
     (output,) = feed(tracker, world.measure(1.1, at(1.1)))
     assert output.status.rejected == {"duplicate": 1, "late": 1}
 
@@ -319,7 +323,7 @@ def others(draw: st.DrawFn) -> Any:
 
 CONFIGS = st.fixed_dictionaries(
     {
-        "filter": st.sampled_from(["ekf", "iekf"]),
+        "filter": st.sampled_from(["ekf", "iekf", "ukf", "srukf"]),
         "process_noise": st.sampled_from(["continuous", "werner", "white_acceleration"]),
         "gate_probability": st.sampled_from([0.99, 1.0]),
         "manoeuvre_speed_sd_mps": st.sampled_from([0.0, 5.0]),
@@ -346,7 +350,8 @@ def station(rsu_id: str) -> RsuInfo:
 
 
 def numbers(output: TrackOutput) -> Iterator[np.ndarray]:
-    yield np.array([output.status.nis, output.status.position_sd_m])
+    status = output.status
+    yield np.array([status.nis, status.position_sd_m, status.protection_level_m])
     if output.odometry is not None:
         o = output.odometry
         yield from (o.position, o.quaternion, o.linear_velocity)

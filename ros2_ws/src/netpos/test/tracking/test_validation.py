@@ -144,6 +144,11 @@ GAUSSIANS = [
     ([0.0, 0.0], np.diag([1e12, 1.01e12]), "variance"),
     ([0.0, 0.0], np.diag([0.99e12, 0.9]), "variance"),
     ([0.0, 0.0], np.diag([0.99e12, 1.1]), None),
+    # finite, but their products are not
+    ([0.0, 0.0], np.diag([1e300, 1e300]), "variance"),
+    ([0.0, 0.0], np.full((2, 2), 1e300), "variance"),
+    ([0.0, 0.0], np.array([[1.0, 1e300], [1e300, 1.0]]), "variance"),
+    ([0.0, 0.0], np.array([[1.0, -1.7e308], [-1.7e308, 1.7e308]]), "variance"),
 ]
 
 

@@ -1,0 +1,156 @@
+"""The messages of MCAP files, read and written chunk by chunk.
+
+The libraries handle them one by one, at several times the cost. What is written is byte for byte
+what mcap's own writer gives, what is read is what rosbags gives.
+"""
+
+from __future__ import annotations
+
+import struct
+from bisect import bisect_left
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from io import BytesIO
+from typing import Any
+
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Chunk
+from mcap.writer import Writer
+
+from netpos.bags.scan import unpack
+
+_HEAD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<BQHIQQ")
+_FIXED = _MESSAGE.size - _HEAD.size  # bytes of a message's record between its length and its data
+
+Found = tuple[int, int, str, bytes]  # log time, place in the file, topic, payload
+
+
+def messages_in_order(storage: Any, topics: Mapping[int, str]) -> Iterator[Found]:
+    """Messages of an indexed file in log-time order, ties in the order of the file.
+
+    ``storage`` is rosbags' reader of the file, opened; ``topics`` those wanted, by channel.
+
+    Raises
+    ------
+    ValueError, struct.error, EOFError  a chunk is damaged
+    """
+    waiting: list[Found] = []
+    chunks = sorted(enumerate(storage.chunks), key=lambda item: item[1].message_start_time)
+    for number, chunk in chunks:
+        if not chunk.message_index_offsets or topics.keys() & chunk.message_index_offsets:
+            due = bisect_left(waiting, (chunk.message_start_time,))
+            yield from waiting[:due]
+            waiting = sorted(waiting[due:] + _messages_of(storage.bio, chunk, number, topics))
+    yield from waiting
+
+
+def _messages_of(file: Any, chunk: Any, number: int, topics: Mapping[int, str]) -> list[Found]:
+    file.seek(chunk.chunk_start_offset + _HEAD.size)
+    body = file.read(chunk.chunk_length - _HEAD.size)
+    raw = unpack(Chunk.read(ReadDataStream(BytesIO(body))))
+    found: list[Found] = []
+    position, place = 0, number << 40
+    while position < len(raw):
+        if raw[position] == Opcode.MESSAGE:
+            _, size, channel, _, time, _ = _MESSAGE.unpack_from(raw, position)
+            end = position + _HEAD.size + size
+            if channel in topics:
+                cdr = raw[position + _MESSAGE.size : end]
+                found.append((time, place + position, topics[channel], cdr))
+        else:
+            end = position + _HEAD.size + _HEAD.unpack_from(raw, position)[1]
+        position = end
+    if position != len(raw):
+        raise ValueError("a record exceeds its chunk")
+    return found
+
+
+class _Index:
+    """Record that finds the messages of one channel in a chunk: log time, offset, log time, ..."""
+
+    __slots__ = ("channel_id", "pairs")
+
+    def __init__(self, channel_id: int, pairs: list[int]) -> None:
+        self.channel_id = channel_id
+        self.pairs = pairs
+
+    def write(self, records: Any) -> None:
+        """As mcap's MessageIndex."""
+        records.start_record(Opcode.MESSAGE_INDEX)
+        records.write2(self.channel_id)
+        records.write4(8 * len(self.pairs))
+        records.write(struct.pack(f"<{len(self.pairs)}Q", *self.pairs))
+        records.finish_record()
+
+
+class _Chunk:
+    """In place of mcap's builder of chunks, with the attributes its writer uses."""
+
+    def __init__(self, statistics: Any) -> None:
+        self._statistics = statistics  # of the file, brought up to date with each whole chunk
+        self.reset()
+
+    def reset(self) -> None:
+        self.count = 0  # bytes
+        self.num_messages = 0
+        self.message_start_time = 0
+        self.message_end_time = 0
+        self.message_indices: dict[int, _Index] = {}
+        self._parts: list[bytes] = []
+        self._pairs: defaultdict[int, list[int]] = defaultdict(list)
+
+    def add_schema(self, schema: Any) -> None:
+        records = RecordBuilder()
+        schema.write(records)
+        self._parts.append(records.end())
+        self.count += len(self._parts[-1])
+
+    add_channel = add_schema
+
+    def add(self, channel_id: int, log_time: int, data: bytes, publish: int, seq: int) -> None:
+        size = _FIXED + len(data)
+        head = _MESSAGE.pack(Opcode.MESSAGE, size, channel_id, seq, log_time, publish)
+        self._parts += (head, data)
+        self._pairs[channel_id] += (log_time, self.count)
+        self.count += 9 + size
+        self.num_messages += 1
+
+    def end(self) -> bytes:
+        """The records; the index and the statistics are complete from here on."""
+        times = [time for pairs in self._pairs.values() for time in pairs[::2]]
+        self.message_start_time, self.message_end_time = min(times), max(times)
+        self.message_indices = {c: _Index(c, pairs) for c, pairs in self._pairs.items()}
+        total = self._statistics
+        first = total.message_count == 0
+        start = self.message_start_time
+        total.message_start_time = start if first else min(start, total.message_start_time)
+        total.message_end_time = max(self.message_end_time, total.message_end_time)
+        total.message_count += self.num_messages
+        for channel_id, pairs in self._pairs.items():
+            total.channel_message_counts[channel_id] += len(pairs) // 2
+        return b"".join(self._parts)
+
+
+class FastWriter(Writer):  # type: ignore[misc]  # mcap has no types
+    """mcap's Writer; a chunk is written when it exceeds ``chunk_size`` bytes."""
+
+    def __init__(self, stream: Any, *, chunk_size: int, **options: Any) -> None:
+        super().__init__(stream, chunk_size=chunk_size, **options)
+        self._size = chunk_size
+        self._statistics = self._Writer__statistics
+        self._chunk = _Chunk(self._statistics)
+        self._Writer__chunk_builder = self._chunk
+
+    def add_message(
+        self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
+    ) -> None:
+        """Append a message to the chunk in progress."""
+        self._chunk.add(channel_id, log_time, data, publish_time, sequence)
+        if self._chunk.count > self._size:
+            self.flush()
+
+    def time_span(self) -> tuple[int, int]:
+        """First and last log time of all chunks written so far; 0, 0 before any."""
+        return self._statistics.message_start_time, self._statistics.message_end_time

@@ -1,0 +1,98 @@
+"""``netpos reproduce``."""
+
+from __future__ import annotations
+
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from netpos.cli.errors import WorkFailedError
+from netpos.cli.results import write_json
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+    from rich.table import Table
+
+    from netpos.evaluation.reproduce import Reproduction
+
+
+def reproduce(
+    paper: Annotated[str, typer.Argument(help="Paper, for example fokin2020.")],
+    runs: Annotated[int, typer.Option(help="Runs (seeds) of each experiment.")] = 1000,
+    seed: Annotated[int, typer.Option(help="Seed of the first run; run i has seed + i.")] = 1,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes. Default: one per processor.")
+    ] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Write the rows as JSON.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Draw the paper's pictures there.")
+    ] = None,
+) -> None:
+    """Reproduce a paper's figures; every row says whether its target is kept."""
+    from rich.console import Console  # noqa: PLC0415
+
+    from netpos.evaluation.reproduce import reproduce as run  # noqa: PLC0415
+
+    if out is not None and out.exists() and not out.is_dir():
+        raise NotADirectoryError(f"--out {out} is a file; give a folder")
+    bar = _Bar()
+    try:
+        result = run(paper, runs=runs, seed=seed, workers=workers, progress=bar.show)
+    except BrokenProcessPool as error:
+        raise WorkFailedError("a worker process died; try fewer --workers") from error
+    finally:
+        bar.stop()
+    Console().print(_table(result))
+    if json_file is not None:
+        write_json(json_file, result.to_json())
+    if out is not None:
+        for path in result.outcome.draw(out):
+            typer.echo(f"wrote {path}")
+
+
+class _Bar:
+    """Progress on stderr, one line per experiment. It starts with the first report: its thread
+    must not exist when the worker processes are forked."""
+
+    def __init__(self) -> None:
+        self._progress: Progress | None = None
+        self._tasks: dict[str, TaskID] = {}
+
+    def show(self, label: str, done: int, total: int) -> None:
+        """Report of ``frame.Progress``."""
+        if self._progress is None:
+            from rich.console import Console  # noqa: PLC0415
+            from rich.progress import Progress, TimeElapsedColumn  # noqa: PLC0415
+
+            self._progress = Progress(
+                *Progress.get_default_columns(), TimeElapsedColumn(), console=Console(stderr=True)
+            )
+            self._progress.start()
+        if label not in self._tasks:
+            self._tasks[label] = self._progress.add_task(label, total=total)
+        self._progress.update(self._tasks[label], completed=done)
+
+    def stop(self) -> None:
+        """Leave the lines as they are."""
+        if self._progress is not None:
+            self._progress.stop()
+
+
+def _table(result: Reproduction) -> Table:
+    from rich.markup import escape  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+
+    title = f"{result.paper}: {result.runs} runs from seed {result.seed}, {result.wall_s:.1f} s"
+    table = Table("figure", "unit", title=title)
+    for column in ("paper", "ours"):
+        table.add_column(column, justify="right")
+    table.add_column("ok")
+    verdicts = {True: "yes", False: "NO", None: ""}
+    for row in result.rows:
+        values = ["–" if v is None else f"{v:.3g}" for v in (row.paper, row.ours)]
+        table.add_row(escape(row.name), escape(row.unit), *values, verdicts[row.ok])
+    return table

@@ -1,0 +1,67 @@
+"""The posterior Cramér-Rao bound of a recorded run, for the tracker's own motion model."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from netpos.evaluation.bounds import bound_rmse, run_bound
+from netpos.evaluation.pairing import Stamps, Trajectory
+from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.messages.values import Array, InitialPose, RsuInfo, RsuMeasurement
+from netpos.tracking.batch import batch_of
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.models import motions_of, pose_state
+from netpos.tracking.rsus import Rsu
+
+
+def recorded_bound_m(
+    measurements: Sequence[RsuMeasurement],
+    rsus: Mapping[str, RsuInfo],
+    pose: InitialPose | None,
+    truth: Trajectory,
+    config: TrackerConfig,
+    scored_ns: Stamps,
+) -> float | None:
+    """Smallest RMSE [m] at the stamps ``scored_ns`` that the measurements of a device allow.
+
+    None where the recording does not tell: motion models that interact or follow an IMU or a
+    heading, RSUs with biases or coloured noise, fewer than two epochs within the truth.
+    """
+    known = {name: Rsu.of(info) for name, info in rsus.items()}
+    simple = config.motion_model == "constant_velocity" and len(truth) > 1
+    if not simple or not all(rsu.plain for rsu in known.values()):
+        return None
+    epochs: dict[int, list[RsuMeasurement]] = defaultdict(list)
+    first_ns, last_ns = int(truth.stamp_ns[0]), int(truth.stamp_ns[-1])
+    for m in measurements:
+        if m.rsu_id in known and first_ns <= m.stamp_ns <= last_ns:
+            epochs[m.stamp_ns].append(m)
+    if len(epochs) < 2:
+        return None
+    stamps = np.array(sorted(epochs), dtype=np.int64)
+    blocks = [batch_of(epochs[int(s)], known, None, -1).rows for s in stamps]
+    bounds = run_bound(
+        stamps,
+        np.cumsum([0, *map(len, blocks)]),
+        np.vstack(blocks),
+        truth.stamp_ns,
+        np.column_stack([truth.position[:, :2], truth.velocity[:, :2]]),
+        _prior(config, pose),
+        motions_of(config),
+        height_m=config.device_height_m,
+    )
+    scored = bounds[np.isin(stamps, scored_ns)]
+    return bound_rmse(scored) if len(scored) else None
+
+
+def _prior(config: TrackerConfig, pose: InitialPose | None) -> Array:
+    """Covariance (6, 6) of what the tracker is told before the first measurement."""
+    if pose is not None:
+        return pose_state(config, pose.position[:2], pose.cov[:2, :2])[1]
+    reach, c = config.coverage_radius_m, SPEED_OF_LIGHT_MPS
+    speed = config.initial_speed_sd_mps
+    clock = [c * config.clock_offset_sd_s, c * config.clock_drift_sd]
+    return np.diag(np.array([reach, reach, speed, speed, *clock]) ** 2)

@@ -1,0 +1,191 @@
+"""A scenario, run with one seed: simulator, filter and bound."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from netpos.evaluation.bounds import bound_covariances
+from netpos.evaluation.metrics import NS
+from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
+from netpos.filters.motion import NO_BIAS, SPEED_OF_LIGHT_MPS
+from netpos.messages.values import Array, ImuSample
+from netpos.scenario import Simulation, load_scenario
+from netpos.scenario.simulation import Beacons
+from netpos.tracking import estimates
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.engine import run_epochs
+from netpos.tracking.imu_buffer import ImuBuffer
+from netpos.tracking.models import grown, initial_extra_sd, motions_of, options_of, pose_state
+
+Ints = npt.NDArray[np.int64]
+
+VUE = "vue_1"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Experiment:
+    """A scenario with single values changed before validation, as ``load_scenario`` takes them,
+    and settings of the tracker over the scenario's own."""
+
+    name: str
+    scenario: str
+    changes: tuple[tuple[str, object], ...] = ()
+    tracker: tuple[tuple[str, object], ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Track:
+    """One run: N epochs with at least one measurement, up to the loss of the track if ``lost``.
+
+    stamps_ns (N,); truth and mean (N, n) in the filter's units; cov and bound (N, n, n); nis, dof
+    (N,)
+    """
+
+    stamps_ns: Ints
+    truth: Array
+    mean: Array
+    cov: Array
+    bound: Array
+    nis: Array
+    dof: Array
+    lost: bool
+
+    @property
+    def error_m(self) -> Array:
+        """(N,) horizontal errors."""
+        error: Array = np.hypot(*(self.mean[:, :2] - self.truth[:, :2]).T)
+        return error
+
+
+class Epochs(NamedTuple):
+    """Epochs of a run: stamps_ns (N,), row_start (N + 1,), rows (M, ROW_WIDTH)."""
+
+    stamps_ns: Ints
+    row_start: Ints
+    rows: Array
+
+
+class Setup:
+    """What all seeds of an experiment share."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        """
+        Raises
+        ------
+        ValueError  the tracker's motion models interact
+        """
+        scenario = load_scenario(experiment.scenario, changes=dict(experiment.changes))
+        self.simulation = Simulation(scenario)
+        """Under the scenario's own seed."""
+        self.config = TrackerConfig.from_mapping({**scenario.tracker, **dict(experiment.tracker)})
+        self._templates = RowTemplates.of(self.simulation.rsus, self.simulation.fields)
+        self._options = options_of(self.config)
+        self._extra_sd = initial_extra_sd(self.config)
+        self._motions = motions_of(self.config)
+        if len(self._motions) > 1:
+            raise ValueError(f"{experiment.name}: interacting motion models are not supported")
+
+    def run(self, seed: int) -> Track:
+        """Simulate, estimate and bound one seed.
+
+        Raises
+        ------
+        ValueError  the scenario gives no initial pose, or no RSU hears the first beacon
+        """
+        simulation = self.simulation.with_seed(seed)
+        pose = simulation.initial_pose(VUE)
+        if pose is None:
+            raise ValueError(
+                f"scenario {simulation.scenario.name} gives no initial pose; set initial_pose_sd_m"
+            )
+        heard, row_start, rows = observation_rows(simulation.observations(VUE), self._templates)
+        if not heard.size or heard[0] > 0:
+            raise ValueError(f"no RSU hears the first beacon of {simulation.scenario.name}")
+        epochs = Epochs(simulation.beacons(VUE).stamp_ns[heard], row_start, rows)
+        mean, cov = pose_state(self.config, pose.position[:2], pose.cov[:2, :2])
+        if self.config.use_imu:
+            done, *filled, motions = self._driven(epochs, mean, cov, simulation.imu(VUE))
+        else:
+            done, *filled = self._compiled(epochs, mean, cov)
+            motions = self._motions
+        prior = grown(mean, cov, self._extra_sd)[1]
+        truth = _truth(simulation.beacons(VUE), heard, len(prior))
+        height_m = self.config.device_height_m
+        bound = bound_covariances(*epochs, truth, prior, height_m, motions, NO_BIAS)
+        means, covs, nis, dof = (array[:done] for array in filled)
+        return Track(
+            stamps_ns=epochs.stamps_ns[:done],
+            truth=truth[:done],
+            mean=means,
+            cov=covs,
+            bound=bound[:done],
+            nis=nis,
+            dof=dof,
+            lost=done < heard.size,
+        )
+
+    def _compiled(
+        self, epochs: Epochs, mean: Array, cov: Array
+    ) -> tuple[int, Array, Array, Array, Array]:
+        """Epochs done, means, covariances, NIS, degrees of freedom: all epochs in one kernel."""
+        mean, cov = grown(mean, cov, self._extra_sd)
+        filled = _room(epochs.stamps_ns.size, mean.size)
+        taken = np.empty(epochs.stamps_ns.size)
+        motion = self._motions[0]
+        done = run_epochs(*epochs, mean, cov, motion, NO_BIAS, self._options, *filled, taken)
+        return done, *filled
+
+    def _driven(
+        self, epochs: Epochs, mean: Array, cov: Array, samples: list[ImuSample]
+    ) -> tuple[int, Array, Array, Array, Array, Array]:
+        """As ``_compiled``, epoch by epoch with the IMU between them; also the motions
+        (N, Parameter) with its increments."""
+        imu = ImuBuffer()
+        for sample in samples:
+            imu.add(sample)
+        count, config = epochs.stamps_ns.size, self.config
+        filled = _room(count, mean.size + self._extra_sd.size)
+        means, covs, nis, dof = filled
+        motions = np.tile(self._motions[0], (count, 1))
+        heard_ns = int(epochs.stamps_ns[0])
+        estimate = estimates.start(config, heard_ns, mean, cov)
+        rejected = 0
+        for k, stamp in enumerate(epochs.stamps_ns.tolist()):
+            yaw, speed, _ = imu.increments(estimate.stamp_ns, stamp)
+            estimate.drive(yaw, speed, config.gyro_noise_density)
+            rows = epochs.rows[epochs.row_start[k] : epochs.row_start[k + 1]].copy()
+            unheard_s = (stamp - heard_ns) / NS
+            nis[k], dof[k], taken = estimate.step(stamp, unheard_s, rejected, rows, NO_BIAS)
+            means[k], covs[k], motions[k] = estimate.mean, estimate.cov, estimate.motion
+            rejected = 0 if 2 * taken.sum() >= taken.size else rejected + 1
+            heard_ns = stamp if dof[k] else heard_ns
+            if rejected >= config.max_rejected_epochs:
+                return k + 1, *filled, motions
+        return count, *filled, motions
+
+
+def _room(epochs: int, n: int) -> tuple[Array, Array, Array, Array]:
+    """Means, covariances, NIS and degrees of freedom, to be filled."""
+    return np.empty((epochs, n)), np.empty((epochs, n, n)), np.empty(epochs), np.empty(epochs)
+
+
+def _truth(beacons: Beacons, heard: Ints, n: int) -> Array:
+    """(N, n) true states of the beacons ``heard`` (N,); entries beyond the six are 0."""
+    c = SPEED_OF_LIGHT_MPS
+    truth = np.zeros((heard.size, n))
+    truth[:, :2] = beacons.position[heard, :2]
+    truth[:, 2:4] = beacons.velocity[heard]
+    truth[:, 4] = c * beacons.clock_offset_s[heard]
+    truth[:, 5] = c * beacons.clock_drift[heard]
+    return truth
+
+
+@lru_cache(maxsize=4)
+def setup_of(experiment: Experiment) -> Setup:
+    """The set-up of an experiment, built once per process."""
+    return Setup(experiment)

@@ -1,0 +1,249 @@
+"""Many seeds of an experiment; only sums are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from netpos.evaluation.consistency import MeanTest, chi2_mean_bounds, effective_size
+from netpos.evaluation.metrics import MIN_SPEED_FOR_HEADING_MPS, NS, SKIP_EPOCHS
+from netpos.evaluation.reproduce.experiment import Experiment, Track, setup_of
+from netpos.evaluation.reproduce.frame import Work
+from netpos.filters.compile import kernel
+from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.messages.values import Array
+
+Ints = npt.NDArray[np.int64]
+
+DIVERGED_M = 5.0
+BIN_M = 0.002  # of the histogram of errors
+BINS = 10_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tally:
+    """Sums over the scored estimates of one run; errors in m, ns and rad."""
+
+    n: int
+    error2: float
+    error: float
+    error_max: float
+    clock: float
+    clock2: float
+    heading2: float
+    heading_n: int
+    nees: float
+    nees_n_eff: float
+    nis: float
+    dof: float
+    bound2: float
+    rate_hz: float
+    ready_s: float | None
+    speed_max: float
+    lost: bool
+
+
+@kernel
+def _sums(
+    mean: Array, cov: Array, truth: Array, bound: Array, skip: int, out: Array, histogram: Ints
+) -> Array:
+    """Add to out (8,): error^2, error, clock error and its square [ns], heading error^2, their
+    number, bound^2, largest error; count errors in the histogram; returns the NEES (N - skip,)."""
+    to_ns = 1e9 / SPEED_OF_LIGHT_MPS
+    nees = np.empty(max(mean.shape[0] - skip, 0))
+    for i in range(skip, mean.shape[0]):
+        x, y = mean[i, 0] - truth[i, 0], mean[i, 1] - truth[i, 1]
+        square = x * x + y * y
+        error = np.sqrt(square)
+        clock = to_ns * (mean[i, 4] - truth[i, 4])
+        out[0] += square
+        out[1] += error
+        out[2] += clock
+        out[3] += clock * clock
+        vx, vy = truth[i, 2], truth[i, 3]
+        if vx * vx + vy * vy > MIN_SPEED_FOR_HEADING_MPS**2:
+            wx, wy = mean[i, 2], mean[i, 3]
+            turn = np.arctan2(vx * wy - vy * wx, vx * wx + vy * wy)
+            out[4] += turn * turn
+            out[5] += 1.0
+        out[6] += bound[i, 0, 0] + bound[i, 1, 1]
+        out[7] = max(out[7], error)
+        a, b, c = cov[i, 0, 0], cov[i, 0, 1], cov[i, 1, 1]
+        nees[i - skip] = (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
+        histogram[min(int(error / BIN_M), BINS)] += 1
+    return nees
+
+
+def tally(track: Track, position_sd_max_m: float, histogram: Ints, skip: int) -> Tally:
+    """Sums of one run without its first ``skip`` estimates; errors are counted in ``histogram``
+    (BINS + 1,). Ready: position sd (largest axis) at most ``position_sd_max_m``."""
+    out = np.zeros(8)
+    nees = _sums(track.mean, track.cov, track.truth, track.bound, skip, out, histogram)
+    error2, error, clock, clock2, heading2, heading_n, bound2, error_max = out.tolist()
+    a, b, c = track.cov[:, 0, 0], track.cov[:, 0, 1], track.cov[:, 1, 1]
+    largest = (a + c) / 2 + np.hypot((a - c) / 2, b)
+    ready = np.flatnonzero(largest <= position_sd_max_m**2)
+    elapsed = (track.stamps_ns - track.stamps_ns[0]) / NS
+    speed = np.hypot(track.truth[:, 2], track.truth[:, 3])
+    return Tally(
+        n=nees.size,
+        error2=error2,
+        error=error,
+        error_max=error_max,
+        clock=clock,
+        clock2=clock2,
+        heading2=heading2,
+        heading_n=int(heading_n),
+        nees=float(nees.sum()),
+        nees_n_eff=effective_size(nees) if nees.size else 0.0,
+        nis=float(track.nis[skip:].sum()),
+        dof=float(track.dof[skip:].sum()),
+        bound2=bound2,
+        rate_hz=float((elapsed.size - 1) / elapsed[-1]),
+        ready_s=float(elapsed[ready[0]]) if ready.size else None,
+        speed_max=float(speed.max()),
+        lost=track.lost,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Batch:
+    """Some seeds: their tallies, their histogram (BINS + 1,), and squared errors (runs, N) where
+    asked for."""
+
+    tallies: list[Tally]
+    histogram: Ints
+    error2: Array | None
+
+
+def _batch(argument: tuple[Experiment, int, bool], seeds: range) -> Batch:
+    experiment, skip, series = argument
+    setup = setup_of(experiment)
+    histogram = np.zeros(BINS + 1, dtype=np.int64)
+    tallies, squares = [], []
+    for seed in seeds:
+        track = setup.run(seed)
+        tallies.append(tally(track, setup.config.initial_position_sd_max_m, histogram, skip))
+        if series:
+            squares.append(track.error_m**2)
+    return Batch(tallies=tallies, histogram=histogram, error2=_stacked(squares))
+
+
+def _stacked(series: list[Array]) -> Array | None:
+    """(runs, N), NaN where a run is shorter; None of nothing."""
+    if not series:
+        return None
+    out = np.full((len(series), max(s.size for s in series)), np.nan)
+    for row, values in zip(out, series, strict=True):
+        row[: values.size] = values
+    return out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Summary:
+    """Figures over all runs of an experiment.
+
+    rmse_m over all scored estimates, mean_error_m what fokin2020:eq.34 calls RMSE; clock_sd_ns
+    about the mean; nees of the position (2 degrees of freedom); bound_rmse_m the posterior
+    Cramér-Rao bound of rmse_m; lost: runs that ended with a lost track; diverged: these, and runs
+    with an error above 5 m; rate_hz and ready_s of the worst run, ready_s None where a run never
+    got ready; error2 (runs, N) m^2 of all estimates for experiments with one route, NaN after a
+    loss.
+    """
+
+    experiment: Experiment
+    runs: int
+    n: int
+    rmse_m: float
+    mean_error_m: float
+    error_max_m: float
+    clock_sd_ns: float
+    clock_rmse_ns: float
+    heading_rmse_deg: float | None
+    nees: MeanTest
+    nis_over_dof: float | None
+    bound_rmse_m: float
+    diverged: int
+    lost: int
+    rate_hz: float
+    ready_s: float | None
+    speed_max_mps: float
+    histogram: Ints
+    error2: Array | None
+
+    @property
+    def bound_ratio(self) -> float:
+        """RMSE over the posterior Cramér-Rao bound."""
+        return self.rmse_m / self.bound_rmse_m
+
+    def share_within(self, error_m: float) -> float:
+        """Share of estimates whose error is below a whole number of histogram bins."""
+        return float(self.histogram[: round(error_m / BIN_M)].sum() / self.histogram.sum())
+
+    def percentile_m(self, percent: float) -> float | None:
+        """Error that a share of the estimates keeps, to one bin (2 mm), upper edge; None beyond
+        the histogram (20 m)."""
+        reached = np.cumsum(self.histogram) >= percent / 100 * self.histogram.sum()
+        place = int(np.argmax(reached))
+        return (place + 1) * BIN_M if place < BINS else None
+
+    @classmethod
+    def of(cls, experiment: Experiment, batches: Iterable[Batch]) -> Summary:
+        """Figures of batches in the order of the seeds.
+
+        Raises
+        ------
+        ValueError  no run lasts longer than the estimates left out
+        """
+        kept = list(batches)
+        tallies = [t for batch in kept for t in batch.tallies]
+        n = sum(t.n for t in tallies)
+        if n == 0:
+            raise ValueError(f"{experiment.name}: no run has estimates that count")
+        clock = sum(t.clock for t in tallies) / n
+        clock2 = sum(t.clock2 for t in tallies) / n
+        headings, dof = sum(t.heading_n for t in tallies), sum(t.dof for t in tallies)
+        n_eff = sum(t.nees_n_eff for t in tallies)
+        ready = [t.ready_s for t in tallies]
+        series = [row for batch in kept if batch.error2 is not None for row in batch.error2]
+        return cls(
+            experiment=experiment,
+            runs=len(tallies),
+            n=n,
+            rmse_m=float(np.sqrt(sum(t.error2 for t in tallies) / n)),
+            mean_error_m=sum(t.error for t in tallies) / n,
+            error_max_m=max(t.error_max for t in tallies),
+            clock_sd_ns=float(np.sqrt(max(clock2 - clock**2, 0.0))),
+            clock_rmse_ns=float(np.sqrt(clock2)),
+            heading_rmse_deg=float(
+                np.rad2deg(np.sqrt(sum(t.heading2 for t in tallies) / headings))
+            )
+            if headings
+            else None,
+            nees=MeanTest(
+                mean=sum(t.nees for t in tallies) / n,
+                bounds=chi2_mean_bounds(2, n_eff),
+                n_eff=n_eff,
+            ),
+            nis_over_dof=sum(t.nis for t in tallies) / dof if dof else None,
+            bound_rmse_m=float(np.sqrt(sum(t.bound2 for t in tallies) / n)),
+            diverged=sum(t.lost or t.error_max > DIVERGED_M for t in tallies),
+            lost=sum(t.lost for t in tallies),
+            rate_hz=min(t.rate_hz for t in tallies),
+            ready_s=None if None in ready else max(r for r in ready if r is not None),
+            speed_max_mps=max(t.speed_max for t in tallies),
+            histogram=np.sum([batch.histogram for batch in kept], axis=0),
+            error2=_stacked(series),
+        )
+
+
+def monte_carlo(
+    work: Work, experiment: Experiment, *, skip: int = SKIP_EPOCHS, series: bool = False
+) -> Summary:
+    """Run an experiment over the seeds of ``work``. ``series`` keeps every error: for experiments
+    whose epochs are the same in every run."""
+    batches = work.over_seeds(experiment.name, _batch, (experiment, skip, series))
+    return Summary.of(experiment, batches)

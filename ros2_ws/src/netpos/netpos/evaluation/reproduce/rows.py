@@ -1,0 +1,124 @@
+"""Filter rows of a whole simulated run at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from netpos.filters.compile import kernel
+from netpos.filters.measurement import (
+    GATE_VARIANCE,
+    GROUP,
+    KIND,
+    ROW_WIDTH,
+    VALUE,
+    VARIANCE,
+    Kind,
+    rsu_axes,
+    rsu_rows,
+)
+from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
+from netpos.radio.measure import AZIMUTH, ELEVATION, RANGE, TOA, Observations
+
+Ints = npt.NDArray[np.int64]
+
+_COLUMNS = {
+    Kind.AZIMUTH: AZIMUTH,
+    Kind.ELEVATION: ELEVATION,
+    Kind.TOA: TOA,
+    Kind.RANGE: RANGE,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class RowTemplates:
+    """What rows of each RSU have in common: everything but value, variances and group.
+
+    rows (m, q, ROW_WIDTH) per RSU and quantity; column (q,) of ``Observations.values``; scale (q,)
+    from its unit to the row's; rank (m,) of the RSU where a tracker sorts them by name.
+    """
+
+    rows: Array
+    column: Ints
+    scale: Array
+    rank: Ints
+
+    @classmethod
+    def of(cls, rsus: tuple[RsuInfo, ...], fields: Field) -> RowTemplates:
+        """Templates of RSUs that measure ``fields`` in their own axes, without biases."""
+        rows = []
+        for info in rsus:
+            empty = RsuMeasurement(stamp_ns=1, rsu_id=info.rsu_id, vue_id="", fields=fields)
+            rows.append(rsu_rows(empty, info, rsu_axes(info), 0))
+        kinds = [Kind(int(kind)) for kind in rows[0][:, KIND]]
+        scale = [SPEED_OF_LIGHT_MPS if kind is Kind.TOA else 1.0 for kind in kinds]
+        order = np.argsort([info.rsu_id for info in rsus])
+        rank = np.empty(len(rsus), dtype=np.int64)
+        rank[order] = np.arange(len(rsus))
+        column = np.array([_COLUMNS[kind] for kind in kinds], dtype=np.int64)
+        return cls(np.array(rows), column, np.array(scale), rank)
+
+
+@kernel
+def _fill(
+    heard_by: Ints,
+    rsu: Ints,
+    values: Array,
+    variances: Array,
+    templates: Array,
+    column: Ints,
+    scale: Array,
+    rank: Ints,
+    rows: Array,
+    row_start: Ints,
+) -> None:
+    at, epoch = 0, 0
+    quantities = column.size
+    order = np.empty(rsu.shape[1], dtype=np.int64)
+    for i in range(heard_by.size):
+        if heard_by[i] == 0:
+            continue
+        row_start[epoch] = at
+        for j in range(heard_by[i]):  # insertion sort by name
+            place = j
+            while place > 0 and rank[rsu[i, order[place - 1]]] > rank[rsu[i, j]]:
+                order[place] = order[place - 1]
+                place -= 1
+            order[place] = j
+        for group in range(heard_by[i]):
+            j = order[group]
+            for q in range(quantities):
+                rows[at] = templates[rsu[i, j], q]
+                variance = scale[q] * scale[q] * variances[i, j, column[q]]
+                rows[at, VALUE] = scale[q] * values[i, j, column[q]]
+                rows[at, VARIANCE] = variance
+                rows[at, GATE_VARIANCE] = variance
+                rows[at, GROUP] = group
+                at += 1
+        epoch += 1
+    row_start[epoch] = at
+
+
+def observation_rows(seen: Observations, templates: RowTemplates) -> tuple[Ints, Ints, Array]:
+    """Epochs (N,) as indices of the beacons that were heard, row_start (N + 1,) and rows
+    (M, ROW_WIDTH): the rows of ``rsu_rows`` of every measurement, RSUs in the order of their
+    names."""
+    heard = np.flatnonzero(seen.heard_by)
+    rows = np.empty((int(seen.heard_by.sum()) * templates.column.size, ROW_WIDTH))
+    row_start = np.zeros(heard.size + 1, dtype=np.int64)
+    _fill(
+        seen.heard_by,
+        seen.rsu,
+        seen.values,
+        seen.variances,
+        templates.rows,
+        templates.column,
+        templates.scale,
+        templates.rank,
+        rows,
+        row_start,
+    )
+    return heard, row_start, rows

@@ -1,0 +1,59 @@
+"""Accepting or rejecting the rows of one epoch by group, from a given innovation covariance."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from netpos.filters.compile import kernel
+from netpos.filters.fit import distance2
+from netpos.filters.measurement import GROUP
+from netpos.messages.values import Array
+
+Indices = NDArray[np.int64]
+
+
+@kernel
+def gate_groups(
+    rows: Array, innovation: Array, S: Array, gate_nis: Array, accepted: Array
+) -> None:
+    """Fill ``accepted`` (groups,) with 1 where a group's squared Mahalanobis distance is within
+    its limit, else 0.
+
+    rows : (m, ROW_WIDTH), rows of a group adjacent
+    innovation, S : (m,), (m, m), with the gate variances
+    gate_nis : (d + 1,) largest accepted distance for d degrees of freedom; the last entry serves
+        all larger groups
+    """
+    start = 0
+    while start < rows.shape[0]:
+        group = rows[start, GROUP]
+        stop = start + 1
+        while stop < rows.shape[0] and rows[stop, GROUP] == group:
+            stop += 1
+        distance = distance2(S[start:stop, start:stop].copy(), innovation[start:stop].copy())
+        limit = gate_nis[min(stop - start, gate_nis.size - 1)]
+        accepted[int(group)] = 1.0 if distance <= limit else 0.0
+        start = stop
+
+
+@kernel
+def accepted_rows(rows: Array, accepted: Array) -> Indices:
+    """Indices of the rows whose group is accepted, (used,)."""
+    index = np.empty(rows.shape[0], np.int64)
+    used = 0
+    for i in range(rows.shape[0]):
+        if accepted[int(rows[i, GROUP])] == 1.0:
+            index[used] = i
+            used += 1
+    return index[:used]
+
+
+@kernel
+def joint_nis(innovation: Array, S: Array, index: Indices) -> float:
+    """Squared Mahalanobis distance of the rows ``index`` (used,) together."""
+    block = np.empty((index.size, index.size))
+    for i in range(index.size):
+        for j in range(index.size):
+            block[i, j] = S[index[i], index[j]]
+    return float(distance2(block, innovation[index]))

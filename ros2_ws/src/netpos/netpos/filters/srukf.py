@@ -1,0 +1,156 @@
+"""Square-root unscented Kalman filter: carries the lower factor L of P = L L'. In place.
+
+The same filter as ``ukf``, with twice its digits: nothing is ever squared, so variances 1e20 apart
+live side by side. Prediction is a QR decomposition of the weighted deviations and the noise's
+factor by rotations (one Cholesky up-date per deviation: petukhov:eq.22). The update rotates
+
+    [ chol(E E' + R)   G ]      [ chol(S)             0  ]
+    [ 0                L ]  to  [ L G' chol(S)^-T     L+ ]
+
+which gives the factor that down-dating L by the columns of K chol(S) gives (petukhov:eq.26, which
+omits chol(S)). A down-date fails where rounding makes its result indefinite; a rotation cannot:
+each diagonal entry of L is multiplied by a cosine that is positive while R is.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from netpos.filters.compile import kernel
+from netpos.filters.factor import factor
+from netpos.filters.gate import accepted_rows, gate_groups, joint_nis
+from netpos.filters.measurement import GATE_VARIANCE, VARIANCE
+from netpos.filters.motion import noise
+from netpos.filters.sigma import innovation_cov, move, regress
+from netpos.messages.values import Array
+
+__all__ = ["add_covariance", "cholesky_update", "covariance", "factor", "predict", "update"]
+
+
+@kernel
+def covariance(L: Array) -> Array:
+    """P = L L' of its factor (n, n)."""
+    return L @ L.T
+
+
+@kernel
+def cholesky_update(L: Array, x: Array, sign: float) -> bool:
+    """Factor of L L' + sign x x' in place of ``L`` (n, n), for sign 1 or -1; ``x`` (n,) is used
+    up.
+
+    False, and L as it was, where the down-dated matrix would not be positive definite.
+    """
+    n = x.size
+    if sign < 0.0:
+        return bool(_down_date(L, x))
+    for k in range(n):
+        if x[k] == 0.0:
+            continue
+        length = math.hypot(L[k, k], x[k])
+        c, s = L[k, k] / length, x[k] / length
+        L[k, k] = length
+        for i in range(k + 1, n):
+            below = L[i, k]
+            L[i, k] = c * below + s * x[i]
+            x[i] = c * x[i] - s * below
+    return True
+
+
+@kernel
+def _down_date(L: Array, x: Array) -> bool:
+    """The rotations that lift x = L p out of L: LINPACK's dchdd."""
+    n = x.size
+    rest = 1.0
+    for k in range(n):
+        for j in range(k):
+            x[k] -= L[k, j] * x[j]
+        if L[k, k] > 0.0:
+            x[k] /= L[k, k]
+            rest -= x[k] * x[k]
+        elif x[k] != 0.0:
+            return False
+    if rest <= 0.0:
+        return False
+    top = math.sqrt(rest)
+    lifted = np.zeros(n)
+    for k in range(n - 1, -1, -1):
+        length = math.hypot(top, x[k])
+        _rotate(lifted, L[:, k], k, top / length, x[k] / length)
+        top = length
+    return True
+
+
+@kernel
+def _rotate(first: Array, second: Array, start: int, c: float, s: float) -> None:
+    """Rotate two columns from entry ``start`` on."""
+    for i in range(start, first.size):
+        a, b = first[i], second[i]
+        first[i] = c * a + s * b
+        second[i] = c * b - s * a
+
+
+@kernel
+def add_covariance(L: Array, W: Array) -> None:
+    """Factor of L L' + W in place of ``L`` (n, n); ``W`` (n, n) may be singular."""
+    W_factor = factor(W)
+    for j in range(W.shape[0]):
+        cholesky_update(L, W_factor[:, j].copy(), 1.0)
+
+
+@kernel
+def predict(mean: Array, spread: Array, dt: float, motion: Array, bias: Array) -> None:
+    """Move mean (n,) and factor ``spread`` (n, n) by ``dt`` seconds; as ``ukf.predict``."""
+    if dt <= 0.0:
+        return
+    D = move(mean, spread, dt, motion, bias)
+    Q = np.empty_like(spread)
+    noise(mean, dt, motion, bias, Q)
+    spread[:] = factor(Q)
+    for j in range(D.shape[0]):
+        cholesky_update(spread, D[j], 1.0)
+
+
+@kernel
+def update(
+    mean: Array, spread: Array, rows: Array, height_m: float, gate_nis: Array, accepted: Array
+) -> tuple[float, int]:
+    """One epoch, in place; as ``ukf.update`` with the factor ``spread`` (n, n) for cov."""
+    innovation, G, E = regress(mean, spread, rows, height_m)
+    S = innovation_cov(G, E, rows[:, GATE_VARIANCE].copy())
+    gate_groups(rows, innovation, S, gate_nis, accepted)
+    index = accepted_rows(rows, accepted)
+    if index.size == 0:
+        return 0.0, 0
+    nis = joint_nis(innovation, S, index)
+    fuse(mean, spread, innovation[index], G[index], E[index], rows[index, VARIANCE])
+    return nis, index.size
+
+
+@kernel
+def fuse(
+    mean: Array, spread: Array, innovation: Array, G: Array, E: Array, variance: Array
+) -> None:
+    """Update mean (n,) and factor (n, n) with rows as ``sigma.regress`` returns them; ``G`` and
+    ``innovation`` are used up."""
+    n, m = mean.size, innovation.size
+    S = np.zeros((m, m))  # the factor: first of E E' + R, then of the whole
+    for i in range(m):
+        S[i, i] = math.sqrt(variance[i])
+    for j in range(E.shape[1]):
+        cholesky_update(S, E[:, j].copy(), 1.0)
+    for i in range(m):
+        gain = np.zeros(n)
+        for j in range(n - 1, -1, -1):
+            if G[i, j] == 0.0:
+                continue
+            length = math.hypot(S[i, i], G[i, j])
+            c, s = S[i, i] / length, G[i, j] / length
+            _rotate(S[:, i], G[:, j], i, c, s)
+            _rotate(gain, spread[:, j], j, c, s)
+        for k in range(i):
+            innovation[i] -= S[i, k] * innovation[k]
+        innovation[i] /= S[i, i]
+        for a in range(n):
+            mean[a] += gain[a] * innovation[i]

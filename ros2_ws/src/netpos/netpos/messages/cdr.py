@@ -1,0 +1,267 @@
+"""Values straight from and to the bytes of their messages (little-endian XCDR1).
+
+The short way of what ``netpos.messages.codec`` and a serialiser of whole messages do, with the
+same result, for what comes and goes many times a second.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache, lru_cache
+from typing import Any
+
+import numpy as np
+
+from netpos.messages.fields import MAP_FRAME, NS, base_link, vue_of_frame
+from netpos.messages.values import (
+    Array,
+    ClockState,
+    Field,
+    ImuSample,
+    Odometry,
+    RsuMeasurement,
+    TrackStatus,
+)
+
+STRING = "string"
+_ENCAPSULATION = b"\0\1\0\0"  # ahead of the fields; alignment counts from its end
+_NAMES = 4096  # texts kept encoded and decoded: frames, devices, RSUs, reasons
+
+
+@lru_cache(_NAMES)
+def _encoded(text: str) -> bytes:
+    return text.encode() + b"\0"
+
+
+@lru_cache(_NAMES)
+def _decoded(block: bytes) -> str:
+    if not block.endswith(b"\0"):
+        raise ValueError("a string without its end")
+    return block[:-1].decode()
+
+
+@cache
+def _fixed(codes: tuple[str, ...], phase: int) -> struct.Struct:
+    """Fields of fixed size that begin ``phase`` bytes after a multiple of 8; padding is zero."""
+    position, text = phase, "<"
+    for code in codes:
+        count, width = int(code[:-1] or 1), struct.calcsize(f"<{code[-1]}")
+        padding = -position % width
+        text += f"{padding}x" + (code if count == 1 else f"{count * width}s")
+        position += padding + count * width
+    return struct.Struct(text)
+
+
+@lru_cache(_NAMES)
+def _texts(values: tuple[str, ...], phase: int) -> bytes:
+    content = b"\0" * phase
+    for text in map(_encoded, values):
+        content += _fixed(("I",), len(content) & 7).pack(len(text)) + text
+    return content[phase:]
+
+
+def _sequence(code: str, values: Sequence[Any], phase: int) -> bytes:
+    if code == STRING:
+        return _texts(tuple(values), phase)
+    return _fixed((code,) * len(values), phase).pack(*values) if values else b""
+
+
+class Layout:
+    """How the fields of a message type lie in its bytes, however long its strings are.
+
+    ``items`` are its fields without nesting, in the order of the definition: a code of the module
+    ``struct``, an array of them (``"36d"``, as bytes), ``"string"``, or a sequence (``"Q[]"``).
+    """
+
+    def __init__(self, items: Iterable[str]) -> None:
+        # Fields of fixed size up to a string or a sequence, by where they begin; then what follows
+        self._runs: list[tuple[tuple[struct.Struct, ...], int, str]] = []
+        codes: tuple[str, ...] = ()
+        for item in (*items, ""):
+            if item in ("", STRING) or item.endswith("[]"):
+                counted = (*codes, "I") if item else codes
+                by_phase = tuple(_fixed(counted, phase) for phase in range(8))
+                self._runs.append((by_phase, len(codes), item))
+                codes = ()
+            else:
+                codes += (item,)
+
+    def pack(self, *values: Any) -> bytes:
+        """The message; ``struct.error`` where a value does not fit its field."""
+        parts, position, first = [_ENCAPSULATION], 0, 0
+        for by_phase, n, kind in self._runs:
+            fixed, last = by_phase[position & 7], first + n
+            position += fixed.size
+            if not kind:
+                parts.append(fixed.pack(*values[first:]))
+                break
+            if kind == STRING:
+                content = _encoded(values[last])
+                count = len(content)
+            else:
+                content = _sequence(kind[:-2], values[last], position & 7)
+                count = len(values[last])
+            parts += (fixed.pack(*values[first:last], count), content)
+            position += len(content)
+            first = last + 1
+        return b"".join(parts)
+
+    def unpack(self, cdr: bytes) -> list[Any] | None:
+        """The fields, or None for what needs a closer look: another encoding, a message that is
+        cut or damaged, a type with sequences."""
+        if not cdr.startswith(_ENCAPSULATION):
+            return None
+        values: list[Any] = []
+        position = 4
+        try:
+            for by_phase, _, kind in self._runs:
+                fixed = by_phase[(position - 4) & 7]
+                values += fixed.unpack_from(cdr, position)
+                position += fixed.size
+                if kind:
+                    if kind != STRING:
+                        return None
+                    end = position + values.pop()
+                    values.append(_decoded(cdr[position:end]))
+                    position = end
+        except (struct.error, ValueError):
+            return None
+        return values if 0 <= len(cdr) - position < 4 else None
+
+
+def _bytes(matrix: Array) -> bytes:
+    return np.asarray(matrix, dtype="<f8").tobytes()
+
+
+def _matrix(block: bytes, n: int) -> Array:
+    return np.frombuffer(block, dtype="<f8").reshape(n, n)
+
+
+def _shared_zeros(*shape: int) -> Array:
+    zeros = np.zeros(shape)
+    zeros.flags.writeable = False
+    return zeros
+
+
+_field = lru_cache(256)(Field)
+_first = struct.Struct("<d").unpack_from
+_NO_POSITION, _NO_COV = _shared_zeros(3), _shared_zeros(3, 3)
+_ZERO_POSITION = bytes(12 * 8)  # position and its covariance, at the end of a measurement
+
+
+class CdrCodec:
+    """Reads and writes the bytes of messages; ``items`` flattens a type for ``Layout``.
+
+    What reads returns None where the codec of messages has to look.
+    """
+
+    def __init__(self, items: Callable[[str], Iterable[str]]) -> None:
+        self._measurement = Layout(items("netpos_msgs/msg/RsuMeasurement"))
+        self._imu = Layout(items("sensor_msgs/msg/Imu"))
+        self._odometry = Layout(items("nav_msgs/msg/Odometry"))
+        self._transform = Layout(("I", *items("geometry_msgs/msg/TransformStamped")))
+        self._clock_state = Layout(items("netpos_msgs/msg/ClockState"))
+        self._track_status = Layout(items("netpos_msgs/msg/TrackStatus"))
+
+    def measurement(self, cdr: bytes) -> RsuMeasurement | None:
+        """Value of a netpos_msgs/RsuMeasurement; values are not judged here."""
+        values = self._measurement.unpack(cdr)
+        if values is None:
+            return None
+        sec, nanosec, _, rsu_id, vue_id, sequence, expected, fields, los, rssi = values[:10]
+        position, position_cov = _NO_POSITION, _NO_COV
+        if not cdr.endswith(_ZERO_POSITION):
+            position, position_cov = np.array(values[23:26]), _matrix(values[26], 3)
+        return RsuMeasurement(
+            stamp_ns=sec * NS + nanosec,
+            rsu_id=rsu_id,
+            vue_id=vue_id,
+            sequence=sequence,
+            expected=expected,
+            fields=_field(fields),
+            line_of_sight=los,
+            rssi_dbm=rssi,
+            azimuth_rad=values[10],
+            azimuth_var=values[11],
+            elevation_rad=values[12],
+            elevation_var=values[13],
+            toa_s=values[14],
+            toa_var=values[15],
+            range_m=values[16],
+            range_var=values[17],
+            phase_difference_rad=values[18],
+            phase_difference_var=values[19],
+            lever_arm=(values[20], values[21], values[22]),
+            position=position,
+            position_cov=position_cov,
+        )
+
+    def imu(self, cdr: bytes, vue_id: str | None = None) -> ImuSample | None:
+        """Value of a sensor_msgs/Imu of a device (default: the one its frame names)."""
+        values = self._imu.unpack(cdr)
+        if values is None:
+            return None
+        sec, nanosec, frame, *_, gx, gy, gz, rate_cov, ax, ay, az, force_cov = values
+        return ImuSample(
+            stamp_ns=sec * NS + nanosec,
+            vue_id=vue_id or vue_of_frame(frame),
+            angular_velocity=np.array((gx, gy, gz)),
+            specific_force=np.array((ax, ay, az)),
+            angular_velocity_var=_first(rate_cov)[0],
+            specific_force_var=_first(force_cov)[0],
+        )
+
+    def odometry(self, value: Odometry) -> bytes:
+        """nav_msgs/Odometry: pose in map, twist in the device's base_link."""
+        return self._odometry.pack(
+            *divmod(value.stamp_ns, NS),
+            MAP_FRAME,
+            base_link(value.vue_id),
+            *value.position.tolist(),
+            *value.quaternion.tolist(),
+            _bytes(value.pose_cov),
+            *value.linear_velocity.tolist(),
+            *value.angular_velocity.tolist(),
+            _bytes(value.twist_cov),
+        )
+
+    def transform(self, value: Odometry) -> bytes:
+        """tf2_msgs/TFMessage with map -> base_link."""
+        return self._transform.pack(
+            1,
+            *divmod(value.stamp_ns, NS),
+            MAP_FRAME,
+            base_link(value.vue_id),
+            *value.position.tolist(),
+            *value.quaternion.tolist(),
+        )
+
+    def clock_state(self, value: ClockState) -> bytes:
+        """netpos_msgs/ClockState."""
+        return self._clock_state.pack(
+            *divmod(value.stamp_ns, NS),
+            base_link(value.vue_id),
+            value.offset_s,
+            value.drift,
+            _bytes(value.cov),
+        )
+
+    def track_status(self, value: TrackStatus) -> bytes:
+        """netpos_msgs/TrackStatus."""
+        reasons = sorted(value.rejected)
+        return self._track_status.pack(
+            *divmod(value.stamp_ns, NS),
+            base_link(value.vue_id),
+            value.state,
+            value.nis,
+            value.nis_dof,
+            value.used,
+            value.accepted,
+            sum(value.rejected.values()),
+            reasons,
+            [value.rejected[reason] for reason in reasons],
+            value.sources,
+            value.position_sd_m,
+            value.protection_level_m,
+        )

@@ -1,0 +1,349 @@
+"""Mean and covariance of one device, carried from epoch to epoch by the chosen filter.
+
+``Single`` runs one motion model in the compiled engine, ``Interacting`` several at once, and
+``Reference`` one on FilterPy.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Protocol
+
+import numpy as np
+
+from netpos.filters import filterpy_backend, imm
+from netpos.filters.measurement import GROUP
+from netpos.filters.motion import Parameter
+from netpos.messages.values import Array
+from netpos.tracking import engine
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.engine import Option
+from netpos.tracking.models import grown, initial_extra_sd, motions_of, options_of
+
+
+class Estimate(Protocol):
+    """What a track needs of a filter. ``bias`` (2, k): sd and time constant of the bias states."""
+
+    stamp_ns: int
+
+    @property
+    def mean(self) -> Array:
+        """State (n,)."""
+
+    @property
+    def cov(self) -> Array:
+        """Covariance (n, n)."""
+
+    def grow(self, sd: Array) -> None:
+        """Append independent states of mean 0 until there are 6 + len(sd)."""
+
+    def drive(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
+        """Set what the IMU integrated since ``stamp_ns``, and how good its yaw rate was."""
+
+    def predict(self, stamp_ns: int, bias: Array) -> None:
+        """Move to ``stamp_ns``."""
+
+    def step(
+        self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
+    ) -> tuple[float, int, Array]:
+        """Move to ``stamp_ns`` and apply one epoch: NIS, its degrees of freedom and, per group,
+        whether it was accepted. ``prior`` holds the prediction afterwards."""
+
+    @property
+    def prior(self) -> tuple[Array, Array]:
+        """Mean and covariance predicted in the last ``step``."""
+
+    @property
+    def motion(self) -> Array:
+        """(Parameter,) of the last step; of no use to a smoother for interacting models."""
+
+    def copy(self) -> Estimate:
+        """An independent copy."""
+
+
+class Single:
+    """One motion model in the compiled engine."""
+
+    def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
+        self.stamp_ns = stamp_ns
+        self._options = options_of(config)
+        self._motion: Array = motions_of(config)[0].copy()
+        mean, cov = grown(mean, cov, initial_extra_sd(config))
+        self._mean, self._spread = mean.copy(), engine.to_spread(cov, self._options)
+        self._rows = 0
+        self._make_room(4)
+
+    def _make_room(self, rows: int) -> None:
+        n = self._mean.size
+        self._rows = max(rows, self._rows)
+        self._work, self._spare = engine.scratch(n, self._rows)
+        self._accepted = np.zeros((2, self._rows))
+
+    @property
+    def mean(self) -> Array:
+        return self._mean
+
+    @property
+    def cov(self) -> Array:
+        return engine.to_cov(self._spread, self._options)
+
+    @property
+    def motion(self) -> Array:
+        return self._motion
+
+    @property
+    def prior(self) -> tuple[Array, Array]:
+        n = self._mean.size
+        return self._spare[0], engine.to_cov(self._spare[1 : n + 1], self._options)
+
+    def grow(self, sd: Array) -> None:
+        if self._mean.size < 6 + sd.size:
+            mean, cov = grown(self._mean, self.cov, sd)
+            self._mean, self._spread = mean, engine.to_spread(cov, self._options)
+            self._make_room(self._rows)
+
+    def drive(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
+        self._motion[Parameter.YAW_INCREMENT] = yaw_rad
+        self._motion[Parameter.SPEED_INCREMENT] = speed_mps
+        self._motion[Parameter.GYRO] = gyro_density
+
+    def predict(self, stamp_ns: int, bias: Array) -> None:
+        dt = (stamp_ns - self.stamp_ns) * 1e-9
+        engine.predict(self._mean, self._spread, dt, self._motion, bias, self._options)
+        self.stamp_ns = stamp_ns
+
+    def step(
+        self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
+    ) -> tuple[float, int, Array]:
+        if len(rows) > self._rows:
+            self._make_room(len(rows))
+        nis, dof, _ = engine.step(
+            self._mean,
+            self._spread,
+            (stamp_ns - self.stamp_ns) * 1e-9,
+            unheard_s,
+            rejected_in_row,
+            rows,
+            self._motion,
+            bias,
+            self._options,
+            self._accepted,
+            self._work,
+            self._spare,
+        )
+        self.stamp_ns = stamp_ns
+        return nis, dof, self._accepted[0, : int(rows[-1, GROUP]) + 1]
+
+    def copy(self) -> Single:
+        twin = copy.copy(self)
+        twin._mean, twin._spread = self._mean.copy(), self._spread.copy()
+        twin._motion = self._motion.copy()
+        return twin
+
+
+class _Looks:
+    """The looks of ``engine.step`` for estimates that are not one compiled step."""
+
+    stamp_ns: int
+    mean: Array
+    cov: Array
+    _options: Array
+    _prior: tuple[Array, Array]
+
+    def _move(self, stamp_ns: int, bias: Array) -> None:
+        raise NotImplementedError
+
+    def _update(self, rows: Array, accepted: Array) -> tuple[float, int]:
+        raise NotImplementedError
+
+    def _open(self, sd: float, unheard_s: float) -> None:
+        raise NotImplementedError
+
+    def _state(self) -> tuple[Array, ...]:
+        raise NotImplementedError
+
+    def _set_state(self, state: tuple[Array, ...]) -> None:
+        raise NotImplementedError
+
+    def _note_jump(self, sd: float, unheard_s: float) -> None:
+        """Keep the velocity step allowed for, for a smoother."""
+
+    @property
+    def prior(self) -> tuple[Array, Array]:
+        return self._prior
+
+    def predict(self, stamp_ns: int, bias: Array) -> None:
+        if stamp_ns > self.stamp_ns:
+            self._move(stamp_ns, bias)
+
+    def _restore(self, state: tuple[Array, ...]) -> None:
+        self._set_state(tuple(part.copy() for part in state))
+
+    def step(
+        self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
+    ) -> tuple[float, int, Array]:
+        self.predict(stamp_ns, bias)
+        self._prior = (self.mean.copy(), self.cov.copy())
+        before = tuple(part.copy() for part in self._state())
+        opened = rejected_in_row >= self._options[Option.INFLATE_AFTER]
+        speed = float(self._options[Option.INITIAL_SPEED])
+        jump = speed if opened else 0.0
+        if opened:
+            self._open(speed, unheard_s)
+        accepted = np.zeros(int(rows[-1, GROUP]) + 1)
+        nis, used = self._update(rows, accepted)
+        manoeuvre = float(self._options[Option.MANOEUVRE_SPEED])
+        if manoeuvre > 0.0 and not accepted.all():
+            first = self._state()
+            self._restore(before)
+            if opened:
+                self._open(speed, unheard_s)
+            self._open(manoeuvre, unheard_s)
+            second = np.zeros_like(accepted)
+            second_nis, second_used = self._update(rows, second)
+            if second.sum() > accepted.sum():
+                nis, used, accepted = second_nis, second_used, second
+                jump = float(np.hypot(jump, manoeuvre))
+            else:
+                self._set_state(first)
+        if accepted.any():
+            self._note_jump(jump, unheard_s)
+        else:
+            self._restore(before)
+        return nis, used, accepted
+
+
+class Interacting(_Looks):
+    """Interacting models stop, straight and turn, each an extended Kalman filter."""
+
+    def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
+        self.stamp_ns = stamp_ns
+        self._options = options_of(config)
+        self._motions = motions_of(config)
+        count = len(self._motions)
+        self._sojourn_s = np.full(count, config.sojourn_s)
+        mean, cov = grown(mean, cov, initial_extra_sd(config))
+        self._prior = (mean, cov)
+        self._set_state(
+            (np.tile(mean, (count, 1)), np.tile(cov, (count, 1, 1)), np.full(count, 1.0 / count))
+        )
+
+    def _state(self) -> tuple[Array, ...]:
+        return self._means, self._covs, self.weights
+
+    def _set_state(self, state: tuple[Array, ...]) -> None:
+        self._means, self._covs, self.weights = state
+        self.mean = np.empty_like(self._means[0])
+        self.cov = np.empty_like(self._covs[0])
+        imm.combine(self._means, self._covs, self.weights, self.mean, self.cov)
+
+    def grow(self, sd: Array) -> None:
+        if self.mean.size < 6 + sd.size:
+            pairs = [grown(m, c, sd) for m, c in zip(self._means, self._covs, strict=True)]
+            means = np.array([mean for mean, _ in pairs])
+            self._set_state((means, np.array([cov for _, cov in pairs]), self.weights))
+
+    @property
+    def motion(self) -> Array:
+        raise NotImplementedError("interacting models have no single motion")
+
+    def drive(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
+        raise NotImplementedError("interacting models take no IMU")
+
+    def _move(self, stamp_ns: int, bias: Array) -> None:
+        dt = (stamp_ns - self.stamp_ns) * 1e-9
+        state = self._state()
+        imm.predict(*state, dt, self._motions, self._sojourn_s, bias)
+        self.stamp_ns = stamp_ns
+        self._set_state(state)
+
+    def _update(self, rows: Array, accepted: Array) -> tuple[float, int]:
+        state = self._state()
+        result: tuple[float, int] = imm.update(
+            *state,
+            rows,
+            float(self._options[Option.HEIGHT]),
+            self._options[engine.GATE :],
+            int(self._options[Option.ITERATIONS]),
+            accepted,
+            engine.scratch(self.mean.size, len(rows))[0],
+        )
+        self._set_state(state)
+        return result
+
+    def _open(self, sd: float, unheard_s: float) -> None:
+        for cov in self._covs:
+            engine.open_velocity(cov, sd, unheard_s, self._options)
+
+    def copy(self) -> Interacting:
+        twin = copy.copy(self)
+        twin._restore(self._state())
+        return twin
+
+
+class Reference(_Looks):
+    """One motion model on FilterPy: slow, for comparison."""
+
+    def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
+        self.stamp_ns = stamp_ns
+        self._options = options_of(config)
+        self._motion: Array = motions_of(config)[0].copy()
+        unscented = config.filter == "ukf"
+        self._predict_with = (
+            filterpy_backend.ukf_predict if unscented else filterpy_backend.ekf_predict
+        )
+        self._update_with = (
+            filterpy_backend.ukf_update if unscented else filterpy_backend.ekf_update
+        )
+        self._set_state(grown(mean, cov, initial_extra_sd(config)))
+        self._prior = (self.mean, self.cov)
+
+    def _state(self) -> tuple[Array, ...]:
+        return self.mean, self.cov
+
+    def _set_state(self, state: tuple[Array, ...]) -> None:
+        self.mean, self.cov = state
+
+    @property
+    def motion(self) -> Array:
+        return self._motion
+
+    def grow(self, sd: Array) -> None:
+        self.mean, self.cov = grown(self.mean, self.cov, sd)
+
+    def drive(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
+        self._motion[Parameter.YAW_INCREMENT] = yaw_rad
+        self._motion[Parameter.SPEED_INCREMENT] = speed_mps
+        self._motion[Parameter.GYRO] = gyro_density
+
+    def _note_jump(self, sd: float, unheard_s: float) -> None:
+        self._motion[Parameter.JUMP_SPEED] = sd
+        self._motion[Parameter.JUMP_TIME] = unheard_s
+
+    def _move(self, stamp_ns: int, bias: Array) -> None:
+        dt = (stamp_ns - self.stamp_ns) * 1e-9
+        self._motion[Parameter.JUMP_SPEED] = 0.0
+        self._predict_with(self.mean, self.cov, dt, self._motion, bias)
+        self.stamp_ns = stamp_ns
+
+    def _update(self, rows: Array, accepted: Array) -> tuple[float, int]:
+        gate, height_m = self._options[engine.GATE :], float(self._options[Option.HEIGHT])
+        return self._update_with(self.mean, self.cov, rows, height_m, gate, accepted)
+
+    def _open(self, sd: float, unheard_s: float) -> None:
+        engine.open_velocity(self.cov, sd, unheard_s, self._options)
+
+    def copy(self) -> Reference:
+        twin = copy.copy(self)
+        twin._motion = self._motion.copy()
+        twin._restore(self._state())
+        return twin
+
+
+def start(config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> Estimate:
+    """Estimate of the configured kind from mean (6,) and covariance (6, 6) at ``stamp_ns``."""
+    if config.backend == "filterpy":
+        return Reference(config, stamp_ns, mean, cov)
+    if config.motion_model == "interacting":
+        return Interacting(config, stamp_ns, mean, cov)
+    return Single(config, stamp_ns, mean, cov)

@@ -1,0 +1,375 @@
+"""Health of the RSUs, from what the tracks of all devices find: who is silent, who lies.
+
+The evidence against an RSU is comparative. Stamps are cut into slots. In a slot a device speaks
+*against* an RSU when its gate refuses nearly all that this RSU says and takes nearly all of at
+least two others, which outnumber those it refuses and whose innovations are as small as their sd
+promises (a track led astray by two RSUs passes its gate, but not that); it speaks *for* an RSU
+when it takes it as it takes another one. Slots against it in a row, long enough and with
+measurements enough, isolate an RSU; slots for it, in a row and longer, re-admit it. So a sharp
+turn (the others are refused too), a burst, one of many devices with a blocked path, or two RSUs
+that contradict each other isolate nobody.
+
+Everything follows from stamps. A slot is judged in one piece ``settle_s`` after its end, and the
+verdict holds for measurements from then on: while no measurement comes later than that, what a
+tracker is told does not depend on the order of arrival. A track that goes back in time calls
+``rewind`` and observes anew.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from enum import IntEnum
+
+from netpos.tracking.health_words import Observation, medians, misfit, off, rate_hz, words
+
+_AGREES, _REFUSED = 0.7, 0.3  # accept ratios
+_WITNESS = 2.5  # mean squared normalised innovation; that of a track led astray is larger
+_STALE_SLOTS = 10  # a run of verdicts does not survive a longer pause
+_FORGET_NS = 60_000_000_000
+_SPEAKS = 3  # refused measurements in a run before they are mentioned
+_FEW = 20
+_BIASED = 1.5  # median normalised innovation of an RSU that passes the gate
+
+
+class RsuState(IntEnum):
+    """What the tracker thinks of an RSU."""
+
+    OK = 0
+    SUSPECT = 1
+    ISOLATED = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HealthConfig:
+    """When an RSU is isolated, re-admitted and called silent.
+
+    RSUs are compared within a slot: it must be no shorter than their measurement interval. Raises
+    ``ValueError`` for values that are not finite and > 0.
+    """
+
+    slot_s: float = 1.0
+    settle_s: float = 2.0
+    isolate_after_s: float = 2.0
+    isolate_after_count: int = 10
+    readmit_after_s: float = 5.0
+    readmit_after_count: int = 20
+    lapse_s: float = 30.0  # without any trusted RSU: nothing to compare with
+    silent_after_s: float = 3.0
+    window: int = 200  # measurements behind the figures of a report
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if not 0.0 < value < math.inf:
+                raise ValueError(f"{entry.name} must be finite and > 0, got {value!r}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RsuReport:
+    """Figures of one RSU for the operator; all but ``age_s`` are ``settle_s`` behind.
+
+    ``age_s`` since it was last heard, -1: never; ``accept_ratio`` over the last ``window``
+    measurements, -1: none; medians of the innovation (m, rad) and of innovation / sd by kind,
+    of the measurements since it began to be refused where it is.
+    """
+
+    rsu_id: str
+    state: RsuState
+    text: str
+    age_s: float = -1.0
+    rate_hz: float = 0.0
+    accept_ratio: float = -1.0
+    measurements: int = 0
+    late: int = 0
+    mean_innovation: Mapping[str, float] = field(default_factory=dict)
+    mean_normalised: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class _Run:
+    """Verdicts of one sign in a row: first and last stamp and number of their measurements."""
+
+    first_ns: int
+    last_ns: int
+    count: int
+
+    def reaches(self, duration_s: float, count: int) -> bool:
+        return self.last_ns - self.first_ns >= duration_s * 1e9 and self.count >= count
+
+
+@dataclass(slots=True)
+class _Rsu:
+    window: deque[Observation]
+    last_ns: int = -1
+    last_vue: str = ""
+    measurements: int = 0
+    late: int = 0
+    isolated: bool = False
+    cause: str = ""
+    against: _Run | None = None
+    agrees: _Run | None = None
+    changes: deque[tuple[int, bool]] = field(default_factory=lambda: deque(maxlen=16))
+
+
+@dataclass(slots=True)
+class _Vote:
+    """What one device says of one RSU in one slot."""
+
+    entries: list[Observation]
+    ratio: float
+    misfit: float
+    witnesses: frozenset[str] = frozenset()
+
+
+class RsuHealth:
+    """Collects observations of all tracks, reports and isolates RSUs."""
+
+    def __init__(self, config: HealthConfig | None = None) -> None:
+        self._config = config or HealthConfig()
+        self._slot_ns = int(self._config.slot_s * 1e9)
+        self._settle_ns = int(self._config.settle_s * 1e9)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the clock jumped back."""
+        # By slot, then by device and RSU, then by stamp.
+        self._open: dict[int, dict[tuple[str, str], dict[int, Observation]]] = {}
+        self._rsus: dict[str, _Rsu] = {}
+        self._heard: dict[str, int] = {}  # newest stamp by device
+        self._judged = -(1 << 62)  # slots below are judged
+        self._due_ns = -(1 << 62)  # when the next one is
+        self._trusted_ns = 0
+
+    def observe(
+        self,
+        rsu_id: str,
+        vue_id: str,
+        stamp_ns: int,
+        accepted: bool,
+        innovations: Mapping[str, tuple[float, float]],
+    ) -> None:
+        """Take what a track found of one measurement; of an isolated RSU: what the gate would have
+        said. A second observation of the same RSU, device and stamp replaces the first.
+
+        innovations : (measured minus predicted in m or rad, its sd) by ``Kind`` name, any case
+        Raises ``ValueError`` for an innovation that is not finite or an sd that is not > 0.
+        """
+        for value, sd in innovations.values():
+            if not (-math.inf < value < math.inf and 0.0 < sd < math.inf):
+                raise ValueError(
+                    f"innovation and sd of {rsu_id} must be finite, the sd > 0, got {innovations}"
+                )
+        if stamp_ns >= self._due_ns:
+            self._advance(stamp_ns)
+        rsu = self._rsus.get(rsu_id)
+        if rsu is None:
+            rsu = self._rsus[rsu_id] = _Rsu(deque(maxlen=self._config.window))
+        slot = stamp_ns // self._slot_ns
+        if slot < self._judged:
+            rsu.late += 1
+            return
+        if stamp_ns >= rsu.last_ns:
+            rsu.last_ns, rsu.last_vue = stamp_ns, vue_id
+        if stamp_ns > self._heard.get(vue_id, -1):
+            self._heard[vue_id] = stamp_ns
+        streams = self._open.get(slot)
+        if streams is None:
+            streams = self._open[slot] = {}
+        stream = streams.get((vue_id, rsu_id))
+        if stream is None:
+            stream = streams[vue_id, rsu_id] = {}
+        stream[stamp_ns] = Observation(stamp_ns, vue_id, accepted, tuple(innovations.items()))
+
+    def rewind(self, vue_id: str, stamp_ns: int) -> None:
+        """Drop what was observed of a device from ``stamp_ns`` on, as far as it is not judged: its
+        track goes back and will observe anew."""
+        for slot, streams in self._open.items():
+            if (slot + 1) * self._slot_ns > stamp_ns:
+                for key in [k for k in streams if k[0] == vue_id]:
+                    kept = {t: entry for t, entry in streams[key].items() if t < stamp_ns}
+                    if kept:
+                        streams[key] = kept
+                    else:
+                        del streams[key]
+
+    def isolated(self, rsu_id: str, stamp_ns: int) -> bool:
+        """Whether a measurement of this RSU with this stamp is to be refused."""
+        if stamp_ns >= self._due_ns:
+            self._advance(stamp_ns)
+        rsu = self._rsus.get(rsu_id)
+        if rsu is None:
+            return False
+        for effective_ns, isolated in reversed(rsu.changes):
+            if effective_ns <= stamp_ns:
+                return isolated
+        return False
+
+    # judgement
+
+    def _advance(self, now_ns: int) -> None:
+        """Judge the slots that ended ``settle_s`` ago."""
+        closed = (now_ns - self._settle_ns) // self._slot_ns
+        if closed <= self._judged:
+            return
+        self._judged = closed
+        self._due_ns = (closed + 1) * self._slot_ns + self._settle_ns
+        for slot in sorted(s for s in self._open if s < closed):
+            self._judge(self._open.pop(slot), (slot + 1) * self._slot_ns)
+        self._heard = {v: t for v, t in self._heard.items() if t > now_ns - _FORGET_NS}
+
+    def _judge(
+        self, streams: Mapping[tuple[str, str], Mapping[int, Observation]], end_ns: int
+    ) -> None:
+        devices: dict[str, dict[str, _Vote]] = {}
+        heard: dict[str, list[Observation]] = {}
+        for (vue_id, rsu_id), stream in streams.items():
+            entries = list(stream.values())
+            ratio = sum(e.accepted for e in entries) / len(entries)
+            devices.setdefault(vue_id, {})[rsu_id] = _Vote(entries, ratio, misfit(entries))
+            heard.setdefault(rsu_id, []).extend(entries)
+        for rsu_id, entries in heard.items():
+            rsu = self._rsus[rsu_id]
+            rsu.window.extend(sorted(entries))
+            rsu.measurements += len(entries)
+            if not rsu.isolated:
+                self._trusted_ns = max(self._trusted_ns, rsu.window[-1].stamp_ns)
+        against: dict[str, list[_Vote]] = {}
+        agree: dict[str, list[_Vote]] = {}
+        for votes in devices.values():
+            self._compare(votes, against, agree)
+        for rsu_id in sorted(against.keys() | agree.keys()):
+            self._extend(rsu_id, against.get(rsu_id, []), agree.get(rsu_id, []))
+        self._decide(against, end_ns)
+
+    def _compare(
+        self,
+        votes: Mapping[str, _Vote],
+        against: dict[str, list[_Vote]],
+        agree: dict[str, list[_Vote]],
+    ) -> None:
+        """Sort what one device says of the RSUs into votes against and for them."""
+        trusted = [name for name in votes if not self._rsus[name].isolated]
+        taken = frozenset(
+            name
+            for name in trusted
+            if votes[name].ratio >= _AGREES and votes[name].misfit <= _WITNESS
+        )
+        refused = [name for name in trusted if votes[name].ratio <= _REFUSED]
+        for name, vote in votes.items():
+            vote.witnesses = taken - {name}
+            if vote.ratio >= _AGREES and vote.witnesses:
+                agree.setdefault(name, []).append(vote)
+            elif vote.ratio <= _REFUSED and len(taken) >= max(2, len(refused) + 1):
+                against.setdefault(name, []).append(vote)
+
+    def _extend(self, rsu_id: str, against: list[_Vote], agree: list[_Vote]) -> None:
+        """Lengthen the run of verdicts the majority of devices is for, end the other."""
+        rsu = self._rsus[rsu_id]
+        if len(against) >= len(agree):
+            rsu.agrees = None
+        if len(against) > len(agree):
+            rsu.against = self._longer(rsu.against, against, False)
+            rsu.cause = words([e for e in self._since_refused(rsu) if not e.accepted])
+        elif len(agree) > len(against):
+            rsu.against = None
+            rsu.agrees = self._longer(rsu.agrees, agree, True)
+
+    def _longer(self, run: _Run | None, votes: Iterable[_Vote], accepted: bool) -> _Run:
+        stamps = [e.stamp_ns for vote in votes for e in vote.entries if e.accepted is accepted]
+        first, last = min(stamps), max(stamps)
+        if run is None or first - run.last_ns > _STALE_SLOTS * self._slot_ns:
+            return _Run(first, last, len(stamps))
+        return _Run(run.first_ns, last, run.count + len(stamps))
+
+    def _decide(self, against: Mapping[str, list[_Vote]], end_ns: int) -> None:
+        cfg = self._config
+        for rsu in self._rsus.values():
+            if not rsu.isolated:
+                continue
+            consistent = rsu.agrees is not None and rsu.agrees.reaches(
+                cfg.readmit_after_s, cfg.readmit_after_count
+            )
+            if consistent or end_ns - self._trusted_ns > cfg.lapse_s * 1e9:
+                self._set(rsu, False, end_ns)
+        accused: list[tuple[int, str]] = []
+        for name in against:
+            run = self._rsus[name].against
+            if run is not None and run.reaches(cfg.isolate_after_s, cfg.isolate_after_count):
+                accused.append((-run.count, name))
+        for _, name in sorted(accused):
+            if not self._rsus[name].isolated and any(
+                sum(not self._rsus[w].isolated for w in vote.witnesses) >= 2
+                for vote in against[name]
+            ):
+                self._set(self._rsus[name], True, end_ns)
+
+    def _set(self, rsu: _Rsu, isolated: bool, end_ns: int) -> None:
+        rsu.isolated = isolated
+        rsu.agrees = None
+        if not isolated:
+            rsu.against = None
+        rsu.changes.append((end_ns + self._settle_ns, isolated))
+
+    # reports
+
+    def reports(self, now_ns: int) -> list[RsuReport]:
+        """Reports of all RSUs heard so far, by name."""
+        return [self.report(rsu_id, now_ns) for rsu_id in sorted(self._rsus)]
+
+    def report(self, rsu_id: str, now_ns: int) -> RsuReport:
+        """State of one RSU at ``now_ns`` by any clock, and in words what is wrong with it; changes
+        nothing."""
+        rsu = self._rsus.get(rsu_id)
+        if rsu is None or rsu.last_ns < 0:
+            return RsuReport(rsu_id=rsu_id, state=RsuState.OK, text="not heard yet")
+        age_s = max(now_ns - rsu.last_ns, 0) * 1e-9
+        entries = self._since_refused(rsu)
+        ratio = -1.0
+        if rsu.window:
+            ratio = sum(e.accepted for e in rsu.window) / len(rsu.window)
+        state, text = self._verdict(rsu, now_ns, age_s, entries)
+        return RsuReport(
+            rsu_id=rsu_id,
+            state=state,
+            text=text,
+            age_s=age_s,
+            rate_hz=rate_hz(rsu.window),
+            accept_ratio=ratio,
+            measurements=rsu.measurements,
+            late=rsu.late,
+            mean_innovation=medians(entries),
+            mean_normalised=medians(entries, normalised=True),
+        )
+
+    def _since_refused(self, rsu: _Rsu) -> list[Observation]:
+        first_ns = rsu.against.first_ns if rsu.against is not None else -1
+        return [e for e in rsu.window if e.stamp_ns >= first_ns]
+
+    def _verdict(
+        self, rsu: _Rsu, now_ns: int, age_s: float, entries: list[Observation]
+    ) -> tuple[RsuState, str]:
+        faults = []
+        silent = age_s >= self._config.silent_after_s
+        newest_ns = self._heard.get(rsu.last_vue, -1)
+        if silent and newest_ns > max(rsu.last_ns, now_ns - self._config.silent_after_s * 1e9):
+            faults.append(f"silent for {age_s:.0f} s")
+        if rsu.isolated:
+            faults.insert(0, f"isolated: {rsu.cause}")
+            if rsu.agrees is not None:
+                consistent_s = (rsu.agrees.last_ns - rsu.agrees.first_ns) * 1e-9
+                faults.append(f"consistent again for {consistent_s:.0f} s")
+            return RsuState.ISOLATED, "; ".join(faults)
+        if rsu.against is not None and rsu.against.count >= _SPEAKS:
+            faults.append(rsu.cause)
+        elif len(entries) >= _FEW:
+            accepted = sum(e.accepted for e in entries)
+            if 2 * accepted < len(entries):
+                faults.append(f"{accepted} of {len(entries)} accepted: {words(entries)}")
+            else:
+                faults.extend(off(entries, _BIASED))
+        if faults:
+            return RsuState.SUSPECT, "; ".join(faults)
+        return RsuState.OK, f"no device heard for {age_s:.0f} s" if silent else "ok"

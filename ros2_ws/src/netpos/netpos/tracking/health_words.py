@@ -1,0 +1,110 @@
+"""What is wrong with an RSU, in figures and in words, from observations of its measurements."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from statistics import median
+from typing import NamedTuple
+
+from netpos.filters.measurement import wrap
+from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+
+_OFF = _SCATTERS = 3.0  # median and sd of the normalised innovations of what is refused
+_NORMAL_QUARTILE = 0.6744897501960817
+_RATE_NS = 10_000_000_000
+
+
+class Observation(NamedTuple):
+    """What a track found of one measurement; per kind (innovation in m or rad, its sd)."""
+
+    stamp_ns: int
+    vue_id: str
+    accepted: bool
+    innovations: tuple[tuple[str, tuple[float, float]], ...]
+
+
+def words(entries: Sequence[Observation]) -> str:
+    """What is wrong with an RSU, from measurements that were refused."""
+    faults = off(entries, _OFF)
+    if not faults:
+        for kind, values in _by_kind(entries).items():
+            spread = _spread(_normalised(kind, values))
+            if spread >= _SCATTERS:
+                faults.append(f"{kind} scatters {spread:.1f} times as far as stated")
+    return ", ".join(faults) or "refused by the gate"
+
+
+def off(entries: Sequence[Observation], limit: float) -> list[str]:
+    """One phrase per kind whose median normalised innovation reaches ``limit`` and its own
+    scatter, worst first."""
+    devices = len({e.vue_id for e in entries})
+    found = []
+    for kind, values in _by_kind(entries).items():
+        normalised = _normalised(kind, values)
+        size = abs(median(normalised))
+        if size >= max(limit, _spread(normalised)):
+            found.append((size, _phrase(kind, median(_unwrapped(kind, values)), devices)))
+    return [phrase for _, phrase in sorted(found, reverse=True)]
+
+
+def _spread(values: Sequence[float]) -> float:
+    """Standard deviation by the median absolute deviation."""
+    centre = median(values)
+    return median(abs(v - centre) for v in values) / _NORMAL_QUARTILE
+
+
+def _phrase(kind: str, error: float, devices: int) -> str:
+    side = "late" if error > 0.0 else "early"
+    if kind in {"azimuth", "elevation"}:
+        return f"{kind} off by {math.degrees(error):.1f} deg"
+    if kind == "range":
+        return f"range {side} by {abs(error):.1f} m"
+    if kind == "toa":
+        step = f"clock step of {error / SPEED_OF_LIGHT_MPS * 1e9:.0f} ns"
+        # A path can be blocked for one device, and it is never shorter than the direct one.
+        return step if devices > 1 or error < 0.0 else f"{step} or blocked path"
+    return f"{kind} off by {error:.3g}"
+
+
+def _by_kind(entries: Iterable[Observation]) -> dict[str, list[tuple[float, float]]]:
+    """Innovations by kind name in lower case."""
+    kinds: dict[str, list[tuple[float, float]]] = {}
+    for entry in entries:
+        for kind, pair in entry.innovations:
+            kinds.setdefault(kind.lower(), []).append(pair)
+    return kinds
+
+
+def _unwrapped(kind: str, values: list[tuple[float, float]]) -> list[float]:
+    """Innovations, angles within half a turn of the first one: an array turned round is +-180."""
+    if kind not in {"azimuth", "elevation"}:
+        return [value for value, _ in values]
+    first = values[0][0]
+    return [first + float(wrap(value - first)) for value, _ in values]
+
+
+def medians(entries: Iterable[Observation], normalised: bool = False) -> dict[str, float]:
+    """Median innovation (m, rad) by kind, or median of innovation / sd."""
+    values_of = _normalised if normalised else _unwrapped
+    return {kind: median(values_of(kind, v)) for kind, v in _by_kind(entries).items()}
+
+
+def misfit(entries: Iterable[Observation]) -> float:
+    """Mean squared normalised innovation; 1 for a consistent track."""
+    squares = [(v / sd) ** 2 for entry in entries for _, (v, sd) in entry.innovations]
+    return math.fsum(squares) / len(squares) if squares else 0.0  # fsum: in any order the same
+
+
+def _normalised(kind: str, values: list[tuple[float, float]]) -> list[float]:
+    return [v / sd for v, (_, sd) in zip(_unwrapped(kind, values), values, strict=True)]
+
+
+def rate_hz(window: Sequence[Observation]) -> float:
+    """Measurements per second over the last 10 s in which there were any."""
+    if not window:
+        return 0.0
+    newest = window[-1].stamp_ns
+    stamps = [e.stamp_ns for e in window if e.stamp_ns > newest - _RATE_NS]
+    span = newest - stamps[0]
+    return sum(s > stamps[0] for s in stamps) / (span * 1e-9) if span > 0 else 0.0

@@ -1,0 +1,70 @@
+"""What the replay and memory rows count; never how fast they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from netpos.bags import BagReader
+from netpos.evaluation.bench import memory, replay
+from netpos.evaluation.bench.common import Row, Unavailable
+from netpos.messages import topics
+from netpos.scenario import load_scenario
+from netpos.scenario.offline import simulate_to_bag
+from netpos.tracking import Tracker
+from netpos.tracking.replay import replay_bag
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bench") / "bag"
+    simulate_to_bag(load_scenario("fast_pass"), path)
+    return path
+
+
+def test_reading_and_tracking_is_a_replay_that_writes_nothing(bag: Path, tmp_path: Path) -> None:
+    summary = replay_bag(bag, tmp_path / "out")
+    assert replay.read_and_track(bag) == summary.epochs > 0
+
+
+def test_rosbags_decodes_what_the_tracker_takes(bag: Path) -> None:
+    with BagReader(bag) as reader:
+        names = (topics.RSU_INFO, topics.RSU_MEASUREMENTS)
+        expected = sum(reader.topics[name].count for name in names)
+    assert replay.read_and_decode(bag) == expected
+
+
+def test_replay_rows_say_what_is_in_them() -> None:
+    rows = [row for row in replay.replay_rows(quick=True) if isinstance(row, Row)]
+    assert [(row.relation, row.target) for row in rows] == [(">=", 300), (">=", 300), ("<=", 2)]
+    assert "Copies all" in rows[0].note
+    assert "Neither writes" in rows[2].note
+
+
+def test_the_fed_tracker_answers_every_epoch_after_its_first_fix() -> None:
+    tracker = Tracker()
+    for rsu in memory._RSUS:
+        tracker.add_rsu(rsu)
+    assert memory.feed(tracker, 0, 100) > 50
+    assert memory.feed(tracker, 100, 200) == 100
+    assert tracker.rejected()["vue_1"].total() == 0
+
+
+def test_memory_is_compared_with_that_after_a_tenth(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = iter([100_000_000, 103_000_000])
+    fed: list[tuple[int, int]] = []
+    monkeypatch.setattr(memory, "resident_bytes", lambda: next(sizes))
+    monkeypatch.setattr(memory, "feed", lambda _, start, stop: fed.append((start, stop)) or 0)
+    (row,) = memory.memory_rows(quick=False)
+    assert fed == [(0, 3600), (3600, 36000)]
+    assert isinstance(row, Row)
+    assert row.ratio == pytest.approx(1.03)
+    assert not row.ok
+
+
+def test_resident_memory_is_of_the_order_of_a_process() -> None:
+    try:
+        size = memory.resident_bytes()
+    except Unavailable as reason:
+        pytest.skip(str(reason))
+    assert 1e7 < size < 1e10

@@ -1,0 +1,90 @@
+"""Who hears a beacon: against a plain search over all RSUs."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from netpos.radio.measure import ALWAYS_VISIBLE, Errors, Sight, Sites, observe
+from netpos.radio.noise import stream_key
+from netpos.world.buildings import line_of_sight
+
+HOUSES = np.array(
+    [[10.0, 10.0, 40.0, 30.0], [55.0, -20.0, 70.0, 25.0], [-30.0, -40.0, 5.0, -10.0]]
+)
+FIXED = Errors(
+    fixed=np.array([1e-3, 0.0, 1e-16, 0.0]),
+    with_elevation=False,
+    snr_at_0_db_loss=0.0,
+    path_loss=np.zeros(5),
+    second_moment=np.zeros((3, 3)),
+    rms_bandwidth_hz=0.0,
+    half_view_rad=math.pi,
+    tx_power_dbm=0.0,
+)
+
+
+def _sites(places: np.ndarray) -> Sites:
+    keys = np.array([stream_key(1, str(i)) for i in range(len(places))])
+    return Sites(
+        position=np.column_stack([places, np.zeros(len(places))]),
+        rotation=np.tile(np.eye(3), (len(places), 1, 1)),
+        noise_key=keys,
+        sight_key=keys,
+    )
+
+
+def _plain(position: np.ndarray, places: np.ndarray, nearest: int, reach: float) -> list[int]:
+    away = np.sqrt(((position - places) ** 2).sum(axis=1))
+    ranked = np.argsort(away, kind="stable")
+    visible = [
+        int(k)
+        for k in ranked
+        if away[k] <= reach and line_of_sight(position, places[k], HOUSES)[0]
+    ]
+    return visible[:nearest]
+
+
+@pytest.mark.parametrize("nearest", [1, 2, 5])
+@pytest.mark.parametrize("reach", [math.inf, 35.0])
+def test_the_nearest_in_sight_hear_the_beacon(nearest: int, reach: float) -> None:
+    """Places that jump about, RSUs at equal distances (a mirrored pair of each)."""
+    rng = np.random.default_rng(11)
+    half = rng.uniform(-60.0, 80.0, (20, 2))
+    places = np.vstack([half, half * [1.0, -1.0]])
+    positions = rng.uniform(-60.0, 80.0, (300, 2)) * [1.0, 0.0]
+    positions[::3, 1] = rng.uniform(-60.0, 80.0, 100)
+    sight = Sight(nearest, reach, HOUSES, ALWAYS_VISIBLE, 50.0, 1.5)
+    seen = observe(
+        np.arange(1, 301),
+        np.column_stack([positions, np.zeros(300)]),
+        np.zeros(300),
+        _sites(places),
+        sight,
+        FIXED,
+    )
+    counts = set()
+    for i, position in enumerate(positions):
+        expected = _plain(position, places, nearest, reach)
+        assert seen.rsu[i, : seen.heard_by[i]].tolist() == expected
+        assert (seen.rsu[i, seen.heard_by[i] :] == -1).all()
+        counts.add(len(expected))
+    assert len(counts) > 1 or math.isinf(reach)
+
+
+def test_an_rsu_at_the_antenna_itself_measures_nothing() -> None:
+    sight = Sight(2, math.inf, np.zeros((0, 4)), ALWAYS_VISIBLE, 50.0, 1.5)
+    sites = _sites(np.array([[3.0, 4.0], [10.0, 0.0]]))
+    seen = observe(np.array([1]), np.array([[3.0, 4.0, 0.0]]), np.zeros(1), sites, sight, FIXED)
+    assert seen.rsu.tolist() == [[1, -1]]
+
+
+def test_an_array_serves_its_field_of_view_only() -> None:
+    """Boresight east, 120 degrees: at 60 degrees just heard, beyond not; the next one is."""
+    sight = Sight(1, math.inf, np.zeros((0, 4)), ALWAYS_VISIBLE, 50.0, 1.5)
+    sites = _sites(np.array([[0.0, 0.0], [-50.0, 0.0]]))
+    errors = FIXED._replace(half_view_rad=math.radians(60.0))
+    places = [[math.cos(a), math.sin(a), 0.0] for a in np.radians([59.99, 60.01, 180.0])]
+    seen = observe(np.array([1, 2, 3]), np.array(places), np.zeros(3), sites, sight, errors)
+    assert seen.rsu[:, 0].tolist() == [0, 1, 1]

@@ -1,0 +1,172 @@
+"""From parameters to the arrays of the kernels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from netpos.filters.motion import Model, Parameter, ProcessNoise
+from netpos.tracking.config import FILTERS, ROBUST, TrackerConfig
+from netpos.tracking.engine import GATE, GATE_SIZE, Filter, Option
+from netpos.tracking.models import (
+    FILTER_ITERATIONS,
+    gate_thresholds,
+    grown,
+    initial_extra_sd,
+    motions_of,
+    options_of,
+    pose_state,
+)
+from scipy.constants import speed_of_light
+from scipy.stats import chi2
+
+
+def test_every_filter_has_its_place_in_the_engine() -> None:
+    assert [f.name.lower() for f in Filter] == list(FILTERS)
+    for place, name in enumerate(FILTERS):
+        options = options_of(TrackerConfig(filter=name))
+        assert options[Option.FILTER] == place
+        assert options[Option.ITERATIONS] == FILTER_ITERATIONS.get(name, 1)
+
+
+def test_options_hold_what_the_parameters_say() -> None:
+    config = TrackerConfig(
+        filter="srukf",
+        device_height_m=1.5,
+        inflate_after_epochs=3,
+        max_rejected_epochs=14,
+        initial_speed_sd_mps=6.5,
+        manoeuvre_speed_sd_mps=7.5,
+        robust="student_t",
+        robust_parameter=5.5,
+        nlos_probability=0.1,
+        nlos_mean_excess_m=33.0,
+        position_gain_min=0.2,
+        velocity_gain_min=0.3,
+        accel_gain_min=0.4,
+        gate_probability=0.99,
+    )
+    options = options_of(config)
+    values = [3, 1, 1.5, 3, 14, 6.5, 7.5, ROBUST.index("student_t"), 5.5, 0.1, 33, 0.2, 0.3, 0.4]
+    assert options[:GATE].tolist() == values
+    np.testing.assert_array_equal(options[GATE:], gate_thresholds(0.99))
+    assert len(options) == GATE + GATE_SIZE
+
+
+@pytest.mark.parametrize("probability", [0.5, 0.95, 0.9999])
+def test_thresholds_are_chi_square_quantiles(probability: float) -> None:
+    t = gate_thresholds(probability)
+    assert t[0] == 0.0
+    for dof in range(1, GATE_SIZE):
+        assert chi2.cdf(t[dof], dof) == pytest.approx(probability, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "accel"),
+    [
+        ({}, 0.7),
+        ({"process_noise": "white_acceleration"}, 0.6),
+        ({"motion_model": "inertial"}, 0.3),
+        ({"motion_model": "inertial", "process_noise": "white_acceleration"}, 0.3),
+    ],
+)
+def test_motion_takes_its_own_acceleration(change: dict[str, Any], accel: float) -> None:
+    config = TrackerConfig(
+        accel_density_mps2_sqrthz=0.7,
+        accel_sd_mps2=0.6,
+        inertial_accel_density_mps2_sqrthz=0.3,
+        **change,
+    )
+    ((motion),) = motions_of(config)
+    assert motion[Parameter.ACCEL] == accel
+
+
+def test_motion_is_in_metres() -> None:
+    config = TrackerConfig(
+        process_noise="werner",
+        clock_white_density=1e-9,
+        clock_walk_density=2e-7,
+        drift_step_sd=3e-6,
+        velocity_step_sd_mps=0.4,
+        turn_rate_density=0.5,
+        jerk_density=0.6,
+        rest_speed_sd_mps=0.07,
+        gyro_noise_density=0.008,
+        gyro_bias_walk=0.0009,
+        accel_bias_walk=0.011,
+    )
+    ((motion),) = motions_of(config)
+    c = speed_of_light
+    expected = {
+        Parameter.MODEL: Model.CONSTANT_VELOCITY,
+        Parameter.NOISE: ProcessNoise.WERNER,
+        Parameter.EXTRAS: 0,
+        Parameter.VELOCITY_STEP: 0.4,
+        Parameter.OFFSET_DENSITY: c * 1e-9,
+        Parameter.DRIFT_DENSITY: c * 2e-7,
+        Parameter.DRIFT_STEP: c * 3e-6,
+        Parameter.TURN_RATE: 0.5,
+        Parameter.JERK: 0.6,
+        Parameter.REST_SPEED: 0.07,
+        Parameter.GYRO: 0.008,
+        Parameter.GYRO_BIAS: 0.0009,
+        Parameter.ACCEL_BIAS: 0.011,
+        Parameter.YAW_INCREMENT: 0.0,
+        Parameter.SPEED_INCREMENT: 0.0,
+    }
+    for entry, value in expected.items():
+        assert motion[entry] == pytest.approx(value, rel=1e-12), entry.name
+
+
+@pytest.mark.parametrize(
+    ("name", "models", "sd"),
+    [
+        ("constant_velocity", [Model.CONSTANT_VELOCITY], []),
+        ("constant_turn", [Model.CONSTANT_TURN], [0.25]),
+        ("constant_acceleration", [Model.CONSTANT_ACCELERATION], [1.5, 1.5]),
+        (
+            "interacting",
+            [Model.STATIONARY, Model.CONSTANT_VELOCITY, Model.CONSTANT_TURN],
+            [0.25],
+        ),
+        ("inertial", [Model.INERTIAL], [0.02, 0.3]),
+    ],
+)
+def test_models_and_their_own_states(name: str, models: list[Model], sd: list[float]) -> None:
+    config = TrackerConfig(
+        motion_model=name,
+        turn_rate_density=0.25,
+        accel_state_sd_mps2=1.5,
+        gyro_bias_sd_radps=0.02,
+        accel_bias_sd_mps2=0.3,
+    )
+    motions = motions_of(config)
+    assert motions[:, Parameter.MODEL].tolist() == models
+    assert set(motions[:, Parameter.EXTRAS]) == {len(sd)}  # all share one state
+    assert initial_extra_sd(config).tolist() == sd
+
+
+def test_pose_state_is_that_of_the_paper() -> None:
+    """fokin2020:eq.32, 33."""
+    config = TrackerConfig(initial_speed_sd_mps=4.0, clock_offset_sd_s=1e-5, clock_drift_mean=1e-6)
+    cov = np.array([[4.0, 1.0], [1.0, 9.0]])
+    mean, P = pose_state(config, np.array([3.0, -4.0]), cov)
+    c = speed_of_light
+    np.testing.assert_allclose(mean, [3.0, -4.0, 0.0, 0.0, 0.0, 1e-6 * c])
+    np.testing.assert_array_equal(P[:2, :2], cov)
+    np.testing.assert_allclose(np.diag(P)[2:], [16.0, 16.0, (1e-5 * c) ** 2, (30e-6 * c) ** 2])
+    assert np.count_nonzero(P) == 8
+
+
+def test_growing_appends_independent_states() -> None:
+    A = np.random.default_rng(0).normal(size=(7, 7))
+    mean, cov = np.arange(7.0), A @ A.T
+    same = grown(mean, cov, np.array([0.5]))
+    assert same[0] is mean
+    x, P = grown(mean, cov, np.array([0.5, 2.0, 3.0]))
+    np.testing.assert_array_equal(x, [*range(7), 0.0, 0.0])
+    np.testing.assert_array_equal(P[:7, :7], cov)
+    np.testing.assert_array_equal(P[7:, 7:], np.diag([4.0, 9.0]))
+    assert not P[:7, 7:].any()
+    assert not P[7:, :7].any()

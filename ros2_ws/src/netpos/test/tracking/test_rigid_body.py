@@ -1,0 +1,358 @@
+"""A device with three antennas in a square of four RSUs: its heading is a state of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from netpos.filters.measurement import (
+    HEADING,
+    LEVER,
+    Coupling,
+    linearise,
+    rsu_axes,
+    rsu_rows,
+)
+from netpos.messages.values import (
+    AngleConvention,
+    Array,
+    Field,
+    InitialPose,
+    Odometry,
+    RsuInfo,
+    RsuMeasurement,
+)
+from netpos.tracking import Tracker, TrackerConfig, TrackOutput
+from scipy.constants import speed_of_light
+from scipy.stats import chi2
+
+T0_NS = 1_000_000_000
+HEIGHT_M = 1.0
+CORNERS = {
+    f"a{k}": np.array([x, y, HEIGHT_M])
+    for k, (x, y) in enumerate(((-10.0, -10.0), (10.0, -10.0), (10.0, 10.0), (-10.0, 10.0)))
+}
+ANTENNAS = {"left": (0.5, 0.4, 0.0), "right": (0.5, -0.4, 0.0), "back": (-0.6, 0.0, 0.0)}
+AHEAD = {"left": (3.0, 1.0, 0.0), "right": (3.0, -1.0, 0.0)}
+Path = Callable[[float], tuple[float, float, float]]
+
+
+def standing(yaw: float) -> Path:
+    return lambda _: (1.0, 2.0, yaw)
+
+
+def circle(t_s: float) -> tuple[float, float, float]:
+    """Left around the middle at 0.3 rad/s, facing outwards: never the way it moves."""
+    angle = 0.3 * t_s
+    return 4.0 * math.cos(angle), 4.0 * math.sin(angle), angle
+
+
+def measure(
+    path: Path,
+    t_s: float,
+    rng: np.random.Generator | None = None,
+    sd: float = 0.05,
+    antennas: dict[str, tuple[float, float, float]] = ANTENNAS,
+) -> list[RsuMeasurement]:
+    """Ranges of every antenna to every corner."""
+    x, y, yaw = path(t_s)
+    c, s = math.cos(yaw), math.sin(yaw)
+    result = []
+    for name, corner in CORNERS.items():
+        for antenna, (lx, ly, lz) in antennas.items():
+            place = np.array([x + c * lx - s * ly, y + s * lx + c * ly, HEIGHT_M + lz])
+            noise = 0.0 if rng is None else rng.normal(0.0, sd)
+            result.append(
+                RsuMeasurement(
+                    stamp_ns=T0_NS + round(t_s * 1e9),
+                    rsu_id=f"{name}_{antenna}",
+                    vue_id="vue_1",
+                    expected=len(CORNERS) * len(antennas),
+                    fields=Field.RANGE,
+                    range_m=float(np.linalg.norm(place - corner)) + noise,
+                    range_var=sd**2,
+                    lever_arm=(lx, ly, lz),
+                )
+            )
+    return result
+
+
+def tracker(**config: Any) -> Tracker:
+    values = {
+        "motion_model": "rigid_body",
+        "device_height_m": HEIGHT_M,
+        "hold_s": 0.0,
+        "accel_density_mps2_sqrthz": 0.5,
+        "turn_rate_density": 0.5,
+        "initial_speed_sd_mps": 1.5,
+        "coverage_radius_m": 20.0,
+    }
+    made = Tracker(TrackerConfig(**(values | config)))
+    for name, corner in CORNERS.items():
+        for antenna in ANTENNAS:
+            made.add_rsu(RsuInfo(rsu_id=f"{name}_{antenna}", position=corner))
+    return made
+
+
+def followed(
+    path: Path, seconds: float, seed: int, feed: Any, target: Tracker | None = None, **options: Any
+) -> list[tuple[float, TrackOutput]]:
+    """Time and report of every epoch, ten per second."""
+    target, rng = target or tracker(), np.random.default_rng(seed)
+    result = []
+    for k in range(round(seconds * 10)):
+        (report,) = feed(target, measure(path, 0.1 * k, rng, **options))
+        result.append((0.1 * k, report))
+    return result
+
+
+def yaw_of(odometry: Odometry) -> float:
+    return 2.0 * math.atan2(odometry.quaternion[2], odometry.quaternion[3])
+
+
+def heading_error(path: Path, t_s: float, odometry: Odometry) -> float:
+    return math.remainder(yaw_of(odometry) - path(t_s)[2], math.tau)
+
+
+def errors(path: Path, reports: list[tuple[float, TrackOutput]]) -> tuple[Array, Array]:
+    """Position errors (n, 2) m and heading errors (n,) rad."""
+    found = [(t, r.odometry) for t, r in reports if r.odometry is not None]
+    place = np.array([o.position[:2] - path(t)[:2] for t, o in found])
+    return place, np.array([heading_error(path, t, o) for t, o in found])
+
+
+def pose_fit(measured: list[RsuMeasurement], start: tuple[float, float, float]) -> Array:
+    """Position and heading information (3, 3) of one epoch by differences, beside the engine."""
+    rows = []
+    for m in measured:
+        corner = CORNERS[m.rsu_id.split("_")[0]]
+
+        def distance(p: Array, m: RsuMeasurement = m, corner: Array = corner) -> float:
+            c, s = math.cos(p[2]), math.sin(p[2])
+            lx, ly, _ = m.lever_arm
+            return math.hypot(
+                p[0] + c * lx - s * ly - corner[0], p[1] + s * lx + c * ly - corner[1]
+            )
+
+        steps = 1e-5 * np.eye(3)
+        p = np.array(start)
+        rows.append([(distance(p + d) - distance(p - d)) / 2e-5 / 0.05 for d in steps])
+    J = np.array(rows)
+    information: Array = J.T @ J
+    return information
+
+
+@pytest.mark.parametrize("convention", AngleConvention)
+@pytest.mark.parametrize("yaw", [-3.0, 0.4, 2.0])
+def test_jacobian_in_the_heading_is_the_difference(
+    convention: AngleConvention, yaw: float
+) -> None:
+    info = RsuInfo(
+        rsu_id="r",
+        position=np.array([2.0, -1.0, 4.0]),
+        quaternion=np.array([0.1, -0.2, 0.3, math.sqrt(1.0 - 0.14)]),
+        angle_convention=convention,
+    )
+    m = RsuMeasurement(
+        stamp_ns=1,
+        rsu_id="r",
+        vue_id="v",
+        fields=Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE,
+        azimuth_var=1e-4,
+        elevation_var=1e-4,
+        toa_var=(0.1 / speed_of_light) ** 2,
+        range_var=0.01,
+        lever_arm=(1.5, -0.7, 0.0),
+    )
+    rows = rsu_rows(m, info, rsu_axes(info), 0, Coupling({}, {}, {}), heading=6)
+    mean = np.array([6.0, 5.0, 0.0, 0.0, 3.0, 0.0, yaw, 0.0])
+    _, H = linearise(rows, mean, 1.2)
+    step = 1e-6 * np.eye(8)
+    for column in (0, 1, 6):
+        ahead, _ = linearise(rows, mean + step[column], 1.2)
+        behind, _ = linearise(rows, mean - step[column], 1.2)
+        np.testing.assert_allclose(H[:, column], (behind - ahead) / 2e-6, atol=1e-7)
+    turned = mean.copy()
+    turned[:2] += (
+        1.5 * math.cos(yaw) + 0.7 * math.sin(yaw),
+        1.5 * math.sin(yaw) - 0.7 * math.cos(yaw),
+    )
+    rows_at_antenna = rows.copy()
+    rows_at_antenna[:, HEADING], rows_at_antenna[:, LEVER:] = -1, 0.0
+    np.testing.assert_allclose(
+        linearise(rows, mean, 1.2)[0], linearise(rows_at_antenna, turned, 1.2)[0], atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.3, math.pi - 1e-3, -math.pi + 1e-3, -1.9])
+@pytest.mark.parametrize("filter_name", ["ekf", "iekf", "ukf", "srukf"])
+def test_heading_of_a_device_at_rest(feed: Any, filter_name: str, yaw: float) -> None:
+    path = standing(yaw)
+    reports = followed(path, 5.0, 1, feed, tracker(filter=filter_name))
+    assert reports[0][1].odometry is not None  # the first epoch is enough
+    place, turned = errors(path, reports)
+    one_epoch = np.linalg.inv(pose_fit(measure(path, 0.0), path(0.0)))
+    assert np.abs(turned).max() < 4.0 * math.sqrt(one_epoch[2, 2])
+    assert np.sqrt(np.mean(turned[20:] ** 2)) < 0.8 * math.sqrt(one_epoch[2, 2])
+    assert np.sqrt(np.mean(place[20:] ** 2)) < 0.8 * math.sqrt(one_epoch[0, 0])
+    for t, report in reports:
+        assert report.odometry is not None, t
+        assert -math.pi <= yaw_of(report.odometry) <= math.pi
+
+
+def test_heading_is_not_the_direction_of_motion(feed: Any) -> None:
+    """Facing outwards on a circle; the velocity is reported across, to the left."""
+    reports = followed(circle, 60.0, 2, feed)  # nearly three turns: past +-pi as often
+    place, turned = errors(circle, reports)
+    assert np.abs(turned).max() < math.radians(8.0)
+    assert np.sqrt(np.mean(turned[20:] ** 2)) < math.radians(2.0)
+    assert np.sqrt(np.mean((place[20:] ** 2).sum(axis=1))) < 0.04
+    velocity = np.array([r.odometry.linear_velocity for _, r in reports[50:] if r.odometry])
+    # a constant velocity model lags behind a centripetal acceleration of 0.36 m/s^2
+    np.testing.assert_allclose(velocity.mean(axis=0), [0.0, 1.2, 0.0], atol=0.08)
+
+
+def test_position_and_heading_errors_are_as_large_as_promised(feed: Any) -> None:
+    """Last epochs of independent runs, whose squared normalised errors add up to a chi-square."""
+    runs, total, total_heading = 40, 0.0, 0.0
+    for seed in range(runs):
+        start = 0.37 * seed
+
+        def path(t_s: float, start: float = start) -> tuple[float, float, float]:
+            x, y, yaw = circle(t_s)
+            return x, y, yaw + start
+
+        t, report = followed(path, 3.0, seed, feed)[-1]
+        assert report.odometry is not None
+        cov = report.odometry.pose_cov
+        d = report.odometry.position[:2] - path(t)[:2]
+        total += float(d @ np.linalg.solve(cov[:2, :2], d))
+        total_heading += heading_error(path, t, report.odometry) ** 2 / cov[5, 5]
+    assert chi2.ppf(0.001, 2 * runs) < total < chi2.ppf(0.999, 2 * runs)
+    assert chi2.ppf(0.001, runs) < total_heading < chi2.ppf(0.999, runs)
+
+
+def test_lever_arms_matter(feed: Any) -> None:
+    """Taken for measurements of base_link, the ranges of the antennas contradict each other."""
+    with_arms, _ = errors(circle, followed(circle, 15.0, 4, feed))
+    target, rng, without = tracker(motion_model="constant_velocity"), np.random.default_rng(4), []
+    for k in range(150):
+        bare = measure(circle, 0.1 * k, rng)
+        for m in bare:
+            m.lever_arm = (0.0, 0.0, 0.0)
+        (report,) = feed(target, bare)
+        without.append((0.1 * k, report))
+    place, _ = errors(circle, without)
+    rmse = [np.sqrt(np.mean((e[20:] ** 2).sum(axis=1))) for e in (with_arms, place)]
+    assert rmse[0] < 0.2 * rmse[1]
+
+
+def test_first_heading_is_waited_for(feed: Any) -> None:
+    """One antenna off the middle leaves a circle of poses; a second one decides."""
+    path, target = standing(2.2), tracker()
+    one = {"left": ANTENNAS["left"]}
+    for k in range(20):
+        for report in feed(target, measure(path, 0.1 * k, antennas=one)):
+            assert report.odometry is None
+    found = [feed(target, measure(path, 2.0 + 0.1 * k)) for k in range(3)]
+    odometry = found[-1][-1].odometry
+    assert odometry is not None
+    assert abs(heading_error(path, 2.2, odometry)) < math.radians(4.0)
+
+
+def test_a_noisy_first_heading_is_never_the_opposite_one(feed: Any) -> None:
+    """Ranges as noisy as the antennas are apart (0.5 m): what is reported lies within 4.5 sd."""
+    for seed in range(25):
+        path = standing(0.25 * seed)
+        t, report = followed(path, 1.0, seed, feed, sd=0.5)[-1]
+        if report.odometry is not None:
+            error = heading_error(path, t, report.odometry)
+            assert abs(error) < 4.5 * math.sqrt(report.odometry.pose_cov[5, 5])
+
+
+def test_heading_is_found_anew_after_a_silence(feed: Any) -> None:
+    target = tracker(max_gap_s=2.0)
+    followed(standing(0.5), 1.0, 5, feed, target)
+    path, rng = standing(-2.6), np.random.default_rng(6)
+    for k in range(5):
+        (report,) = feed(target, measure(path, 10.0 + 0.1 * k, rng))
+    assert report.odometry is not None
+    assert abs(heading_error(path, 10.4, report.odometry)) < math.radians(6.0)
+
+
+def test_initial_pose_leaves_the_heading_to_the_lever_arms(feed: Any) -> None:
+    for yaw in np.linspace(-3.1, 3.1, 9):
+        path, target, rng = standing(float(yaw)), tracker(), np.random.default_rng(7)
+        pose = InitialPose(
+            stamp_ns=T0_NS,
+            vue_id="vue_1",
+            position=np.array([1.0, 2.0, 0.0]),
+            cov=0.25 * np.eye(3),
+        )
+        for k in range(10):
+            items = measure(path, 0.1 * k, rng)
+            (report,) = feed(target, [pose, *items] if k == 0 else items)
+        assert report.odometry is not None
+        assert abs(heading_error(path, 0.9, report.odometry)) < math.radians(6.0)
+
+
+# What does not hold yet; strict, so that a mark goes with its defect.
+
+
+@pytest.mark.parametrize("filter_name", ["ekf", "ukf"])
+def test_initial_pose_without_iteration(feed: Any, filter_name: str) -> None:
+    place, cov = np.array([1.0, 2.0, 0.0]), 0.25 * np.eye(3)
+    for yaw in (0.3, -2.6):
+        path, target = standing(yaw), tracker(filter=filter_name)
+        target.add(InitialPose(stamp_ns=T0_NS, vue_id="vue_1", position=place, cov=cov))
+        t, report = followed(path, 3.0, 1, feed, target)[-1]
+        assert report.odometry is not None
+        assert abs(heading_error(path, t, report.odometry)) < math.radians(6.0)
+
+
+def test_first_fix_with_antennas_far_ahead(feed: Any) -> None:
+    path, target = standing(1.0), tracker()
+    (report,) = feed(target, measure(path, 0.0, np.random.default_rng(8), antennas=AHEAD))
+    assert report.odometry is not None
+    d = report.odometry.position[:2] - path(0.0)[:2]
+    assert d @ np.linalg.solve(report.odometry.pose_cov[:2, :2], d) < chi2.ppf(0.9999, 2)
+
+
+def test_first_fix_close_to_an_rsu(feed: Any) -> None:
+    """0.9 m from a corner, with ranges to all four."""
+    reports = followed(lambda _: (9.4, 9.3, 0.4), 4.0, 9, feed, sd=0.02)
+    assert reports[-1][1].odometry is not None
+
+
+def test_smoothed_heading_is_that_of_the_state(feed: Any) -> None:
+    smoothed = [
+        odometry
+        for _, report in followed(circle, 10.0, 10, feed, tracker(fixed_lag_s=1.0))
+        for odometry in report.smoothed
+    ]
+    turned = [heading_error(circle, (o.stamp_ns - T0_NS) * 1e-9, o) for o in smoothed]
+    assert np.abs(turned[20:]).max() < math.radians(8.0)
+
+
+def test_yaw_rate_is_reported(feed: Any) -> None:
+    odometry = followed(circle, 10.0, 11, feed)[-1][1].odometry
+    assert odometry is not None
+    assert odometry.angular_velocity[2] == pytest.approx(0.3, abs=0.2)
+    assert odometry.twist_cov[5, 5] < 1.0
+
+
+def test_height_of_an_antenna_counts(feed: Any) -> None:
+    """Antennas 1 m above base_link, 5 m from an RSU."""
+    high = {name: (x, y, 1.0) for name, (x, y, _) in ANTENNAS.items()}
+    reports = followed(lambda t: (7.0, 6.0, 0.3 * t), 10.0, 12, feed, sd=0.02, antennas=high)
+    assert "gate" not in reports[-1][1].status.rejected
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e12])
+def test_a_lever_arm_that_is_none_is_refused(bad: float) -> None:
+    target, first = tracker(), measure(circle, 0.0)
+    first[0].lever_arm = (bad, 0.0, 0.0)
+    assert target.add(first[0]) is not None

@@ -1,0 +1,158 @@
+"""Stamps that cannot be right, time that stands still, jumps or goes back, and long gaps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from netpos.messages.values import Array, RsuMeasurement
+from netpos.tracking import Tracker, TrackOutput
+
+T0 = 1_000_000_000
+MS = 1_000_000
+VARIANTS: dict[str, dict[str, Any]] = {
+    "ekf": {"filter": "ekf", "process_noise": "werner"},
+    "iekf": {},
+    "ukf": {"filter": "ukf"},
+    "srukf": {"filter": "srukf"},
+    "interacting": {"motion_model": "interacting"},
+    "inertial": {"motion_model": "inertial"},
+}
+
+
+def truth(t_s: float) -> Array:
+    """East along the street at 8 m/s, clock 3 km ahead and gaining 5 km/s."""
+    return np.array([8.0 * t_s, 0.0, 8.0, 0.0, 3000.0 + 5000.0 * t_s, 5000.0])
+
+
+def fed(tracker: Tracker, items: Iterable[Any]) -> list[TrackOutput]:
+    for item in items:
+        assert tracker.add(item) is None
+    return tracker.process()
+
+
+def epochs(world: Any, count: int, step_s: float = 0.1) -> list[list[RsuMeasurement]]:
+    return [world.measure(step_s * k, truth(step_s * k)) for k in range(count)]
+
+
+def ran(world: Any, batches: Iterable[list[Any]], **config: Any) -> Tracker:
+    tracker: Tracker = world.tracker(**config)
+    for batch in batches:
+        fed(tracker, batch)
+    return tracker
+
+
+def state(tracker: Tracker) -> list[Any]:
+    """Estimate and counts, bit by bit."""
+    s = tracker._tracks["vue_1"]._state
+    estimate = [s.estimate.stamp_ns, s.estimate.mean.tobytes(), s.estimate.cov.tobytes()]
+    return [*estimate, s.accepted, dict(s.rejected), s.last_accepted_ns]
+
+
+def test_stamp_zero_is_refused(world: Any) -> None:
+    tracker = ran(world, epochs(world, 3))
+    for stamp in (0, -1):
+        item = replace(world.measure(0.3, truth(0.3))[0], stamp_ns=stamp)
+        assert tracker.add(item) == "zero_stamp"
+    assert tracker.process() == []
+
+
+def test_one_stamp_far_in_the_future_counts_for_nothing(world: Any) -> None:
+    tracker = ran(world, epochs(world, 10), max_future_s=60.0)
+    before = state(tracker)
+    (far,) = world.measure(0.9 + 60.0 + 1e-9, truth(1.0), names=["a"])
+    assert tracker.add(far) == "future_stamp"
+    assert tracker.process() == []
+    assert state(tracker) == before
+    (output,) = fed(tracker, world.measure(1.0, truth(1.0)))
+    assert output.status.used == 3
+    assert output.status.rejected == {"future_stamp": 1}
+    # what came in between is no confirmation, nor is another time as far away again
+    (far,) = world.measure(70.0, truth(1.0), names=["a"])
+    assert tracker.add(far) == "future_stamp"
+    (later,) = world.measure(200.0, truth(1.0), names=["a"])
+    assert tracker.add(later) == "future_stamp"
+
+
+def test_a_second_stamp_confirms_the_future(world: Any) -> None:
+    tracker = ran(world, epochs(world, 10), max_future_s=60.0)
+    far = world.measure(100.0, truth(1.0))
+    assert tracker.add(far[0]) == "future_stamp"
+    assert tracker.add(far[1]) is None
+    assert tracker.add(far[2]) is None
+    (output,) = tracker.process()
+    assert output.status.stamp_ns == far[0].stamp_ns
+    (near,) = world.measure(0.9 + 60.0, truth(1.0), names=["a"])
+    tracker = ran(world, epochs(world, 10), max_future_s=60.0)
+    assert tracker.add(near) is None  # at the limit no confirmation is needed
+
+
+@pytest.mark.parametrize("history_s", [0.0, 1.0])
+def test_time_set_back_starts_anew(world: Any, history_s: float) -> None:
+    """Ten stamps in a row from before the history, then the track begins again in the past."""
+    later = [world.measure(100.0 + 0.1 * k, truth(0.1 * k)) for k in range(9)]
+    tracker = ran(world, later, history_s=history_s)
+    backward = [m for k in range(6) for m in world.measure(0.1 * k, truth(0.1 * k))]
+    reasons = [tracker.add(m) for m in backward]
+    assert reasons == ["late"] * 10 + [None] * 8
+    outputs = tracker.process() + tracker.flush()
+    assert [o.status.stamp_ns for o in outputs] == [T0 + k * 100 * MS for k in (3, 4, 5)]
+    assert outputs[-1].odometry is not None
+    assert outputs[-1].status.rejected["late"] == 10
+    assert outputs[-1].status.accepted == 27 + 6  # two RSUs are no first fix yet
+    error = outputs[-1].odometry.position[:2] - truth(0.5)[:2]
+    assert np.linalg.norm(error) < 1.0
+
+
+def test_nine_stamps_from_the_past_are_no_new_time(world: Any) -> None:
+    tracker = ran(world, [world.measure(100.0 + 0.1 * k, truth(0.1 * k)) for k in range(9)])
+    backward = [m for k in range(3) for m in world.measure(0.1 * k, truth(0.1 * k))]
+    for _ in range(3):  # what is in time in between ends the row
+        assert [tracker.add(m) for m in backward] == ["late"] * 9
+        k = tracker._tracks["vue_1"]._state.accepted // 3
+        (output,) = fed(tracker, world.measure(100.0 + 0.1 * k, truth(0.1 * k)))
+        assert output.status.used == 3
+
+
+def test_pause_and_resume_are_harmless(world: Any) -> None:
+    """A paused source repeats its last stamp: nothing new, nothing lost, nothing counted twice."""
+    batches = epochs(world, 20)
+    plain = ran(world, batches)
+    paused = world.tracker()
+    for batch in batches:
+        fed(paused, batch)
+        for _ in range(5):
+            assert [paused.add(m) for m in batch] == ["duplicate"] * 3
+            assert paused.process() + paused.flush() == []
+    assert state(paused) == state(plain)
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_a_gap_inflates_the_covariance_and_no_more(world: Any, name: str) -> None:
+    """Up to max_gap_s the track is predicted, beyond it starts anew; all of it finite."""
+    config = VARIANTS[name] | {"max_gap_s": 30.0, "gate_probability": 1.0}
+    for gap_s, updated in ((29.9, True), (30.1, False), (5000.0, False)):
+        tracker = ran(world, epochs(world, 20), **config, max_future_s=1e5)
+        tracker.flush()
+        track = tracker._tracks["vue_1"]
+        before = track._state.estimate.cov
+        ahead = track._state.estimate.copy()
+        ahead.predict(T0 + round((1.9 + gap_s) * 1e9), track._state.bias)
+        np.linalg.cholesky(ahead.cov)
+        assert np.isfinite(ahead.mean).all()
+        assert ahead.cov[0, 0] > before[0, 0]
+        # white acceleration, a lost velocity, no more than a turning, braking car could do
+        grown = math.sqrt(ahead.cov[0, 0])
+        assert 0.1 < grown < 40.0 * gap_s**1.5 + 1.0
+        (output,) = [
+            *fed(tracker, world.measure(1.9 + gap_s, truth(1.9))),
+            *tracker.flush(),
+        ]
+        assert output.status.used == 3
+        assert (output.status.nis_dof > 0) is updated
+        assert np.isfinite(output.odometry.pose_cov).all()
+        np.linalg.cholesky(output.odometry.pose_cov[:2, :2])

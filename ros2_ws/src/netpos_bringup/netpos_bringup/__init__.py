@@ -1,0 +1,1 @@
+"""Launch files, scenarios and the processes that ``netpos bench`` measures the live node with."""
