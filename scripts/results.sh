@@ -25,6 +25,9 @@ if [ -d "$data" ]; then
     netpos replay "$out/uwb_$run.in" --out "$out/uwb_$run" >/dev/null
     netpos evaluate "$out/uwb_$run" --json "$out/uwb_$run.json" >/dev/null
   done
+  netpos import uwb-trolley "$data/uwb_trolley" "$out/uwb_trolley.in" >/dev/null
+  netpos replay "$out/uwb_trolley.in" --out "$out/uwb_trolley" >/dev/null
+  netpos evaluate "$out/uwb_trolley" --json "$out/uwb_trolley.json" >/dev/null
 else
   echo "netpos: no real recordings at $data, so only the simulations were measured" >&2
 fi
