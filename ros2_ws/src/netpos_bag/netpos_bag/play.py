@@ -14,6 +14,7 @@ from netpos_node import message_class, wait_until_heard
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
@@ -38,6 +39,13 @@ class PlayNode(Node):
         clock_class = message_class("rosgraph_msgs/msg/Clock")
         self._ticker = self.create_publisher(clock_class, CLOCK, 10)
         self.max_lag_s = 0.0
+        self._latched = {
+            topic
+            for topic in self.outlets
+            if profile_to_play(self.bag.topics[topic].qos).durability
+            is DurabilityPolicy.TRANSIENT_LOCAL
+        }
+        self._latched_pending: set[str] = set()
 
     def _outlet(self, topic: str) -> Publisher:
         info = self.bag.topics[topic]
@@ -66,6 +74,7 @@ class PlayNode(Node):
         """Once from the start to the end."""
         self._ticker.publish(clock_cdr(self.plan.start_ns))
         for entry in self.plan.leading():
+            self._latched_pending.add(entry.topic)
             self._publish(entry)
         self.wait_for_subscribers()
         begin = time.monotonic()
@@ -79,7 +88,21 @@ class PlayNode(Node):
             if entry is None:
                 self._ticker.publish(clock_cdr(log_time_ns))
             else:
+                begin += self._see_descriptions_arrive(entry.topic)
                 self._publish(entry)
+
+    def _see_descriptions_arrive(self, next_topic: str) -> float:
+        """Before a topic that is not latched goes on: what was latched has arrived, so that no
+        measurement overtakes the description of its RSU. Returns the seconds waited."""
+        if self._latched_pending and next_topic not in self._latched:
+            start = time.monotonic()
+            for topic in self._latched_pending:
+                self.outlets[topic].wait_for_all_acked(Duration(seconds=ACK_S))
+            self._latched_pending.clear()
+            return time.monotonic() - start
+        if next_topic in self._latched:
+            self._latched_pending.add(next_topic)
+        return 0.0
 
     def finish(self) -> None:
         """Leave when all is acknowledged."""

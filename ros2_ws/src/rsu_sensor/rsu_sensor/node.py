@@ -7,12 +7,14 @@ from typing import Any
 from netpos.messages.topics import BEACON, RSU_INFO, RSU_MEASUREMENTS, of_vue
 from netpos_msgs.msg import Beacon, RsuInfo, RsuMeasurement
 from netpos_node import LATCHED, STREAM, run, wait_until_heard
+from rclpy.duration import Duration
 from rclpy.node import Node
 
 from rsu_sensor.conversions import beacon_from_msg, measurement_to_msg, rsu_info_to_msg
 from rsu_sensor.parameters import declare_parameters
 
 _PATIENCE_S = 30.0
+_DELIVERY_S = 5
 
 
 class RsuSensorNode(Node):
@@ -45,6 +47,8 @@ class RsuSensorNode(Node):
                 f"fewer than {self._settings.subscribers} subscribers to {RSU_MEASUREMENTS}; "
                 "measuring all the same"
             )
+        # no measurement overtakes the description of its RSU
+        self._info_pub.wait_for_all_acked(Duration(seconds=_DELIVERY_S))
 
     def _on_beacon(self, msg: Any) -> None:
         try:
