@@ -78,30 +78,6 @@ def _mixed(probability: float, mean: float, variance: float) -> tuple[float, flo
 
 
 @leaf
-def gaussian_excess(
-    innovation: float, innovation_var: float, prior: float, mean_m: float, sd_m: float
-) -> tuple[float, float, float]:
-    """Posterior of the excess path, Gaussian with ``mean_m`` and ``sd_m`` where there is one.
-
-    innovation [m], innovation_var S = H P H' + R [m^2], prior probability of a blocked path.
-    Returns the posterior probability of a blocked path, and E [m] and V [m^2] of (M). A Gaussian
-    reaches below 0: with ``sd_m`` above a third of ``mean_m`` early ranges count as blocked too.
-    """
-    late_var = innovation_var + sd_m * sd_m
-    late = innovation - mean_m
-    log_ratio = 0.5 * (
-        innovation * innovation / innovation_var
-        - late * late / late_var
-        - math.log(late_var / innovation_var)
-    )
-    mean = mean_m + sd_m * sd_m / late_var * late
-    variance = sd_m * sd_m * innovation_var / late_var
-    return _mixed(  # type: ignore[no-any-return]
-        _probability(_log_odds(prior) + log_ratio), mean, variance
-    )
-
-
-@leaf
 def _log_mills(z: float) -> float:
     """log(Phi(z) / phi(z)) of the standard normal."""
     if z < -_TAIL:
@@ -130,8 +106,10 @@ def exponential_excess(
 ) -> tuple[float, float, float]:
     """Posterior of the excess path, exponential with ``mean_m`` where there is one: never early.
 
-    Arguments and result as of ``gaussian_excess``. Given r, the excess is a normal variable of
-    mean r - S / mean_m and variance S, cut off at 0, and the ratio of the likelihoods is
+    innovation [m], innovation_var S = H P H' + R [m^2], prior probability of a blocked path.
+    Returns the posterior probability of a blocked path, and E [m] and V [m^2] of (M).
+
+    Given r, the excess is a normal variable of mean r - S / mean_m and variance S, cut off at 0, and the ratio of the likelihoods is
     sqrt(S) / mean_m times Phi(z) / phi(z) at z = r / sqrt(S) - sqrt(S) / mean_m: all exact.
     """
     sd = math.sqrt(innovation_var)
@@ -163,26 +141,6 @@ def equivalent_measurement(
 
 
 @leaf
-def nlos_mixture(
-    innovation: float,
-    innovation_var: float,
-    measurement_var: float,
-    prior: float,
-    mean_excess_m: float,
-    sd_excess_m: float,
-) -> tuple[float, float, float]:
-    """Posterior probability of a blocked path, shift [m] and variance [m^2] of the equivalent
-    measurement, for a Gaussian excess path; variance inf where none exists."""
-    probability, mean, variance = gaussian_excess(
-        innovation, innovation_var, prior, mean_excess_m, sd_excess_m
-    )
-    shift, equivalent = equivalent_measurement(
-        innovation, innovation_var, measurement_var, mean, variance
-    )
-    return probability, shift, equivalent
-
-
-@leaf
 def nlos_mixture_exponential(
     innovation: float,
     innovation_var: float,
@@ -190,7 +148,8 @@ def nlos_mixture_exponential(
     prior: float,
     mean_excess_m: float,
 ) -> tuple[float, float, float]:
-    """``nlos_mixture`` for an exponential excess path, the better default: never early."""
+    """Posterior probability of a blocked path, shift [m] and variance [m^2] of the equivalent
+    measurement, for an exponential excess path; variance inf where none exists."""
     probability, mean, variance = exponential_excess(
         innovation, innovation_var, prior, mean_excess_m
     )
@@ -198,20 +157,6 @@ def nlos_mixture_exponential(
         innovation, innovation_var, measurement_var, mean, variance
     )
     return probability, shift, equivalent
-
-
-@leaf
-def nlos_distance2(
-    innovation: float, innovation_var: float, mean_excess_m: float, sd_excess_m: float
-) -> float:
-    """Squared Mahalanobis distance [1] to the nearer of both explanations, for the gate of a late
-    range (exponential: sd = mean): a gate that knows only the direct path would refuse what the
-    mixture is there for."""
-    late = innovation - mean_excess_m
-    return min(
-        innovation * innovation / innovation_var,
-        late * late / (innovation_var + sd_excess_m * sd_excess_m),
-    )
 
 
 @leaf

@@ -26,7 +26,7 @@ from netpos.filters.motion import noise
 from netpos.filters.sigma import innovation_cov, move, regress
 from netpos.messages.values import Array
 
-__all__ = ["add_covariance", "cholesky_update", "covariance", "factor", "predict", "update"]
+__all__ = ["cholesky_update", "covariance", "factor", "predict", "update"]
 
 
 @kernel
@@ -89,14 +89,6 @@ def _rotate(first: Array, second: Array, start: int, c: float, s: float) -> None
         a, b = first[i], second[i]
         first[i] = c * a + s * b
         second[i] = c * b - s * a
-
-
-@kernel
-def add_covariance(L: Array, W: Array) -> None:
-    """Factor of L L' + W in place of ``L`` (n, n); ``W`` (n, n) may be singular."""
-    W_factor = factor(W)
-    for j in range(W.shape[0]):
-        cholesky_update(L, W_factor[:, j].copy(), 1.0)
 
 
 @kernel

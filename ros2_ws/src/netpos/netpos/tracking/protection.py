@@ -2,15 +2,13 @@
 it.
 
 The Gaussian part is exact (``protection_level``). What the covariance cannot know comes on top:
-an optimistic filter (``NisWindow``) and a single RSU that is wrong but not refused
-(``bias_shift``, ``faulted_level``).
+an optimistic filter (``NisWindow``) and a manoeuvre not yet noticed (``unnoticed_shift``).
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -144,97 +142,3 @@ def unnoticed_shift(mean: Array, cov: Array, rows: Array, height_m: float, gate:
         yy += h[1] * h[1] / variance
     least = (xx + yy) / 2.0 - math.hypot((xx - yy) / 2.0, xy)
     return math.sqrt(gate / least) if least > 0.0 else math.inf
-
-
-@kernel
-def bias_shift(
-    cov_prior: Array, H_group: Array, variance_group: Array, gate: float, cov_fused: Array
-) -> float:
-    """Largest shift of the position [m] by a bias of one RSU that its gate would still pass.
-
-    cov_prior : (n, n) the gate sees; H_group : (m, n); variance_group : (m,); gate : threshold T
-    of the squared Mahalanobis distance; cov_fused : (n, n) the group is fused into, that is after
-    all others of the epoch (``cov_prior`` where it is alone)
-
-    The slope of receiver autonomous integrity monitoring (Brown 1992; Walter and Enge 1995): the
-    bias b with b' S^-1 b <= T, S of the prior, that moves the position K b furthest; sqrt(T) times
-    the largest singular value of K_xy S^(1/2). For a group that is alone that is sqrt(T) times the
-    root of the largest eigenvalue of what its update takes off the position covariance.
-
-    To be added to a protection level only together with a probability (``faulted_level``): alone
-    it answers "how bad at worst", and every healthy track would carry some sqrt(T) = 4 sd of it.
-    It is the shift of one epoch: a bias that grows slowly moves the track along, passes every gate
-    and adds up. That is what the comparison of RSUs over time is for, not this bound. It also
-    takes the noise of the faulty group as 0: half of the biases on the bound are refused.
-    inf without a gate.
-    """
-    m, n = H_group.shape
-    S_gate = _innovation_cov(cov_prior, H_group, variance_group)
-    S = _innovation_cov(cov_fused, H_group, variance_group)
-    K = np.zeros((m, 2))  # transposed: S K = H P_xy by elimination, S being positive definite
-    for i in range(m):
-        for p in range(2):
-            for a in range(n):
-                K[i, p] += H_group[i, a] * cov_fused[a, p]
-    for i in range(m):
-        for j in range(i + 1, m):
-            factor = S[j, i] / S[i, i]
-            for k in range(m):
-                S[j, k] -= factor * S[i, k]
-            for p in range(2):
-                K[j, p] -= factor * K[i, p]
-    for i in range(m - 1, -1, -1):
-        for p in range(2):
-            for j in range(i + 1, m):
-                K[i, p] -= S[i, j] * K[j, p]
-            K[i, p] /= S[i, i]
-    xx = xy = yy = 0.0
-    for i in range(m):
-        for j in range(m):
-            xx += K[i, 0] * S_gate[i, j] * K[j, 0]
-            xy += K[i, 0] * S_gate[i, j] * K[j, 1]
-            yy += K[i, 1] * S_gate[i, j] * K[j, 1]
-    return math.sqrt(gate * ((xx + yy) / 2.0 + math.hypot((xx - yy) / 2.0, xy)))
-
-
-@kernel
-def _innovation_cov(cov: Array, H: Array, variance: Array) -> Array:
-    """H cov H' + diag(variance), (m, m)."""
-    m, n = H.shape
-    S = np.zeros((m, m))
-    for i in range(m):
-        S[i, i] = variance[i]
-        for j in range(m):
-            for a in range(n):
-                for b in range(n):
-                    S[i, j] += H[i, a] * cov[a, b] * H[j, b]
-    return S
-
-
-def faulted_level(
-    cov2: Array,
-    risk: float,
-    shifts: Sequence[float],
-    fault_probability: float,
-    inflation: float = 1.0,
-) -> float:
-    """Protection level [m] that also holds when one RSU is wrong by what its gate passes.
-
-    shifts : m, ``bias_shift`` of each RSU fused; fault_probability : that a given RSU is wrong
-
-    The risk is split as in advanced RAIM (Blanch et al. 2012): half to the fault-free case, half
-    evenly to the faults, each of which may then leave its share with the probability risk / (2 n
-    fault_probability), and the error of a shifted estimate exceeds r no more often than that of
-    the true one exceeds r - shift. Faults less probable than their share cost nothing. Two faults
-    at once are not covered.
-    """
-    if not 0.0 <= fault_probability <= 1.0:
-        raise ValueError(f"fault_probability must be in [0, 1], got {fault_probability!r}")
-    if not shifts or fault_probability == 0.0:
-        return protection_level(cov2, risk, inflation)
-    level = protection_level(cov2, max(risk / 2.0, RISK_MIN), inflation)
-    share = risk / (2.0 * len(shifts) * fault_probability)
-    if share >= 1.0:
-        return level
-    share = min(max(share, RISK_MIN), RISK_MAX)
-    return max(level, max(shifts) + protection_level(cov2, share, inflation))

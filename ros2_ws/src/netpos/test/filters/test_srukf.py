@@ -78,14 +78,6 @@ def test_factor_equals_cholesky(random_cov: Maker) -> None:
     np.testing.assert_allclose(srukf.factor(cov), np.linalg.cholesky(cov), rtol=1e-12)
 
 
-def test_add_covariance(random_cov: Maker) -> None:
-    rng = np.random.default_rng(2)
-    P, w = random_cov(rng, 6), rng.normal(size=(6, 2))
-    L = np.linalg.cholesky(P)
-    srukf.add_covariance(L, w @ w.T)
-    np.testing.assert_allclose(L, np.linalg.cholesky(P + w @ w.T), rtol=1e-9, atol=1e-12)
-
-
 @pytest.mark.parametrize("kind", list(ProcessNoise))
 @pytest.mark.parametrize("model", [Model.CONSTANT_VELOCITY, Model.CONSTANT_TURN])
 def test_predict_equals_the_plain_filter(

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from netpos.messages.values import Array
+from netpos.filters.measurement import linearise, rsu_axes, rsu_rows
+from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.protection import (
     RISK_MIN,
     NisWindow,
-    bias_shift,
-    faulted_level,
     protection_level,
+    unnoticed_shift,
 )
 from scipy import integrate, optimize, stats
 
@@ -170,70 +170,37 @@ def test_window_refuses_unsound_settings(bad: dict[str, Any]) -> None:
         NisWindow(**bad)
 
 
-# undetected biases
+# manoeuvres
 
 
-def random_case(seed: int, n: int = 6, m: int = 2) -> tuple[Array, Array, Array, Array]:
-    """A prior, the same after another group, and the rows of one group."""
-    rng = np.random.default_rng(seed)
-    L, H = rng.normal(size=(n, n)), rng.normal(size=(m, n))
-    P = L @ L.T
-    other = rng.normal(size=(2, n))
-    S = other @ P @ other.T + np.eye(2)
-    after = P - P @ other.T @ np.linalg.solve(S, other @ P)
-    return P, (after + after.T) / 2, H, rng.uniform(0.1, 2.0, size=m)
+def azimuth_row(x: float, y: float, sd_rad: float, mean: Array) -> Array:
+    info = RsuInfo(rsu_id="a", position=np.array([x, y, 0.0]))
+    m = RsuMeasurement(
+        stamp_ns=1,
+        rsu_id="a",
+        vue_id="vue_1",
+        fields=Field.AZIMUTH,
+        azimuth_rad=math.atan2(mean[1] - y, mean[0] - x),
+        azimuth_var=sd_rad**2,
+    )
+    return rsu_rows(m, info, rsu_axes(info), 0)
 
 
-@pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize("alone", [True, False])
-def test_no_bias_that_passes_the_gate_moves_the_position_further(seed: int, alone: bool) -> None:
-    P, after, H, R = random_case(seed)
-    fused = P if alone else after
-    T = 18.4
-    bound = bias_shift(P, H, R, T, fused)
-    S_gate, S = H @ P @ H.T + np.diag(R), H @ fused @ H.T + np.diag(R)
-    K = fused @ H.T @ np.linalg.inv(S)
-    angle = np.linspace(0, 2 * math.pi, 20001)
-    u = np.stack([np.cos(angle), np.sin(angle)])
-    b = np.linalg.cholesky(S_gate) @ u * math.sqrt(T)
-    np.testing.assert_allclose(np.einsum("ik,ij,jk->k", b, np.linalg.inv(S_gate), b), T)
-    shifts = np.linalg.norm((K @ b)[:2], axis=0)
-    assert shifts.max() == pytest.approx(bound, rel=1e-6)
+def test_unnoticed_shift_is_where_the_gate_begins_to_refuse() -> None:
+    """Two bearings at right angles, a prior without width: 1 degree at 100 m and at 40 m. The
+    weaker bearing alone decides, and a device moved that far across it just passes."""
+    mean, cov, sd, gate = np.array([100.0, 0, 0, 0, 0, 0]), np.zeros((6, 6)), math.radians(1), 9.0
+    rows = np.vstack([azimuth_row(0.0, 0.0, sd, mean), azimuth_row(100.0, 40.0, sd, mean)])
+    shift = unnoticed_shift(mean, cov, rows, 0.0, gate)
+    assert shift == pytest.approx(3.0 * sd * 100.0, rel=1e-9)
+    moved = mean.copy()
+    moved[1] += shift
+    assert ((linearise(rows, moved, 0.0)[0] / sd) ** 2).sum() == pytest.approx(gate, rel=5e-3)
+    wider = unnoticed_shift(mean, np.eye(6), rows, 0.0, gate)
+    assert wider > shift
 
 
-def test_alone_it_is_what_the_update_takes_off_the_covariance() -> None:
-    P, _, H, R = random_case(7)
-    post = np.linalg.inv(np.linalg.inv(P) + H.T @ np.diag(1 / R) @ H)
-    taken = np.linalg.eigvalsh((P - post)[:2, :2])[-1]
-    assert bias_shift(P, H, R, 9.0, P) == pytest.approx(3.0 * math.sqrt(taken), rel=1e-9)
-
-
-def test_no_gate_no_bound() -> None:
-    P, _, H, R = random_case(8)
-    assert bias_shift(P, H, R, math.inf, P) == math.inf
-
-
-def test_faulted_level_holds_over_monte_carlo() -> None:
-    """One RSU in a hundred wrong by its worst undetected shift, in the worst direction."""
-    rng = np.random.default_rng(13)
-    cov, risk, fault = rotated(1.0, 0.5, 0.4), 1e-3, 0.01
-    shifts = [4.0, 2.5]
-    level = faulted_level(cov, risk, shifts, fault)
-    errors = rng.multivariate_normal(np.zeros(2), cov, size=2_000_000)
-    wrong = rng.random((errors.shape[0], 2)) < fault
-    along = np.array([math.cos(0.4), math.sin(0.4)])
-    errors += np.where(wrong[:, :1], 4.0, np.where(wrong[:, 1:], 2.5, 0.0)) * along
-    assert np.mean(np.linalg.norm(errors, axis=1) > level) < risk
-    plain = protection_level(cov, risk)
-    assert np.mean(np.linalg.norm(errors, axis=1) > plain) > 5 * risk
-
-
-def test_faulted_level_without_faults_and_with_improbable_ones() -> None:
-    cov = np.eye(2)
-    assert faulted_level(cov, 1e-4, [], 0.1) == protection_level(cov, 1e-4)
-    assert faulted_level(cov, 1e-4, [5.0], 0.0) == protection_level(cov, 1e-4)
-    assert faulted_level(cov, 1e-4, [50.0], 1e-6) == protection_level(cov, 5e-5)
-    assert faulted_level(cov, 1e-4, [50.0], 1e-3) > 50.0
-    assert faulted_level(cov, 1e-4, [math.inf], 1e-3) == math.inf
-    with pytest.raises(ValueError, match="fault_probability"):
-        faulted_level(cov, 1e-4, [1.0], 1.5)
+def test_unnoticed_shift_is_unbounded_along_a_single_bearing() -> None:
+    mean = np.array([100.0, 0, 0, 0, 0, 0])
+    rows = azimuth_row(0.0, 0.0, 0.01, mean)
+    assert math.isinf(unnoticed_shift(mean, np.eye(6), rows, 0.0, 9.0))
