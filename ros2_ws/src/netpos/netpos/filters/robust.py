@@ -109,8 +109,9 @@ def exponential_excess(
     innovation [m], innovation_var S = H P H' + R [m^2], prior probability of a blocked path.
     Returns the posterior probability of a blocked path, and E [m] and V [m^2] of (M).
 
-    Given r, the excess is a normal variable of mean r - S / mean_m and variance S, cut off at 0, and the ratio of the likelihoods is
-    sqrt(S) / mean_m times Phi(z) / phi(z) at z = r / sqrt(S) - sqrt(S) / mean_m: all exact.
+    Given r, the excess is a normal variable of mean r - S / mean_m and variance S, cut off at 0,
+    and the ratio of the likelihoods is sqrt(S) / mean_m times Phi(z) / phi(z) at
+    z = r / sqrt(S) - sqrt(S) / mean_m: all exact.
     """
     sd = math.sqrt(innovation_var)
     z = innovation / sd - sd / mean_m
