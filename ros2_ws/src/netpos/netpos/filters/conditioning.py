@@ -17,6 +17,7 @@ from netpos.filters.measurement import (
     Kind,
     curvature_variance,
     innovation_row,
+    innovation_variance,
     linearise,
 )
 from netpos.filters.robust import huber_factor, nlos_mixture_exponential, student_t_factor
@@ -40,13 +41,9 @@ def _unblock(
 ) -> None:
     """Replace a range or time by the measurement equivalent to the mixture of a direct and a
     blocked path."""
-    n = mean.size
     innovation = innovation_row(row, mean, height_m, h)
-    spread = row[VARIANCE] + curvature_variance(row, mean, cov, height_m)
-    measurement_var = spread
-    for a in range(n):
-        for b in range(n):
-            spread += h[a] * cov[a, b] * h[b]
+    spread = innovation_variance(row, mean, cov, height_m, row[VARIANCE], h)
+    measurement_var = row[VARIANCE] + curvature_variance(row, mean, cov, height_m)
     _, shift, variance = nlos_mixture_exponential(
         innovation, spread, measurement_var, prior, excess_m
     )

@@ -198,6 +198,19 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
     return float(0.5 * square / (d2 * d2))
 
 
+@leaf
+def innovation_variance(
+    row: Array, mean: Array, cov: Array, height_m: float, variance: float, h: Array
+) -> float:
+    """Variance of the row's innovation: ``variance``, what linearising leaves out, and the prior
+    ``cov`` (n, n) along the row's Jacobian ``h`` (n,) at ``mean`` (n,)."""
+    total = variance + curvature_variance(row, mean, cov, height_m)
+    for a in range(mean.size):
+        for b in range(mean.size):
+            total += h[a] * cov[a, b] * h[b]
+    return float(total)
+
+
 @kernel
 def linearise(rows: Array, mean: Array, height_m: float) -> tuple[Array, Array]:
     """Innovations (m,) and Jacobian H (m, n) of ``rows`` (m, ROW_WIDTH) at ``mean``; angle

@@ -12,8 +12,8 @@ from netpos.filters.measurement import (
     GROUP,
     KIND,
     Kind,
-    curvature_variance,
     innovation_row,
+    innovation_variance,
 )
 from netpos.messages.values import Array, RsuMeasurement
 from netpos.tracking.batch import Batch
@@ -32,11 +32,8 @@ def row_fits(mean: Array, cov: Array, rows: Array, height_m: float) -> Array:
     h = np.empty(mean.size)
     for i in range(rows.shape[0]):
         fits[i, 0] = innovation_row(rows[i], mean, height_m, h)
-        variance = rows[i, GATE_VARIANCE] + curvature_variance(rows[i], mean, cov, height_m)
-        for a in range(mean.size):
-            for b in range(mean.size):
-                variance += h[a] * cov[a, b] * h[b]
-        fits[i, 1] = math.sqrt(variance)
+        noise = rows[i, GATE_VARIANCE]
+        fits[i, 1] = math.sqrt(innovation_variance(rows[i], mean, cov, height_m, noise, h))
     return fits
 
 

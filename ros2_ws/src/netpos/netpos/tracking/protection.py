@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from netpos.filters.compile import kernel, leaf
-from netpos.filters.measurement import GATE_VARIANCE, curvature_variance, innovation_row
+from netpos.filters.measurement import GATE_VARIANCE, innovation_row, innovation_variance
 from netpos.messages.values import Array
 
 _ANGLES = 16
@@ -133,10 +133,8 @@ def unnoticed_shift(mean: Array, cov: Array, rows: Array, height_m: float, gate:
     h = np.empty(mean.size)
     for i in range(rows.shape[0]):
         innovation_row(rows[i], mean, height_m, h)
-        variance = rows[i, GATE_VARIANCE] + curvature_variance(rows[i], mean, cov, height_m)
-        for a in range(mean.size):
-            for b in range(mean.size):
-                variance += h[a] * cov[a, b] * h[b]
+        noise = rows[i, GATE_VARIANCE]
+        variance = innovation_variance(rows[i], mean, cov, height_m, noise, h)
         xx += h[0] * h[0] / variance
         xy += h[0] * h[1] / variance
         yy += h[1] * h[1] / variance
