@@ -1,13 +1,17 @@
-"""The device clock against network time: offset rho and drift alpha (fokin2020:eq.1,
-fokin2020:eq.2).
+"""Clocks against network time: that of a device, offset rho and drift alpha (fokin2020:eq.1,
+fokin2020:eq.2),
 
 alpha[n] = beta alpha[n-1] + eta[n],   rho[n] = rho[n-1] + alpha[n] T
-"""
+
+and those of the RSUs, which a network keeps together to a few nanoseconds."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from scipy.signal import lfilter
@@ -47,3 +51,50 @@ def simulate_clock(
     drift = np.asarray(lfilter([1.0], [1.0, -model.beta], eta), dtype=np.float64)
     steps = drift * np.diff(stamps_ns, prepend=stamps_ns[:1]) * 1e-9
     return offset_0 + np.cumsum(steps), drift
+
+
+@dataclass(
+    frozen=True, slots=True, kw_only=True, config=ConfigDict(extra="forbid", allow_inf_nan=False)
+)
+class NetworkClockModel:
+    """How well the RSUs' clocks agree: errors of standard deviation ``sd_s`` each, with the
+    autocorrelation ``exp(-t / correlation_time_s)`` of a disciplined clock.
+
+    ``reference`` names the RSU whose clock *is* network time. ``declared`` says whether the RSUs
+    describe these errors (``RsuInfo.range_bias_sd_m``), so that a tracker estimates them.
+    """
+
+    sd_s: float = Field(gt=0)
+    correlation_time_s: float = Field(default=100.0, gt=0)
+    reference: str | None = None
+    declared: bool = True
+
+
+CLOCK_TONES = 64
+
+
+def clock_tones(model: NetworkClockModel, seed: int, rsu_id: str) -> Array:
+    """(CLOCK_TONES, 3) amplitude [s], angular frequency [rad/s] and phase [rad] of an RSU's clock
+    error under a seed; amplitude 0 at the reference.
+
+    The sum of the tones is a stationary process known at any instant without its past. One
+    frequency comes from each of the equally likely slices of the wanted spectrum, a Cauchy
+    distribution of scale 1 / correlation time, so its mean autocorrelation is exactly the wanted
+    one (spectral method, Shinozuka and Deodatis 1991).
+    """
+    rng = generator(seed, f"{rsu_id}/clock")
+    slice_ = (np.arange(CLOCK_TONES) + rng.random(CLOCK_TONES)) / CLOCK_TONES
+    frequency = np.tan(0.5 * math.pi * slice_) / model.correlation_time_s
+    phase = 2.0 * math.pi * rng.random(CLOCK_TONES)
+    sd_s = 0.0 if rsu_id == model.reference else model.sd_s
+    amplitude = np.full(CLOCK_TONES, sd_s * math.sqrt(2.0 / CLOCK_TONES))
+    return np.column_stack([amplitude, frequency, phase])
+
+
+@njit(cache=True)
+def clock_error(elapsed_s: float, tones: Array) -> float:
+    """Clock minus network time [s] of an RSU at a time on any fixed scale; tones (k, 3)."""
+    error = 0.0
+    for k in range(tones.shape[0]):
+        error += tones[k, 0] * math.cos(tones[k, 1] * elapsed_s + tones[k, 2])
+    return error

@@ -3,7 +3,8 @@ noise.
 
     azimuth   = atan2(dy, dx) in the RSU's axes                        (fokin2020:eq.13)
     elevation = atan2(dz, hypot(dx, dy)) in the RSU's axes
-    toa       = |d| / c + clock offset                                 (fokin2020:eq.14)
+    toa       = |d| / c + clock offset of the device - clock error of the RSU
+                                                                       (fokin2020:eq.14)
     range     = |d|, two-way, free of the clock
 
 Noise depends on (seed, RSU, device, stamp) only, so any process, live or offline, draws the same
@@ -18,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from netpos.radio.clocks import clock_error
 from netpos.radio.noise import Key, draw_normals
 from netpos.radio.propagation import (
     LOS_MODELS,
@@ -46,6 +48,7 @@ class Sites(NamedTuple):
     rotation: Array  # (m, 3, 3) map to RSU axes
     noise_key: Key  # (m, 2)
     sight_key: Key  # (m, 2)
+    clock_tones: Array  # (m, k, 3) of clocks.clock_tones; k = 0: perfect clocks
 
 
 class Sight(NamedTuple):
@@ -244,7 +247,8 @@ def observe(
             turned = azimuth + math.sqrt(var[AZIMUTH]) * noise[AZIMUTH]
             values[i, j, AZIMUTH] = (turned + math.pi) % (2.0 * math.pi) - math.pi
             values[i, j, ELEVATION] = elevation + math.sqrt(var[ELEVATION]) * noise[ELEVATION]
-            delay = distance / SPEED_OF_LIGHT_MPS + clock_offsets_s[i]
+            rsu_clock_s = clock_error(stamps_ns[i] * 1e-9, sites.clock_tones[k])
+            delay = distance / SPEED_OF_LIGHT_MPS + clock_offsets_s[i] - rsu_clock_s
             values[i, j, TOA] = delay + math.sqrt(var[TOA]) * noise[TOA]
             values[i, j, RANGE] = distance + math.sqrt(var[RANGE]) * noise[RANGE]
             for quantity in range(4):

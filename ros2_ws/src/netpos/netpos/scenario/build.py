@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from netpos.messages.values import RsuInfo
+from netpos.radio.clocks import clock_tones
 from netpos.radio.measure import Errors, Sight, Sites, los_model_number
 from netpos.radio.noise import stream_key
+from netpos.radio.propagation import SPEED_OF_LIGHT_MPS
 from netpos.scenario.schema import Device, FixedErrors, Scenario
 from netpos.world.frames import quaternion_from_yaw, yaw_from_quaternion
 from netpos.world.maps import METIS_KERB_OFFSET_M, METIS_MADRID, METIS_RSU_SPACING_M
@@ -27,6 +30,22 @@ def buildings_of(scenario: Scenario) -> Array:
 
 def rsus_of(scenario: Scenario) -> tuple[RsuInfo, ...]:
     """The RSUs, stamped with the start of the run."""
+    clock = scenario.rsus.clock
+    if clock is None or not clock.declared:
+        return _placed(scenario)
+    return tuple(
+        rsu
+        if rsu.rsu_id == clock.reference
+        else replace(
+            rsu,
+            range_bias_sd_m=SPEED_OF_LIGHT_MPS * clock.sd_s,
+            bias_correlation_time_s=clock.correlation_time_s,
+        )
+        for rsu in _placed(scenario)
+    )
+
+
+def _placed(scenario: Scenario) -> tuple[RsuInfo, ...]:
     if scenario.rsus.layout == "metis_madrid":
         places = METIS_MADRID.lamp_posts(METIS_RSU_SPACING_M, METIS_KERB_OFFSET_M)
         return tuple(
@@ -59,13 +78,35 @@ def rotations_of(rsus: tuple[RsuInfo, ...]) -> Array:
     return rotations
 
 
-def sites_of(rsus: tuple[RsuInfo, ...], rotations: Array, seed: int, vue_id: str) -> Sites:
-    """The RSUs as one device meets them: places, rotations of ``rotations_of``, noise streams."""
+def clock_tones_of(scenario: Scenario, rsus: tuple[RsuInfo, ...]) -> Array:
+    """(m, k, 3) of the RSUs' clocks; k = 0 where they are perfect.
+
+    Raises
+    ------
+    ValueError  the reference is none of the RSUs
+    """
+    clock = scenario.rsus.clock
+    if clock is None:
+        return np.zeros((len(rsus), 0, 3))
+    ids = [rsu.rsu_id for rsu in rsus]
+    if clock.reference is not None and clock.reference not in ids:
+        raise ValueError(
+            f"rsus.clock.reference {clock.reference!r} is none of the RSUs: {', '.join(ids)}"
+        )
+    return np.array([clock_tones(clock, scenario.seed, rsu_id) for rsu_id in ids])
+
+
+def sites_of(
+    rsus: tuple[RsuInfo, ...], rotations: Array, tones: Array, seed: int, vue_id: str
+) -> Sites:
+    """The RSUs as one device meets them: places, rotations of ``rotations_of``, clocks of
+    ``clock_tones_of``, noise streams."""
     return Sites(
         position=np.array([rsu.position for rsu in rsus]),
         rotation=rotations,
         noise_key=np.array([stream_key(seed, f"{r.rsu_id}/{vue_id}/noise") for r in rsus]),
         sight_key=np.array([stream_key(seed, f"{r.rsu_id}/{vue_id}/sight") for r in rsus]),
+        clock_tones=tones,
     )
 
 

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from netpos.inertial.imu import ImuModel, MagnetometerModel, interval_ns
 from netpos.radio.arrays import AntennaArray
-from netpos.radio.clocks import ClockModel
+from netpos.radio.clocks import ClockModel, NetworkClockModel
 from netpos.radio.noise import generator
 from netpos.radio.propagation import UMA_HIGHEST_DEVICE_M, LosModel, PathLoss
 from netpos.radio.waveform import Waveform
@@ -75,6 +75,7 @@ class Rsus(Section):
     layout: Literal["metis_madrid", "list"] = "list"
     units: tuple[RsuUnit, ...] = ()
     height_m: Finite = 0.0
+    clock: NetworkClockModel | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

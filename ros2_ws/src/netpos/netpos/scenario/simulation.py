@@ -38,7 +38,14 @@ from netpos.radio.measure import (
     observe,
 )
 from netpos.radio.noise import generator
-from netpos.scenario.build import errors_of, rotations_of, rsus_of, sight_of, sites_of
+from netpos.scenario.build import (
+    clock_tones_of,
+    errors_of,
+    rotations_of,
+    rsus_of,
+    sight_of,
+    sites_of,
+)
 from netpos.scenario.schema import Device, Scenario
 from netpos.world.frames import quaternion_from_yaw
 
@@ -81,12 +88,13 @@ class Simulation:
         self._place_devices()
 
     def _place_devices(self) -> None:
+        tones = clock_tones_of(self.scenario, self.rsus)
         self._vues = {
             vue: _Vue(
                 self.scenario,
                 vue,
                 device,
-                sites_of(self.rsus, self._rotations, self.scenario.seed, vue),
+                sites_of(self.rsus, self._rotations, tones, self.scenario.seed, vue),
                 self._sights[vue],
             )
             for vue, device in self.scenario.each_device

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from netpos.radio.clocks import ClockModel, simulate_clock
+from netpos.radio.clocks import (
+    ClockModel,
+    NetworkClockModel,
+    clock_error,
+    clock_tones,
+    simulate_clock,
+)
 from scipy import stats
 
 STEP_NS = 83_650_000
@@ -41,3 +47,37 @@ def test_fixed_start() -> None:
 def test_bad_model_is_refused() -> None:
     with pytest.raises(ValueError, match="drift_sd"):
         ClockModel(drift_sd=-1.0)
+
+
+def test_rsu_clock_errors_have_the_wanted_autocorrelation() -> None:
+    """Over many seeds, at lags that no period of the tones is tied to."""
+    model = NetworkClockModel(sd_s=3e-9, correlation_time_s=50.0)
+    lags = np.array([0.0, 5.0, 50.0, 100.0])
+    errors = np.array(
+        [
+            [clock_error(1e4 + lag, clock_tones(model, seed, "rsu_1")) for lag in lags]
+            for seed in range(3000)
+        ]
+    )
+    assert abs(errors.mean(axis=0)).max() < 4 * 3e-9 / np.sqrt(3000)
+    products = errors * errors[:, :1] / 9e-18
+    spread = 4 * products.std(axis=0) / np.sqrt(3000)
+    assert (abs(products.mean(axis=0) - np.exp(-lags / 50.0)) < spread).all()
+
+
+def test_rsu_clock_errors_are_normal_and_independent() -> None:
+    model = NetworkClockModel(sd_s=2e-9)
+    pairs = np.array(
+        [
+            [clock_error(7.0, clock_tones(model, seed, name)) for name in ("rsu_1", "rsu_2")]
+            for seed in range(3000)
+        ]
+    )
+    assert stats.kstest(pairs[:, 0], stats.norm(scale=2e-9).cdf).pvalue > 1e-3
+    assert abs(np.corrcoef(pairs.T)[0, 1]) < 4 / np.sqrt(3000)
+
+
+def test_the_reference_clock_is_network_time() -> None:
+    model = NetworkClockModel(sd_s=2e-9, reference="rsu_1")
+    assert clock_error(7.0, clock_tones(model, 1, "rsu_1")) == 0.0
+    assert clock_error(7.0, clock_tones(model, 1, "rsu_2")) != 0.0

@@ -32,6 +32,7 @@ def _sites(places: np.ndarray) -> Sites:
         rotation=np.tile(np.eye(3), (len(places), 1, 1)),
         noise_key=keys,
         sight_key=keys,
+        clock_tones=np.zeros((len(places), 0, 3)),
     )
 
 

@@ -19,6 +19,7 @@ from netpos.messages.values import (
     Odometry,
     RsuMeasurement,
 )
+from netpos.radio.clocks import NetworkClockModel, clock_error, clock_tones
 from netpos.scenario import Scenario, Simulation, load_scenario
 from netpos.world.maps import METIS_MADRID
 from scipy import stats
@@ -114,6 +115,33 @@ def test_errors_agree_with_the_stated_variances(name: str) -> None:
         assert low < (z**2).sum() < high
         assert stats.kstest(z, "norm").pvalue > 1e-4
         assert abs(np.corrcoef(z[:-2], z[2:])[0, 1]) < 5 / math.sqrt(len(z))  # white per RSU
+
+
+def test_times_of_arrival_carry_the_errors_of_the_rsus_clocks() -> None:
+    """The same beacons with and without; one error per RSU and instant, none at the reference."""
+    clock = {"sd_s": 4e-9, "reference": "rsu_2", "declared": False}
+    perfect = Simulation(load_scenario("fast_pass"))
+    simulation = Simulation(load_scenario("fast_pass", changes={"rsus.clock": clock}))
+    model = NetworkClockModel(**clock)
+    for beacon in _beacons(perfect):
+        for m, ideal in zip(simulation.measure(beacon), perfect.measure(beacon), strict=True):
+            tones = clock_tones(model, perfect.scenario.seed, m.rsu_id)
+            error = clock_error(beacon.stamp_ns * 1e-9, tones)
+            assert m.toa_s - ideal.toa_s == pytest.approx(-error, abs=1e-18)
+            assert (error == 0.0) == (m.rsu_id == "rsu_2")
+            assert m.azimuth_rad == ideal.azimuth_rad
+    assert all(rsu.range_bias_sd_m == 0.0 for rsu in simulation.rsus)
+
+
+def test_rsus_declare_the_errors_of_their_clocks() -> None:
+    clock = {"sd_s": 4e-9, "correlation_time_s": 30.0, "reference": "rsu_2"}
+    rsus = Simulation(load_scenario("fast_pass", changes={"rsus.clock": clock})).rsus
+    declared = {r.rsu_id: (r.range_bias_sd_m, r.bias_correlation_time_s) for r in rsus}
+    assert declared == {"rsu_1": (pytest.approx(4e-9 * C), 30.0), "rsu_2": (0.0, 0.0)}
+    with pytest.raises(ValueError, match="reference 'rsu_9' is none of the RSUs: rsu_1, rsu_2"):
+        Simulation(
+            load_scenario("fast_pass", changes={"rsus.clock": {**clock, "reference": "rsu_9"}})
+        )
 
 
 def test_fixed_errors_are_those_of_the_paper() -> None:

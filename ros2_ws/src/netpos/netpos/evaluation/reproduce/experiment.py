@@ -12,7 +12,7 @@ import numpy.typing as npt
 from netpos.evaluation.bounds import bound_covariances
 from netpos.evaluation.metrics import NS
 from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
-from netpos.filters.motion import NO_BIAS, SPEED_OF_LIGHT_MPS
+from netpos.filters.motion import N_CORE, NO_BIAS, SPEED_OF_LIGHT_MPS
 from netpos.messages.values import Array, ImuSample
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.simulation import Beacons
@@ -63,11 +63,13 @@ class Track:
 
 
 class Epochs(NamedTuple):
-    """Epochs of a run: stamps_ns (N,), row_start (N + 1,), rows (M, ROW_WIDTH)."""
+    """Epochs of a run: stamps_ns (N,), row_start (N + 1,), rows (M, ROW_WIDTH), biases (2, k) in
+    the rows."""
 
     stamps_ns: Ints
     row_start: Ints
     rows: Array
+    bias: Array
 
 
 class Setup:
@@ -95,7 +97,8 @@ class Setup:
 
         Raises
         ------
-        ValueError  the scenario gives no initial pose, or no RSU hears the first beacon
+        ValueError  the scenario gives no initial pose, or no RSU hears the first beacon, or RSUs
+            declare biases while the motion model is inertial
         """
         simulation = self.simulation.with_seed(seed)
         pose = simulation.initial_pose(VUE)
@@ -103,20 +106,26 @@ class Setup:
             raise ValueError(
                 f"scenario {simulation.scenario.name} gives no initial pose; set initial_pose_sd_m"
             )
-        heard, row_start, rows = observation_rows(simulation.observations(VUE), self._templates)
+        heard, row_start, rows, bias = observation_rows(
+            simulation.observations(VUE), self._templates, N_CORE + self._extra_sd.size
+        )
         if not heard.size or heard[0] > 0:
             raise ValueError(f"no RSU hears the first beacon of {simulation.scenario.name}")
-        epochs = Epochs(simulation.beacons(VUE).stamp_ns[heard], row_start, rows)
+        epochs = Epochs(simulation.beacons(VUE).stamp_ns[heard], row_start, rows, bias)
         mean, cov = pose_state(self.config, pose.position[:2], pose.cov[:2, :2])
         if self.config.use_imu:
+            if bias.size:
+                raise ValueError(
+                    "an inertial motion model takes no RSU biases here; undeclare them"
+                )
             done, *filled, motions = self._driven(epochs, mean, cov, simulation.imu(VUE))
         else:
             done, *filled = self._compiled(epochs, mean, cov)
             motions = self._motions
-        prior = grown(mean, cov, self._extra_sd)[1]
+        prior = self._grown(mean, cov, epochs)[1]
         truth = _truth(simulation.beacons(VUE), heard, len(prior))
         height_m = self.config.device_height_m
-        bound = bound_covariances(*epochs, truth, prior, height_m, motions, NO_BIAS)
+        bound = bound_covariances(*epochs[:3], truth, prior, height_m, motions, bias)
         means, covs, nis, dof = (array[:done] for array in filled)
         return Track(
             stamps_ns=epochs.stamps_ns[:done],
@@ -133,18 +142,24 @@ class Setup:
         self, epochs: Epochs, mean: Array, cov: Array
     ) -> tuple[int, Array, Array, Array, Array]:
         """Epochs done, means, covariances, NIS, degrees of freedom: all epochs in one kernel."""
-        mean, cov = grown(mean, cov, self._extra_sd)
+        mean, cov = self._grown(mean, cov, epochs)
         filled = _room(epochs.stamps_ns.size, mean.size)
         taken = np.empty(epochs.stamps_ns.size)
         motion = self._motions[0]
-        done = run_epochs(*epochs, mean, cov, motion, NO_BIAS, self._options, *filled, taken)
+        done = run_epochs(
+            *epochs[:3], mean, cov, motion, epochs.bias, self._options, *filled, taken
+        )
         return done, *filled
+
+    def _grown(self, mean: Array, cov: Array, epochs: Epochs) -> tuple[Array, Array]:
+        """The start with the motion model's own states and the biases."""
+        return grown(mean, cov, np.append(self._extra_sd, epochs.bias[0]))
 
     def _driven(
         self, epochs: Epochs, mean: Array, cov: Array, samples: list[ImuSample]
     ) -> tuple[int, Array, Array, Array, Array, Array]:
         """As ``_compiled``, epoch by epoch with the IMU between them; also the motions
-        (N, Parameter) with its increments."""
+        (N, Parameter) with its increments. Without biases."""
         imu = ImuBuffer()
         for sample in samples:
             imu.add(sample)

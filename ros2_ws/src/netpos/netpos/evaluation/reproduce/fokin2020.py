@@ -8,6 +8,7 @@ fokin2020:eq.32, 33 ask for.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -56,6 +57,20 @@ METIS = (
 )
 METIS_ONE_RSU = (_metis(100, 1), 3.0, 10.3)
 
+CLOCK_SD_S = 3e-9  # of the RSUs' clocks against network time
+RSU_CLOCKS = tuple(
+    replace(
+        _metis(500, 2),
+        name=f"METIS, N_T = 500, RSU clocks {1e9 * CLOCK_SD_S:.0f} ns, {label}",
+        changes=(
+            *_metis(500, 2).changes,
+            ("rsus.clock.sd_s", CLOCK_SD_S),
+            ("rsus.clock.declared", declared),
+        ),
+    )
+    for label, declared in (("not declared", False), ("estimated", True))
+)
+
 _POSE = (("devices.0.initial_pose_sd_m", 5.0),)
 FIG_5_SLOW = Experiment(name="Fig. 5, T = 0.1 s", scenario="fast_pass", changes=_POSE)
 FIG_5_FAST = Experiment(name="Fig. 5, T = 0.01 s", scenario="fast_pass_100hz", changes=_POSE)
@@ -81,6 +96,7 @@ def reproduce(work: Work) -> Outcome:
     """All rows, and pictures of the run with the first seed."""
     targets = (*METIS, METIS_ONE_RSU)
     metis = [monte_carlo(work, experiment) for experiment, _, _ in targets]
+    clocks = [monte_carlo(work, e) for e in RSU_CLOCKS]
     fast = [monte_carlo(work, e, series=True) for e in (FIG_5_SLOW, FIG_5_FAST)]
     turns = [[monte_carlo(work, e, series=True) for e in variants] for variants in FIG_6]
     rows = [
@@ -89,6 +105,7 @@ def reproduce(work: Work) -> Outcome:
             for summary, (_, rmse_m, clock_sd_ns) in zip(metis, targets, strict=True)
             for row in _on_metis(summary, rmse_m, clock_sd_ns)
         ),
+        *_rsu_clocks(clocks[0], clocks[1]),
         *_fast_pass(fast[0], fast[1]),
         *(row for variants in turns for row in _turn(variants)),
         *_line_of_sight(),
@@ -120,6 +137,21 @@ def _on_metis(summary: Summary, rmse_m: float, clock_sd_ns: float) -> Iterator[R
         yield shown(share, "1", rate)
     else:
         yield required(share, "1", rate, rate == 0.0)
+
+
+def _rsu_clocks(ignored: Summary, estimated: Summary) -> Iterator[Row]:
+    """The RSUs' clock errors as states of each track, against a tracker that knows of none."""
+    for figure, unit in (("rmse_m", "m"), ("clock_sd_ns", "ns")):
+        label = {"rmse_m": "RMSE", "clock_sd_ns": "clock offset sd"}[figure]
+        before, after = getattr(ignored, figure), getattr(estimated, figure)
+        yield shown(f"{ignored.experiment.name}: {label}", unit, before)
+        yield required(f"{estimated.experiment.name}: {label}", unit, after, after < before)
+    for summary in (ignored, estimated):
+        nees = summary.nees.mean
+        yield shown(f"{summary.experiment.name}: NEES, mean (expected 2)", "1", nees)
+        share = f"{summary.experiment.name}: routes with an error above 5 m or lost"
+        yield shown(share, "1", summary.diverged / summary.runs)
+    yield shown(f"{estimated.experiment.name}: RMSE over bound", "1", estimated.bound_ratio)
 
 
 def _fast_pass(slow: Summary, fast: Summary) -> Iterator[Row]:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from netpos.filters.compile import kernel
 from netpos.filters.measurement import (
+    BIAS,
     GATE_VARIANCE,
     GROUP,
     KIND,
@@ -22,6 +23,7 @@ from netpos.filters.measurement import (
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.radio.measure import AZIMUTH, ELEVATION, RANGE, TOA, Observations
+from netpos.tracking.rsus import Rsu
 
 Ints = npt.NDArray[np.int64]
 
@@ -38,28 +40,33 @@ class RowTemplates:
     """What rows of each RSU have in common: everything but value, variances and group.
 
     rows (m, q, ROW_WIDTH) per RSU and quantity; column (q,) of ``Observations.values``; scale (q,)
-    from its unit to the row's; rank (m,) of the RSU where a tracker sorts them by name.
+    from its unit to the row's; rank (m,) of the RSU where a tracker sorts them by name; bias
+    (m, q, 2) standard deviation and time constant of the slow error in the row, 0 where none.
     """
 
     rows: Array
     column: Ints
     scale: Array
     rank: Ints
+    bias: Array
 
     @classmethod
     def of(cls, rsus: tuple[RsuInfo, ...], fields: Field) -> RowTemplates:
-        """Templates of RSUs that measure ``fields`` in their own axes, without biases."""
+        """Templates of RSUs that measure ``fields`` in their own axes."""
         rows = []
         for info in rsus:
             empty = RsuMeasurement(stamp_ns=1, rsu_id=info.rsu_id, vue_id="", fields=fields)
             rows.append(rsu_rows(empty, info, rsu_axes(info), 0))
         kinds = [Kind(int(kind)) for kind in rows[0][:, KIND]]
+        sd = np.array([[Rsu.of(info).bias_sd(kind) for kind in kinds] for info in rsus])
+        tau = np.array([info.bias_correlation_time_s for info in rsus])
+        bias = np.stack([sd, np.where(sd > 0.0, tau[:, None], 0.0)], axis=-1)
         scale = [SPEED_OF_LIGHT_MPS if kind is Kind.TOA else 1.0 for kind in kinds]
         order = np.argsort([info.rsu_id for info in rsus])
         rank = np.empty(len(rsus), dtype=np.int64)
         rank[order] = np.arange(len(rsus))
         column = np.array([_COLUMNS[kind] for kind in kinds], dtype=np.int64)
-        return cls(np.array(rows), column, np.array(scale), rank)
+        return cls(np.array(rows), column, np.array(scale), rank, bias)
 
 
 @kernel
@@ -73,6 +80,7 @@ def _fill(
     scale: Array,
     rank: Ints,
     rows: Array,
+    source: Ints,
     row_start: Ints,
 ) -> None:
     at, epoch = 0, 0
@@ -97,17 +105,24 @@ def _fill(
                 rows[at, VARIANCE] = variance
                 rows[at, GATE_VARIANCE] = variance
                 rows[at, GROUP] = group
+                source[at] = rsu[i, j] * quantities + q
                 at += 1
         epoch += 1
     row_start[epoch] = at
 
 
-def observation_rows(seen: Observations, templates: RowTemplates) -> tuple[Ints, Ints, Array]:
-    """Epochs (N,) as indices of the beacons that were heard, row_start (N + 1,) and rows
-    (M, ROW_WIDTH): the rows of ``rsu_rows`` of every measurement, RSUs in the order of their
-    names."""
+def observation_rows(
+    seen: Observations, templates: RowTemplates, first_bias: int
+) -> tuple[Ints, Ints, Array, Array]:
+    """Epochs (N,) as indices of the beacons that were heard, row_start (N + 1,), rows
+    (M, ROW_WIDTH) and biases (2, k): the rows of ``rsu_rows`` of every measurement, RSUs in the
+    order of their names.
+
+    The slow errors of what is heard are the states ``first_bias``, ``first_bias`` + 1, ...
+    """
     heard = np.flatnonzero(seen.heard_by)
     rows = np.empty((int(seen.heard_by.sum()) * templates.column.size, ROW_WIDTH))
+    source = np.empty(len(rows), dtype=np.int64)
     row_start = np.zeros(heard.size + 1, dtype=np.int64)
     _fill(
         seen.heard_by,
@@ -119,6 +134,12 @@ def observation_rows(seen: Observations, templates: RowTemplates) -> tuple[Ints,
         templates.scale,
         templates.rank,
         rows,
+        source,
         row_start,
     )
-    return heard, row_start, rows
+    bias = templates.bias.reshape(-1, 2)
+    biased = np.intersect1d(np.flatnonzero(bias[:, 0] > 0.0), source)
+    state = np.full(len(bias), -1)
+    state[biased] = first_bias + np.arange(biased.size)
+    rows[:, BIAS] = state[source]
+    return heard, row_start, rows, bias[biased].T.copy()

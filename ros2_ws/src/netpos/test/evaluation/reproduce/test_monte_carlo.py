@@ -125,18 +125,19 @@ def test_a_scenario_without_initial_pose_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scenario", "seed", "model"),
+    ("scenario", "seed", "model", "clock"),
     [
-        ("metis_madrid", 4, "constant_velocity"),
-        ("metis_madrid", 6, "constant_velocity"),
-        ("intersection_turn_30m", 2, "constant_velocity"),
-        ("intersection_turn", 3, "inertial"),
+        ("metis_madrid", 4, "constant_velocity", None),
+        ("metis_madrid", 6, "constant_velocity", None),
+        ("metis_madrid", 6, "constant_velocity", {"sd_s": 3e-9}),
+        ("intersection_turn_30m", 2, "constant_velocity", None),
+        ("intersection_turn", 3, "inertial", None),
     ],
 )
 def test_a_run_is_what_the_tracker_makes_of_its_measurements(
-    scenario: str, seed: int, model: str
+    scenario: str, seed: int, model: str, clock: dict[str, float] | None
 ) -> None:
-    changes = (("max_duration_s", 25.0),)
+    changes = (("max_duration_s", 25.0), ("rsus.clock", clock))
     tracker_settings = (("motion_model", model),)
     setup = Setup(
         Experiment(name="x", scenario=scenario, changes=changes, tracker=tracker_settings)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
-from netpos.filters.measurement import rsu_axes, rsu_rows
+from netpos.filters.measurement import AXES, BIAS, KIND, ORIGIN, Kind, rsu_axes, rsu_rows
 from netpos.messages.values import Beacon
 from netpos.scenario import Simulation, load_scenario
 
@@ -33,7 +33,7 @@ def test_rows_are_those_of_single_measurements(name: str, changes: dict[str, obj
     simulation = Simulation(load_scenario(name, changes=changes))
     infos = {rsu.rsu_id: rsu for rsu in simulation.rsus}
     templates = RowTemplates.of(simulation.rsus, simulation.fields)
-    heard, start, rows = observation_rows(simulation.observations("vue_1"), templates)
+    heard, start, rows, bias = observation_rows(simulation.observations("vue_1"), templates, 6)
     epoch = 0
     for i, beacon in enumerate(e for e in simulation.events() if isinstance(e, Beacon)):
         measured = sorted(simulation.measure(beacon), key=lambda m: m.rsu_id)
@@ -49,6 +49,7 @@ def test_rows_are_those_of_single_measurements(name: str, changes: dict[str, obj
         epoch += 1
     assert epoch == heard.size
     assert start[-1] == len(rows)
+    assert bias.shape == (2, 0)
 
 
 def test_a_run_that_nobody_hears_has_no_rows() -> None:
@@ -56,6 +57,31 @@ def test_a_run_that_nobody_hears_has_no_rows() -> None:
         load_scenario("fast_pass", changes={"measurement.los.max_distance_m": 1.0})
     )
     templates = RowTemplates.of(simulation.rsus, simulation.fields)
-    heard, start, rows = observation_rows(simulation.observations("vue_1"), templates)
-    assert heard.size == len(rows) == 0
+    heard, start, rows, bias = observation_rows(simulation.observations("vue_1"), templates, 6)
+    assert heard.size == len(rows) == bias.size == 0
     assert start.tolist() == [0]
+
+
+def test_each_rsu_heard_has_a_state_for_its_clock() -> None:
+    clock = {"sd_s": 3e-9, "correlation_time_s": 40.0, "reference": "rsu_01"}
+    simulation = Simulation(
+        load_scenario("metis_madrid", changes={"max_duration_s": 20.0, "rsus.clock": clock})
+    )
+    seen = simulation.observations("vue_1")
+    _, _, rows, bias = observation_rows(
+        seen, RowTemplates.of(simulation.rsus, simulation.fields), 7
+    )
+    ids = {tuple(rsu.position): rsu.rsu_id for rsu in simulation.rsus}
+    states: dict[str, set[float]] = {}
+    for row in rows:
+        if row[KIND] == Kind.TOA:
+            states.setdefault(ids[tuple(row[ORIGIN:AXES])], set()).add(row[BIAS])
+        else:
+            assert row[BIAS] == -1
+    reference = states.pop("rsu_01", {-1})
+    assert reference == {-1}
+    assert all(len(of_one) == 1 for of_one in states.values())
+    assert sorted(s for of_one in states.values() for s in of_one) == list(
+        range(7, 7 + len(states))
+    )
+    np.testing.assert_allclose(bias, np.tile([[3e-9 * 299_792_458.0], [40.0]], len(states)))
