@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from netpos.filters.bearing import fuse_around, on_top
 from netpos.filters.compile import kernel, leaf
 from netpos.filters.fit import misfit
 from netpos.filters.fusion import (
@@ -255,6 +256,8 @@ def update(
     if iterations > 1:
         if bends(rows, mean, height_m, work):
             iterate_used(mean, cov, rows, height_m, iterations, work)
+            if on_top(mean, cov, rows, work):
+                fuse_around(mean, cov, rows, height_m, work)
         if is_wide(rows, work):
             refine_used(mean, cov, rows, height_m, work)
     return nis, used
