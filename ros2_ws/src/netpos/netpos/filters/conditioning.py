@@ -9,6 +9,7 @@ from enum import IntEnum
 from netpos.filters.compile import kernel, leaf
 from netpos.filters.ekf import group_nis
 from netpos.filters.measurement import (
+    BLOCKED,
     GATE_VARIANCE,
     GROUP,
     KIND,
@@ -40,11 +41,12 @@ def _unblock(
     mean: Array, cov: Array, row: Array, height_m: float, prior: float, excess_m: float, h: Array
 ) -> None:
     """Replace a range or time by the measurement equivalent to the mixture of a direct and a
-    blocked path."""
+    blocked path; its column BLOCKED, the prior where it is > 0, becomes the posterior."""
     innovation = innovation_row(row, mean, height_m, h)
     spread = innovation_variance(row, mean, cov, height_m, row[VARIANCE], h)
     measurement_var = row[VARIANCE] + curvature_variance(row, mean, cov, height_m)
-    _, shift, variance = nlos_mixture_exponential(
+    prior = row[BLOCKED] if row[BLOCKED] > 0.0 else prior
+    row[BLOCKED], shift, variance = nlos_mixture_exponential(
         innovation, spread, measurement_var, prior, excess_m
     )
     row[VALUE] -= shift

@@ -9,7 +9,8 @@ array a compiled kernel can take:
     or rejected together),
     ORIGIN 3 (RSU position, m), AXES 9 (rotation map -> RSU axes, row-major),
     HEADING (state index of the device's heading, or -1), LEVER 3 (of the antenna in the device, m;
-    forward and left count only where there is a heading)
+    forward and left count only where there is a heading), BLOCKED (probability that the path was
+    blocked; 0: the option's)
 
 For ``LINEAR`` rows the first six entries of ORIGIN and AXES hold H of the six core states.
 With d = p - origin and u = axes d:
@@ -61,11 +62,11 @@ KIND, VALUE, VARIANCE, GATE_VARIANCE, BIAS, COMMON, GROUP, ORIGIN, AXES = (
     7,
     10,
 )
-HEADING, LEVER = 19, 20
+HEADING, LEVER, BLOCKED = 19, 20, 23
 # Plain integers: arithmetic of flags costs ten times as much.
 _AZIMUTH, _ELEVATION, _TOA = int(Field.AZIMUTH), int(Field.ELEVATION), int(Field.TOA)
 _RANGE, _POSITION = int(Field.RANGE), int(Field.POSITION)
-ROW_WIDTH = 23
+ROW_WIDTH = 24
 
 
 @leaf
@@ -300,7 +301,7 @@ def rsu_rows(
     rows = np.empty((len(scalars), ROW_WIDTH))
     rows[:, ORIGIN:AXES] = info.position
     rows[:, AXES:HEADING] = axes
-    rows[:, HEADING:] = heading, *m.lever_arm
+    rows[:, HEADING:] = heading, *m.lever_arm, 0.0
     for row, (kind, value, variance) in zip(rows, scalars, strict=True):
         row[:ORIGIN] = (
             kind,

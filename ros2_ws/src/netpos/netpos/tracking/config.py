@@ -142,6 +142,9 @@ class TrackerConfig:
         0.0, 0.0, 0.99, "share of ranges and times that come late by a blocked path; 0: none"
     )
     nlos_mean_excess_m: float = _real(20.0, 1e-3, 1e5, "mean excess of a blocked path")
+    nlos_memory: float = _real(
+        100.0, 1.0, 1e9, "measurements over which the share of each RSU is learned"
+    )
     isolate_rsus: bool = field(
         default=True, metadata={"text": "refuse an RSU that at least two others contradict"}
     )

@@ -29,6 +29,7 @@ from netpos.messages.values import (
 )
 from netpos.tracking import estimates, output
 from netpos.tracking.batch import Batch, Source, batch_of
+from netpos.tracking.blockage import Blockage
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.engine import GATE_SIZE
 from netpos.tracking.estimates import Estimate
@@ -67,6 +68,7 @@ class _State:
 
     biases: BiasStates
     initialiser: Initialiser
+    blockage: Blockage
     segment: int = 0
     estimate: Estimate | None = None
     bias: Array = field(default_factory=lambda: np.zeros((2, 0)))
@@ -83,6 +85,7 @@ class _State:
     def copy(self) -> _State:
         twin = copy.copy(self)
         twin.biases = self.biases.copy()
+        twin.blockage = self.blockage.copy()
         if self.estimate is None:
             twin.initialiser = self.initialiser.copy()
         else:
@@ -120,7 +123,7 @@ class Track:
 
     def _fresh(self) -> _State:
         first = 6 + self._extra_sd.size
-        return _State(BiasStates(first), Initialiser(self._config))
+        return _State(BiasStates(first), Initialiser(self._config), Blockage.of(self._config))
 
     @property
     def rejected(self) -> Counter[str]:
@@ -270,9 +273,11 @@ class Track:
         state = self._state
         estimate = self._prepare(stamp_ns)
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
+        state.blockage.expect(batch)
         nis, dof, accepted = estimate.step(
             stamp_ns, unheard_s, state.rejected_in_row, batch.rows, state.bias
         )
+        state.blockage.learn(batch)
         state.has_clock |= bool((batch.rows[:, KIND] == Kind.TOA).any()) and dof > 0
         self._note_fit(stamp_ns, batch, accepted, nis, dof)
         refused = int(len(batch.items) - accepted.sum())
