@@ -40,6 +40,25 @@ def update(
 
     Returns the NIS of the accepted rows together, with their gate variances, and their number.
     """
+    own = np.empty((0, 0))
+    nis, used = update_shared(mean, cov, rows, height_m, gate_nis, accepted, gain_floor, own)
+    return nis, used
+
+
+@kernel
+def update_shared(
+    mean: Array,
+    cov: Array,
+    rows: Array,
+    height_m: float,
+    gate_nis: Array,
+    accepted: Array,
+    gain_floor: Array,
+    own: Array,
+) -> tuple[float, int]:
+    """``update`` that also carries ``own`` (n, n), or (0, 0): the part of ``cov`` that the noise
+    of these rows and those before made. What else is in ``cov`` comes from the motion and the
+    start, which others who watch the same object share."""
     m = rows.shape[0]
     innovation, H = linearise(rows, mean, height_m)
     S = H @ cov @ H.T
@@ -56,16 +75,22 @@ def update(
     start = mean.copy()
     for i in index:
         residual = innovation[i] - np.dot(H[i], mean - start)
-        fuse_row(mean, cov, residual, H[i], rows[i, VARIANCE], gain_floor)
+        fuse_row(mean, cov, residual, H[i], rows[i, VARIANCE], gain_floor, own)
     return nis, index.size
 
 
 @kernel
 def fuse_row(
-    mean: Array, cov: Array, residual: float, h: Array, variance: float, gain_floor: Array
+    mean: Array,
+    cov: Array,
+    residual: float,
+    h: Array,
+    variance: float,
+    gain_floor: Array,
+    own: Array,
 ) -> None:
     """Fuse one row with the Kalman gain or its floor: (I - K h) P (I - K h)' + K r K', true for
-    any gain, as a sum of squares."""
+    any gain, as a sum of squares; the same for the share ``own`` of P where there is one."""
     n = mean.size
     Ph = cov @ h
     K = Ph / (np.dot(h, Ph) + variance)
@@ -79,6 +104,12 @@ def fuse_row(
     for a in range(n):
         for b in range(a + 1):
             cov[a, b] = cov[b, a] = np.dot(root[a], root[b]) + K[a] * variance * K[b]
+    if own.size == 0:
+        return
+    root = A @ factor(own)
+    for a in range(n):
+        for b in range(a + 1):
+            own[a, b] = own[b, a] = np.dot(root[a], root[b]) + K[a] * variance * K[b]
 
 
 @kernel

@@ -57,6 +57,10 @@ class Codec:
         self._quaternion = resolve("geometry_msgs/msg/Quaternion")
         self._pose = resolve("geometry_msgs/msg/Pose")
 
+    def message_class(self, type_name: str) -> Any:
+        """The class of a type name."""
+        return self._resolve(type_name)
+
     def time(self, ns: int) -> Any:
         """builtin_interfaces/Time of integer nanoseconds."""
         sec, nanosec = divmod(int(ns), NS)

@@ -23,6 +23,10 @@ ODOMETRY_SMOOTHED = "odometry_smoothed"
 CLOCK_STATE = "clock_state"
 TRACK_STATUS = "track_status"
 
+# Of a network among several: /networks/<network>/tracks and /networks/<network>/<vue>/<name>.
+NETWORKS = "networks"
+TRACKS = "tracks"
+
 TRACKER_OUTPUTS = (ODOMETRY, ODOMETRY_SMOOTHED, CLOCK_STATE, TRACK_STATUS)
 
 
@@ -31,9 +35,15 @@ def is_vue_id(text: str) -> bool:
     return text.isascii() and text.isidentifier()
 
 
-def of_vue(vue_id: str, name: str) -> str:
-    """Topic of a device: ``/vue_1/beacon``."""
-    return f"/{vue_id}/{name}"
+def of_vue(vue_id: str, name: str, network: str = "") -> str:
+    """Topic of a device: ``/vue_1/beacon``, or as one network among several sees it:
+    ``/networks/wifi/vue_1/odometry``."""
+    return f"/{NETWORKS}/{network}/{vue_id}/{name}" if network else f"/{vue_id}/{name}"
+
+
+def tracks_of(network: str) -> str:
+    """Topic of the tracks of a network: ``/networks/wifi/tracks``."""
+    return f"/{NETWORKS}/{network}/{TRACKS}"
 
 
 def split(topic: str) -> tuple[str, str]:
@@ -43,5 +53,8 @@ def split(topic: str) -> tuple[str, str]:
 
 
 def is_tracker_output(topic: str) -> bool:
-    """Whether a topic is published by the tracker (and left out when a bag is re-estimated)."""
-    return topic in (DIAGNOSTICS, TF) or split(topic)[1] in TRACKER_OUTPUTS
+    """Whether a topic is published by a tracker or by the fusion of tracks (and left out when a
+    bag is re-estimated)."""
+    if topic in (DIAGNOSTICS, TF) or topic.startswith(f"/{NETWORKS}/"):
+        return True
+    return split(topic)[1] in TRACKER_OUTPUTS

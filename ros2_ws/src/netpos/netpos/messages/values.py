@@ -192,6 +192,31 @@ class TrackStatus:
     protection_level_m: float = -1.0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NetworkTrack:
+    """A device as the tracker of one network sees it at one epoch.
+
+    mean : (6,) x, y m, vx, vy m/s, ax, ay m/s^2 in ``frame_id``; cov : (6, 6)
+    own_cov : (6, 6) the part of cov that this network's own measurement noise made; 0: not known
+    ``vue_id`` is the network's own name of the device, ``segment`` counts the track's new starts.
+    """
+
+    stamp_ns: int
+    network: str
+    vue_id: str
+    mean: Array
+    cov: Array
+    own_cov: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    segment: int = 0
+    frame_id: str = "map"
+    height_m: float = 0.0
+
+    @property
+    def source(self) -> str:
+        """Who reports: a network and its name of the device."""
+        return f"{self.network}/{self.vue_id}"
+
+
 @dataclass(slots=True, kw_only=True)
 class ImuSample:
     """angular_velocity (3,) rad/s and specific_force (3,) m/s^2 in base_link; variances per axis

@@ -36,6 +36,9 @@ def simulate_to_bag(
         "seed": str(scenario.seed),
         "tracker": yaml.safe_dump(dict(scenario.tracker)),  # the name alone may not be found again
     }
+    if scenario.networks:
+        names = [network.name for network in scenario.networks]
+        metadata["fusion"] = yaml.safe_dump({"networks": names, **scenario.fusion})
     with BagWriter(bag_path, metadata=metadata) as bag:
         for item in timeline(Simulation(scenario), clock_hz, measured=True):
             if isinstance(item, int):

@@ -16,7 +16,7 @@ from netpos.radio.noise import generator
 from netpos.radio.propagation import UMA_HIGHEST_DEVICE_M, LosModel, PathLoss
 from netpos.radio.waveform import Waveform
 from netpos.world.maps import METIS_MADRID
-from netpos.world.motion import Motion, follow
+from netpos.world.motion import Motion, QuadraticMotion, follow
 from netpos.world.routes import random_route, rectangle
 
 Array = npt.NDArray[np.float64]
@@ -25,7 +25,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Place = tuple[Finite, Finite]
-Quantity = Literal["azimuth", "elevation", "toa", "range"]
+Quantity = Literal["azimuth", "elevation", "toa", "range", "position"]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 
 NS = 1_000_000_000
@@ -110,6 +110,7 @@ class FixedErrors(Section):
     elevation_sd_deg: Positive | None = None
     toa_sd_s: Positive | None = None
     range_sd_m: Positive | None = None
+    position_sd_m: Positive | None = None
 
 
 class CramerRaoErrors(Section):
@@ -134,7 +135,8 @@ class Measurement(Section):
     def _complete(self) -> Self:
         if not self.quantities or len(set(self.quantities)) < len(self.quantities):
             raise ValueError(
-                "quantities must name each of azimuth, elevation, toa, range at most once"
+                "quantities must name each of azimuth, elevation, toa, range, position at most"
+                " once"
             )
         if isinstance(self.errors, FixedErrors):
             keys = {
@@ -142,12 +144,15 @@ class Measurement(Section):
                 "elevation": "elevation_sd_deg",
                 "toa": "toa_sd_s",
                 "range": "range_sd_m",
+                "position": "position_sd_m",
             }
             for quantity in self.quantities:
                 if getattr(self.errors, keys[quantity]) is None:
                     raise ValueError(
                         f"errors.{keys[quantity]} is missing: {quantity} is among the quantities"
                     )
+        elif "position" in self.quantities:
+            raise ValueError("position needs errors of model fixed: it has no bound of its own")
         elif "elevation" in self.quantities and self.errors.array.rows < 2:
             raise ValueError("elevation needs an array with at least 2 rows")
         return self
@@ -199,7 +204,55 @@ class RectangleRoute(Section):
         return rectangle(self.corner, self.width_m, self.height_m, laps=self.laps)
 
 
-Route = Annotated[RandomRoute | WaypointRoute | RectangleRoute, Field(discriminator="kind")]
+class Stretch(Section):
+    """A time of constant acceleration."""
+
+    duration_s: Positive
+    acceleration_mps2: Place = (0.0, 0.0)
+
+
+class QuadraticRoute(Section):
+    """Per axis a curve of the second order, or several in a row (dvornikov2017)."""
+
+    kind: Literal["quadratic"]
+    start: Place
+    velocity_mps: Place
+    stretches: tuple[Stretch, ...] = Field(min_length=1)
+
+    def motion(self) -> QuadraticMotion:
+        """The true motion."""
+        return QuadraticMotion(
+            self.start,
+            self.velocity_mps,
+            [stretch.duration_s for stretch in self.stretches],
+            [stretch.acceleration_mps2 for stretch in self.stretches],
+        )
+
+
+Route = Annotated[
+    RandomRoute | WaypointRoute | RectangleRoute | QuadraticRoute, Field(discriminator="kind")
+]
+
+
+class Network(Section):
+    """One of several networks: its RSUs answer the beacons of its own times alone, so the networks
+    measure at different instants. It calls the devices what it likes where ``own_names``."""
+
+    name: Name
+    interval_s: Positive
+    phase_s: NotNegative = 0.0
+    position_sd_m: Positive | None = None
+    own_names: bool = False
+
+    @property
+    def interval_ns(self) -> int:
+        """Time between the network's measurements [integer ns]."""
+        return round(self.interval_s * NS)
+
+    @property
+    def phase_ns(self) -> int:
+        """Time from the start of the run to its first measurement [integer ns]."""
+        return round(self.phase_s * NS)
 
 
 class Device(Section):
@@ -207,7 +260,7 @@ class Device(Section):
 
     count: int = Field(default=1, ge=1)
     route: Route
-    speed_mps: Positive
+    speed_mps: Positive | None = None
     acceleration_mps2: Positive | None = None
     antenna_height_m: Finite = 0.0
     beacon_interval_s: Positive
@@ -224,6 +277,9 @@ class Device(Section):
 
     def motion(self, seed: int, vue_id: str) -> Motion:
         """The true motion; a random route is drawn from the stream ``<vue>/route``."""
+        if isinstance(self.route, QuadraticRoute):
+            return self.route.motion()
+        assert self.speed_mps is not None
         return follow(
             self.route.waypoints(generator(seed, f"{vue_id}/route")),
             self.speed_mps,
@@ -234,6 +290,11 @@ class Device(Section):
 
     @model_validator(mode="after")
     def _drivable(self) -> Self:
+        own_velocity = isinstance(self.route, QuadraticRoute)
+        if self.speed_mps is None and not own_velocity:
+            raise ValueError("speed_mps is missing")
+        if self.speed_mps is not None and own_velocity:
+            raise ValueError("a quadratic route has its own velocity; remove speed_mps")
         if self.beacon_interval_ns < 1:
             raise ValueError("beacon_interval_s must be at least 1e-9")
         sensors = [sensor for sensor in (self.imu, self.magnetometer) if sensor is not None]
@@ -257,7 +318,8 @@ class Scenario(Section):
     the end of its route.
 
     Network time starts at ``start_s`` (the first stamp; not 0, which ROS reads as "no time").
-    ``tracker`` holds parameter overrides for the tracker and is not interpreted here.
+    ``tracker`` and ``fusion`` hold parameter overrides for the tracker and for the fusion of the
+    tracks of several ``networks``; they are not interpreted here.
     """
 
     name: str
@@ -269,7 +331,9 @@ class Scenario(Section):
     rsus: Rsus
     measurement: Measurement
     devices: tuple[Device, ...] = Field(min_length=1)
+    networks: tuple[Network, ...] = ()
     tracker: dict[str, Any] = {}
+    fusion: dict[str, Any] = {}
 
     @property
     def start_ns(self) -> int:
@@ -300,6 +364,31 @@ class Scenario(Section):
             raise ValueError(
                 f"los.probability needs antenna_height_m of at most {UMA_HIGHEST_DEVICE_M}"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _networks_agree(self) -> Self:
+        names = [network.name for network in self.networks]
+        of_rsus = [unit.network for unit in self.rsus.units]
+        if not names:
+            if self.fusion:
+                raise ValueError("fusion needs networks whose tracks are fused")
+            return self
+        if len(set(names)) < len(names):
+            raise ValueError(f"networks must have different names, got {', '.join(names)}")
+        if set(of_rsus) != set(names):
+            raise ValueError(
+                f"networks {', '.join(names)} need RSUs of their own in rsus.units and no others;"
+                f" those name {', '.join(sorted(set(of_rsus))) or 'none'}"
+            )
+        for network in self.networks:
+            for device in self.devices:
+                step_ns = device.beacon_interval_ns
+                if network.interval_ns % step_ns or network.phase_ns % step_ns:
+                    raise ValueError(
+                        f"interval_s and phase_s of network {network.name} must be multiples of"
+                        f" beacon_interval_s ({device.beacon_interval_s:g})"
+                    )
         return self
 
     @model_validator(mode="after")

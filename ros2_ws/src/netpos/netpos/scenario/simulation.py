@@ -46,6 +46,7 @@ from netpos.scenario.build import (
     sight_of,
     sites_of,
 )
+from netpos.scenario.networks import Answering, answering_of
 from netpos.scenario.schema import Device, Scenario
 from netpos.world.frames import quaternion_from_yaw
 
@@ -58,7 +59,9 @@ _FIELDS = {
     "elevation": Field.ELEVATION,
     "toa": Field.TOA,
     "range": Field.RANGE,
+    "position": Field.POSITION,
 }
+_COLUMNS = (Field.AZIMUTH, Field.ELEVATION, Field.TOA, Field.RANGE)  # of Observations.values
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,6 +91,7 @@ class Simulation:
         self._place_devices()
 
     def _place_devices(self) -> None:
+        self._answering = answering_of(self.scenario, self.rsus)
         tones = clock_tones_of(self.scenario, self.rsus)
         self._vues = {
             vue: _Vue(
@@ -133,15 +137,25 @@ class Simulation:
             raise ValueError(f"{what} has a position or clock offset that is not finite")
         if not 0 < beacon.stamp_ns < 2**63:
             raise ValueError(f"{what} has no valid stamp: {beacon.stamp_ns} ns")
+        return [
+            measurement
+            for part in self._answering
+            if part.answers(beacon.stamp_ns - self.scenario.start_ns)
+            for measurement in self._measured_by(part, vue, beacon, position)
+        ]
+
+    def _measured_by(
+        self, part: Answering, vue: _Vue, beacon: Beacon, position: Array
+    ) -> list[RsuMeasurement]:
         seen = observe(
             np.array([beacon.stamp_ns], dtype=np.int64),
             position,
             np.array([beacon.clock_offset_s]),
-            vue.sites,
+            part.sites(vue.sites),
             vue.sight,
             self._errors,
         )
-        return [self._measurement(beacon, seen, j) for j in range(int(seen.heard_by[0]))]
+        return [self._measurement(beacon, part, seen, j) for j in range(int(seen.heard_by[0]))]
 
     def warm_up(self) -> None:
         """Compile the measurement kernel, so that the first beacon does not wait for it."""
@@ -177,14 +191,20 @@ class Simulation:
         """The position handed to the tracker, where the scenario asks for one."""
         return self._vues[vue_id].initial_pose
 
-    def _measurement(self, beacon: Beacon, seen: Observations, j: int) -> RsuMeasurement:
+    def _measurement(
+        self, beacon: Beacon, part: Answering, seen: Observations, j: int
+    ) -> RsuMeasurement:
         value, variance, fields = seen.values[0, j], seen.variances[0, j], self.fields
-        masked = np.array([bool(fields & f) for f in _FIELDS.values()])
+        masked = np.array([bool(fields & f) for f in _COLUMNS])
         value, variance = np.where(masked, value, 0.0), np.where(masked, variance, 0.0)
+        rsu_id = self.rsus[int(part.rsus[seen.rsu[0, j]])].rsu_id
+        fix, fix_cov = np.zeros(3), np.zeros((3, 3))
+        if fields & Field.POSITION:
+            fix, fix_cov = part.fix(beacon, rsu_id, self.scenario.seed)
         return RsuMeasurement(
             stamp_ns=beacon.stamp_ns,
-            rsu_id=self.rsus[int(seen.rsu[0, j])].rsu_id,
-            vue_id=beacon.vue_id,
+            rsu_id=rsu_id,
+            vue_id=part.names[beacon.vue_id],
             sequence=beacon.sequence,
             expected=int(seen.heard_by[0]),
             fields=fields,
@@ -197,6 +217,8 @@ class Simulation:
             toa_var=float(variance[TOA]),
             range_m=float(value[RANGE]),
             range_var=float(variance[RANGE]),
+            position=fix,
+            position_cov=fix_cov,
         )
 
 

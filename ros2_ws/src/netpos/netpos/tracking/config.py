@@ -3,12 +3,14 @@ here."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 from netpos.filters.motion import ProcessNoise
+from netpos.tracking.parameters import check_fields, from_mapping
+from netpos.tracking.parameters import choice as _choice
+from netpos.tracking.parameters import real as _real
 
 FILTERS = ("ekf", "iekf", "ukf", "srukf", "kf")
 BACKENDS = ("compiled", "filterpy")
@@ -21,14 +23,6 @@ MOTION_MODELS = (
     "rigid_body",
 )
 ROBUST = ("none", "huber", "student_t")
-
-
-def _real(default: float, low: float, high: float, text: str) -> Any:
-    return field(default=default, metadata={"low": low, "high": high, "text": text})
-
-
-def _choice(default: str, choices: tuple[str, ...], text: str) -> Any:
-    return field(default=default, metadata={"choices": choices, "text": text})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -185,19 +179,12 @@ class TrackerConfig:
     integrity_risk: float = _real(
         1e-4, 1e-12, 0.5, "probability with which the error may exceed the protection level"
     )
+    network: str = field(
+        default="", metadata={"text": "the network whose RSUs count, one of several; empty: all"}
+    )
 
     def __post_init__(self) -> None:
-        for entry in fields(self):
-            value = getattr(self, entry.name)
-            choices = entry.metadata.get("choices")
-            if choices is not None and value not in choices:
-                raise ValueError(
-                    f"{entry.name} must be one of {', '.join(choices)}, got {value!r}"
-                )
-            if "low" in entry.metadata:
-                low, high = entry.metadata["low"], entry.metadata["high"]
-                if not (math.isfinite(value) and low <= value <= high):
-                    raise ValueError(f"{entry.name} must be in [{low:g}, {high:g}], got {value!r}")
+        check_fields(self)
         self._check_combination()
 
     def _check_combination(self) -> None:
@@ -227,29 +214,4 @@ class TrackerConfig:
     def from_mapping(cls, values: Mapping[str, Any]) -> TrackerConfig:
         """Config of named values over the defaults; raises ``ValueError`` for a name that does not
         exist."""
-        known = {entry.name: entry for entry in fields(cls)}
-        unknown = sorted(set(values) - set(known))
-        if unknown:
-            raise ValueError(
-                f"unknown tracker parameter {unknown[0]!r}; the parameters are {', '.join(known)}"
-            )
-        return cls(**{name: _typed(name, getattr(cls(), name), v) for name, v in values.items()})
-
-
-def _typed(name: str, default: Any, value: Any) -> Any:
-    """``value`` in the type of the default; YAML writes 1 for 1.0 and 1e-4 for a string."""
-    if isinstance(default, bool):
-        if isinstance(value, bool):
-            return value
-        if str(value).lower() in {"true", "false"}:
-            return str(value).lower() == "true"
-        raise ValueError(f"{name} must be true or false, got {value!r}")
-    try:
-        typed = type(default)(value)
-        if isinstance(default, int) and typed != float(value):
-            raise ValueError(value)
-        return typed
-    except (TypeError, ValueError):
-        raise ValueError(
-            f"{name} must be of type {type(default).__name__}, got {value!r}"
-        ) from None
+        return from_mapping(cls, values, "tracker")

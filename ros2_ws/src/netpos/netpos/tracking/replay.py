@@ -4,7 +4,7 @@ node."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +21,24 @@ from netpos.bags import (
     has_common_definition,
 )
 from netpos.messages import topics
+from netpos.messages.network_tracks import network_track_to_msg
 from netpos.messages.values import ImuSample, Odometry
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.networks.chain import Chain
+from netpos.tracking.networks.config import FusionConfig
 from netpos.tracking.sequencer import Item
-from netpos.tracking.settings import TRACKER_METADATA, bag_settings
+from netpos.tracking.settings import (
+    FUSION_METADATA,
+    TRACKER_METADATA,
+    TrackerSettings,
+    bag_settings,
+)
 from netpos.tracking.smoothing import Smoother
 from netpos.tracking.track import TrackOutput
 from netpos.tracking.tracker import Tracker
 
 _ODOMETRY = "nav_msgs/msg/Odometry"
+_FUSION = "fusion."
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,14 +67,18 @@ def replay_bag(
     parameter, ``FileExistsError`` where ``bag_out`` exists.
     """
     with BagReader(bag_in) as source:
-        parameters = {**bag_settings(source.metadata).parameters, **(overrides or {})}
-        config = TrackerConfig.from_mapping(parameters)
+        settings = _changed(bag_settings(source.metadata), overrides or {})
+        config = TrackerConfig.from_mapping(settings.parameters)
         if topics.RSU_MEASUREMENTS not in source.topics:
             raise BagError(
                 f"{bag_in} has no {topics.RSU_MEASUREMENTS}: record that topic to replay"
             )
         metadata = {**source.metadata, TRACKER_METADATA: yaml.safe_dump(asdict(config))}
-        tracker = Tracker(config, keep_posteriors=smooth)
+        if settings.networks:
+            metadata[FUSION_METADATA] = yaml.safe_dump(
+                {"networks": list(settings.networks), **settings.fusion}
+            )
+        tracker = _tracker(config, settings, smooth=smooth)
         epochs = 0
         with BagWriter(bag_out, metadata=metadata) as out:
             for name, info in source.topics.items():
@@ -82,7 +95,31 @@ def replay_bag(
         return ReplaySummary(epochs, {v: dict(c) for v, c in tracker.rejected().items()})
 
 
-def _through(tracker: Tracker, source: BagReader, out: BagWriter) -> Iterator[list[TrackOutput]]:
+def _changed(settings: TrackerSettings, overrides: Mapping[str, Any]) -> TrackerSettings:
+    """Settings with other values; names of parameters of the fusion begin with ``fusion.``."""
+    fusion = {n.removeprefix(_FUSION): v for n, v in overrides.items() if n.startswith(_FUSION)}
+    if fusion and not settings.networks:
+        raise ValueError(f"the bag has one network, so there is no {_FUSION}{min(fusion)} to set")
+    rest = {name: v for name, v in overrides.items() if not name.startswith(_FUSION)}
+    return replace(
+        settings,
+        parameters={**settings.parameters, **rest},
+        fusion={**settings.fusion, **fusion},
+    )
+
+
+def _tracker(config: TrackerConfig, settings: TrackerSettings, *, smooth: bool) -> Tracker | Chain:
+    """One tracker, or one for each of several networks with the fusion of their tracks."""
+    if not settings.networks:
+        return Tracker(config, keep_posteriors=smooth)
+    if smooth:
+        raise ValueError("the tracks of several networks are not smoothed; leave --smooth out")
+    return Chain(settings.networks, config, FusionConfig.from_mapping(settings.fusion))
+
+
+def _through(
+    tracker: Tracker | Chain, source: BagReader, out: BagWriter
+) -> Iterator[list[TrackOutput]]:
     """Feed every message to the tracker and copy it, unless a tracker wrote it."""
     for entry in source.messages([topics.RSU_INFO]):
         tracker.add_rsu(codec().rsu_info_from_msg(entry.message))
@@ -144,21 +181,24 @@ def write_output(out: BagWriter, output: TrackOutput) -> None:
     """Write what the live node would publish, logged at its stamp."""
     make = cdr_codec()
     status = output.status
-    stamp, vue_id = status.stamp_ns, status.vue_id
+    stamp, vue_id, network = status.stamp_ns, status.vue_id, output.network
 
     def write(topic: str, type_name: str, cdr: bytes) -> None:
         out.write_raw(topic, type_name, cdr, stamp)
 
     if output.odometry is not None:
-        topic = topics.of_vue(vue_id, topics.ODOMETRY)
+        topic = topics.of_vue(vue_id, topics.ODOMETRY, network)
         write(topic, _ODOMETRY, make.odometry(output.odometry))
-        if not output.revised:
+        if not output.revised and not network:
             write(topics.TF, "tf2_msgs/msg/TFMessage", make.transform(output.odometry))
     if output.clock is not None:
-        topic = topics.of_vue(vue_id, topics.CLOCK_STATE)
+        topic = topics.of_vue(vue_id, topics.CLOCK_STATE, network)
         write(topic, "netpos_msgs/msg/ClockState", make.clock_state(output.clock))
-    topic = topics.of_vue(vue_id, topics.TRACK_STATUS)
+    topic = topics.of_vue(vue_id, topics.TRACK_STATUS, network)
     write(topic, "netpos_msgs/msg/TrackStatus", make.track_status(status))
     for odometry in output.smoothed:
-        topic = topics.of_vue(vue_id, topics.ODOMETRY_SMOOTHED)
+        topic = topics.of_vue(vue_id, topics.ODOMETRY_SMOOTHED, network)
         write(topic, _ODOMETRY, make.odometry(odometry))
+    if output.track is not None:
+        message = network_track_to_msg(codec(), output.track)
+        out.write(topics.tracks_of(network), message, stamp)

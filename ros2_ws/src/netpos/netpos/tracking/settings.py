@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,22 @@ from netpos.messages import topics
 
 # Name of the metadata entry of a bag that holds parameters for its measurements, as YAML.
 TRACKER_METADATA = "tracker"
+# The same of the networks whose tracks are fused and the parameters of that, as YAML.
+FUSION_METADATA = "fusion"
 
 
 @dataclass(frozen=True, slots=True)
 class TrackerSettings:
-    """Parameters by name, and the devices to expect."""
+    """Parameters by name, and the devices to expect.
+
+    ``networks``: each has a tracker of its own, and their tracks are fused with the parameters
+    ``fusion``; none: one tracker for all RSUs.
+    """
 
     parameters: Mapping[str, Any] = field(default_factory=dict)
     vue_ids: tuple[str, ...] = ("vue_1",)
+    networks: tuple[str, ...] = ()
+    fusion: Mapping[str, Any] = field(default_factory=dict)
 
 
 DEFAULTS = TrackerSettings()
@@ -34,10 +42,17 @@ def bag_settings(metadata: Mapping[str, str]) -> TrackerSettings:
     """
     if TRACKER_METADATA not in metadata:
         return _scenario_settings(metadata["scenario"]) if "scenario" in metadata else DEFAULTS
-    loaded = yaml.safe_load(metadata[TRACKER_METADATA]) or {}
+    loaded = _mapping(metadata, TRACKER_METADATA)
+    fusion = _mapping(metadata, FUSION_METADATA)
+    networks = tuple(map(str, fusion.pop("networks", ())))
+    return TrackerSettings(loaded, networks=networks, fusion=fusion)
+
+
+def _mapping(metadata: Mapping[str, str], name: str) -> dict[str, Any]:
+    loaded = yaml.safe_load(metadata.get(name, "")) or {}
     if not isinstance(loaded, dict):
-        raise ValueError(f"the bag's {TRACKER_METADATA!r} metadata is not a mapping of parameters")
-    return TrackerSettings(loaded)
+        raise ValueError(f"the bag's {name!r} metadata is not a mapping of parameters")
+    return loaded
 
 
 def settings_from(source: str) -> TrackerSettings:
@@ -51,8 +66,8 @@ def settings_from(source: str) -> TrackerSettings:
     if Path(source).is_dir() or source.endswith(".mcap"):
         with BagReader(Path(source)) as bag:
             vue_ids = sorted({topics.split(topic)[0] for topic in bag.topics} - {""})
-            parameters = bag_settings(bag.metadata).parameters
-            return TrackerSettings(parameters, tuple(vue_ids) or DEFAULTS.vue_ids)
+            settings = bag_settings(bag.metadata)
+            return replace(settings, vue_ids=tuple(vue_ids) or DEFAULTS.vue_ids)
     return _scenario_settings(source)
 
 
@@ -60,4 +75,9 @@ def _scenario_settings(source: str) -> TrackerSettings:
     from netpos.scenario import load_scenario  # noqa: PLC0415 - a bag of a real run needs none
 
     scenario = load_scenario(source)
-    return TrackerSettings(dict(scenario.tracker), tuple(scenario.vue_ids))
+    return TrackerSettings(
+        dict(scenario.tracker),
+        tuple(scenario.vue_ids),
+        tuple(network.name for network in scenario.networks),
+        dict(scenario.fusion),
+    )

@@ -22,6 +22,7 @@ from netpos.messages.values import (
     Array,
     ClockState,
     InitialPose,
+    NetworkTrack,
     Odometry,
     RsuMeasurement,
     TrackState,
@@ -39,6 +40,7 @@ from netpos.tracking.history import History, merge
 from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser, with_heading
 from netpos.tracking.models import gate_thresholds, heading_index, initial_extra_sd, pose_state
+from netpos.tracking.networks.secondary import OwnNoise, Secondary
 from netpos.tracking.protection import NisWindow, protection_level, unnoticed_shift
 from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sequencer import Epoch, Item
@@ -53,13 +55,16 @@ _BLIND_GYRO = 1.0  # rad/s/sqrt(Hz): what the heading does while the IMU is sile
 class TrackOutput:
     """What a track says at one epoch; odometry is None until the first fix, clock until the first
     TOA. ``revised``: said before of the same epoch, without what came late. ``smoothed``: earlier
-    epochs that are now ``fixed_lag_s`` old."""
+    epochs that are now ``fixed_lag_s`` old. ``network``: whose track it is, "" for that of all;
+    ``track``: the same for others to fuse with their own."""
 
     odometry: Odometry | None
     clock: ClockState | None
     status: TrackStatus
     revised: bool = False
     smoothed: tuple[Odometry, ...] = ()
+    network: str = ""
+    track: NetworkTrack | None = None
 
 
 @dataclass(slots=True)
@@ -71,6 +76,7 @@ class _State:
     blockage: Blockage
     segment: int = 0
     estimate: Estimate | None = None
+    own: OwnNoise | None = None
     bias: Array = field(default_factory=lambda: np.zeros((2, 0)))
     pose: tuple[Array, Array] | None = None
     nis_window: NisWindow = field(default_factory=NisWindow)
@@ -112,6 +118,7 @@ class Track:
         self._gate = gate_thresholds(config.gate_probability)
         self._extra_sd = initial_extra_sd(config)
         self._heading = heading_index(config)
+        self._secondary = Secondary(vue_id, config) if config.network else None
         self._history: History[_State] = History(int(config.history_s * 1e9))
         self._fixed_lag = FixedLag(vue_id, config) if config.fixed_lag_s > 0.0 else None
         self.posteriors: list[Posterior] | None = None
@@ -278,6 +285,10 @@ class Track:
             stamp_ns, unheard_s, state.rejected_in_row, batch.rows, state.bias
         )
         state.blockage.learn(batch)
+        if self._secondary is not None:
+            state.own = self._secondary.after(
+                state.own, stamp_ns, estimate, batch.rows, state.bias
+            )
         state.has_clock |= bool((batch.rows[:, KIND] == Kind.TOA).any()) and dof > 0
         self._note_fit(stamp_ns, batch, accepted, nis, dof)
         refused = int(len(batch.items) - accepted.sum())
@@ -388,7 +399,7 @@ class Track:
             protection_level_m=level,
         )
         if estimate is None:
-            return TrackOutput(None, None, status)
+            return TrackOutput(None, None, status, network=self._config.network)
         state.yaw, yaw_var = output.heading(mean, cov, state.yaw, self._heading)
         height = self._config.device_height_m
         odometry = output.odometry(stamp_ns, self._vue_id, mean, cov, height, state.yaw, yaw_var)
@@ -397,7 +408,10 @@ class Track:
         clock = None
         if state.has_clock:
             clock = output.clock_state(stamp_ns, self._vue_id, mean, cov)
-        return TrackOutput(odometry, clock, status)
+        track = None
+        if self._secondary is not None:
+            track = self._secondary.track(state.own, state.segment, estimate, state.bias)
+        return TrackOutput(odometry, clock, status, network=self._config.network, track=track)
 
     def _track_state(self, stamp_ns: int, position_sd: float) -> TrackState:
         if self._state.estimate is None:

@@ -67,6 +67,8 @@ class Tracker:
         status)."""
         if isinstance(item, ImuSample):
             return self._add_imu(item)
+        if isinstance(item, RsuMeasurement) and not self.concerns(item):
+            return None
         reason = self._fault(item)
         self._touched.add(item.vue_id)
         if reason is None:
@@ -77,6 +79,13 @@ class Tracker:
         if reason is not None:
             self.track(item.vue_id).refused[reason] += 1
         return reason
+
+    def concerns(self, measurement: RsuMeasurement) -> bool:
+        """Whether a measurement is for this tracker: one of a network leaves those of RSUs it
+        knows to be of other networks to their trackers."""
+        rsu = self._rsus.get(measurement.rsu_id)
+        network = self._config.network
+        return not network or rsu is None or rsu.info.network == network
 
     def _add_imu(self, sample: ImuSample) -> str | None:
         if not self._config.use_imu:

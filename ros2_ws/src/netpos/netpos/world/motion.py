@@ -69,6 +69,16 @@ class Motion:
             [(p.x, p.y, p.yaw, p.curvature, p.speed, p.acceleration, p.spin) for p in pieces]
         )
 
+    def _pieces_at(self, time_s: npt.ArrayLike) -> tuple[Array, npt.NDArray[np.int64]]:
+        """Times (n,) as an array and the piece of each."""
+        t = np.atleast_1d(np.asarray(time_s, dtype=np.float64))
+        if not ((t >= 0) & (t <= self.duration_s + _TIME_TOLERANCE_S)).all():
+            raise ValueError(
+                f"time must be in [0, {self.duration_s}] s, got {t.min()} to {t.max()}"
+            )
+        k = np.maximum(np.searchsorted(self._start, t, side="right") - 1, 0)
+        return t, k
+
     def at(self, time_s: npt.ArrayLike) -> Kinematics:
         """State at times (n,) since the start [s]; at a jump, the state after it.
 
@@ -76,12 +86,7 @@ class Motion:
         ------
         ValueError  a time is not finite or outside [0, duration_s]
         """
-        t = np.atleast_1d(np.asarray(time_s, dtype=np.float64))
-        if not ((t >= 0) & (t <= self.duration_s + _TIME_TOLERANCE_S)).all():
-            raise ValueError(
-                f"time must be in [0, {self.duration_s}] s, got {t.min()} to {t.max()}"
-            )
-        k = np.maximum(np.searchsorted(self._start, t, side="right") - 1, 0)
+        t, k = self._pieces_at(time_s)
         x, y, yaw, curvature, speed, acceleration, spin = self._table[k].T
         tau = t - self._start[k]
         way = speed * tau + acceleration * tau**2 / 2
@@ -99,6 +104,63 @@ class Motion:
             acceleration=acceleration[:, None] * ahead + (curvature * now**2)[:, None] * left,
             yaw=heading,
             yaw_rate=curvature * now + spin,
+        )
+
+
+class QuadraticMotion(Motion):
+    """Per axis a polynomial of degree 2 at a time: stretches of constant acceleration, the
+    position and the velocity continuous (dvornikov2017: curves of the second order)."""
+
+    def __init__(
+        self,
+        start_m: npt.ArrayLike,
+        velocity_mps: npt.ArrayLike,
+        durations_s: Sequence[float],
+        accelerations_mps2: npt.ArrayLike,
+    ) -> None:
+        """From ``start_m`` (2,) with ``velocity_mps`` (2,), then accelerations (k, 2) for
+        durations (k,).
+
+        Raises ``ValueError`` where durations are not > 0 or something is not finite.
+        """
+        a = np.asarray(accelerations_mps2, dtype=np.float64).reshape(-1, 2)
+        durations = np.asarray(durations_s, dtype=np.float64)
+        if len(a) != durations.size or not durations.size:
+            raise ValueError(
+                f"{durations.size} durations need as many accelerations, got {len(a)}"
+            )
+        if not ((durations > 0) & (durations < math.inf)).all():
+            raise ValueError(f"durations must be finite and > 0 s, got {durations.tolist()}")
+        position = [np.asarray(start_m, dtype=np.float64)]
+        velocity = [np.asarray(velocity_mps, dtype=np.float64)]
+        if not np.isfinite([position[0], velocity[0], *a]).all():
+            raise ValueError("start, velocity and accelerations must be finite")
+        for dt, acceleration in zip(durations[:-1], a[:-1], strict=True):
+            position.append(position[-1] + dt * velocity[-1] + dt * dt / 2 * acceleration)
+            velocity.append(velocity[-1] + dt * acceleration)
+        self.duration_s = float(durations.sum())
+        self.smooth = True
+        self._start = np.concatenate([[0.0], np.cumsum(durations)[:-1]])
+        self._stretches = np.hstack([position, velocity, a])
+
+    def at(self, time_s: npt.ArrayLike) -> Kinematics:
+        """State at times (n,) since the start [s]; at a jump of the acceleration, the state after
+        it. The heading is the direction of the velocity.
+
+        Raises ``ValueError`` as ``Motion.at``.
+        """
+        t, k = self._pieces_at(time_s)
+        tau = (t - self._start[k])[:, None]
+        p, v, a = np.hsplit(self._stretches[k], 3)
+        now = v + tau * a
+        across = now[:, 0] * a[:, 1] - now[:, 1] * a[:, 0]
+        speed2 = (now**2).sum(axis=1)
+        return Kinematics(
+            position=p + tau * v + tau * tau / 2 * a,
+            velocity=now,
+            acceleration=a,
+            yaw=np.arctan2(now[:, 1], now[:, 0]),
+            yaw_rate=np.divide(across, speed2, out=np.zeros_like(speed2), where=speed2 > 0),
         )
 
 

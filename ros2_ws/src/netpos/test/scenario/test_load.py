@@ -45,7 +45,7 @@ def test_a_good_file(tmp_path: Path) -> None:
     ("old", "new", "complaint"),
     [
         ("speed_mps: 1.0", "sped_mps: 1.0", "line 10: devices.0.sped_mps: unknown key"),
-        ("    speed_mps: 1.0\n", "", "line 9: devices.0.speed_mps: is missing"),
+        ("    speed_mps: 1.0\n", "", "line 9: devices.0: speed_mps is missing"),
         ("speed_mps: 1.0", "speed_mps: -1.0", "line 10: devices.0.speed_mps: .*got -1.0"),
         ("speed_mps: 1.0", "speed_mps: .nan", "line 10: devices.0.speed_mps: .*got nan"),
         ("speed_mps: 1.0", "speed_mps: fast", "line 10: devices.0.speed_mps: .*got 'fast'"),
