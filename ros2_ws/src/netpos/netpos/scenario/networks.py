@@ -42,10 +42,16 @@ class Answering:
 
     def fix(self, beacon: Beacon, rsu_id: str, seed: int) -> tuple[Array, Array]:
         """Position (3,) m and covariance (3, 3) of a fix."""
-        key = stream_key(seed, f"{rsu_id}/{beacon.vue_id}/fix")
-        error = normals([beacon.stamp_ns], 3, key)[0]
-        position: Array = np.asarray(beacon.position) + self.position_sd_m * error
+        error = fix_errors([beacon.stamp_ns], self.position_sd_m, seed, rsu_id, beacon.vue_id)
+        position: Array = np.asarray(beacon.position) + error[0]
         return position, self.position_sd_m**2 * np.eye(3)
+
+
+def fix_errors(
+    stamps_ns: npt.ArrayLike, sd_m: float, seed: int, rsu_id: str, vue_id: str
+) -> Array:
+    """(n, 3) errors [m] of the fixes of a device by one RSU at stamps (n,)."""
+    return sd_m * normals(stamps_ns, 3, stream_key(seed, f"{rsu_id}/{vue_id}/fix"))
 
 
 def answering_of(scenario: Scenario, rsus: tuple[RsuInfo, ...]) -> tuple[Answering, ...]:

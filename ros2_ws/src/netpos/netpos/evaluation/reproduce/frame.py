@@ -18,7 +18,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
-PAPERS = {"fokin2020": "netpos.evaluation.reproduce.fokin2020"}
+PAPERS = {
+    "fokin2020": "netpos.evaluation.reproduce.fokin2020",
+    "dvornikov2017": "netpos.evaluation.reproduce.dvornikov2017",
+}
 """Module of each paper by its name."""
 
 # Seeds per job. A constant, so that sums over a job do not depend on the number of workers.

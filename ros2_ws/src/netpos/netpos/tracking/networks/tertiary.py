@@ -48,6 +48,16 @@ class NetworkReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Device:
+    """Tracks that are one device, the most preferred network's first; ``places`` of them among
+    all live tracks."""
+
+    vue_id: str
+    members: tuple[NetworkTrack, ...]
+    places: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Fused:
     """One device at one instant: mean (6,), cov (6, 6) and the tracks in it."""
 
@@ -180,6 +190,22 @@ class TrackFusion:
 
     def fuse_epoch(self, stamp_ns: int, reports: Sequence[NetworkTrack]) -> list[Fused]:
         """All devices of which one of the ``reports``, all of ``stamp_ns``, speaks."""
+        moved, devices = self.put_together(stamp_ns, reports)
+        spoken = {report.source for report in reports}
+        fused = []
+        for device in devices:
+            if any(track.source in spoken for track in device.members):
+                mean, cov = self._fuse(moved, device.places)
+                fused.append(
+                    Fused(vue_id=device.vue_id, mean=mean, cov=cov, members=device.members)
+                )
+        return fused
+
+    def put_together(
+        self, stamp_ns: int, reports: Sequence[NetworkTrack]
+    ) -> tuple[Moved, list[Device]]:
+        """All live tracks at ``stamp_ns`` and which of them are the same device; a track that
+        might be one of another network's, but not clearly, is left out."""
         for report in reports:
             self._take(report)
         self._forget(stamp_ns)
@@ -189,27 +215,21 @@ class TrackFusion:
             if stamp_ns - entry.track.stamp_ns <= self._config.stale_s * 1e9
         ]
         live.sort(key=lambda entry: (self._order[entry.track.network], entry.track.vue_id))
-        moved = at_common_instant(
-            [entry.track for entry in live], stamp_ns, self._config.jerk_density
-        )
+        tracks = [entry.track for entry in live]
+        moved = at_common_instant(tracks, stamp_ns, self._config.jerk_density)
         slots = np.array([entry.slot for entry in live])
-        network = np.array([self._order[entry.track.network] for entry in live])
-        groups, unclear = self._grouped(stamp_ns, live, slots, moved, network)
+        groups, unclear = self._grouped(stamp_ns, live, slots, moved)
         place = {slot: index for index, slot in enumerate(slots.tolist())}
-        spoken = {report.source for report in reports}
-        fused = []
+        devices = []
         taken: set[str] = set()
         for group in groups:
-            members = [live[place[slot]] for slot in group]
-            name = self._name(members, taken)
+            places = tuple(place[slot] for slot in group)
+            name = self._name([live[i] for i in places], taken)
             taken.add(name)
-            if len(group) == 1 and group[0] in unclear:
-                continue
-            if any(member.track.source in spoken for member in members):
-                mean, cov = self._fuse(moved, [place[slot] for slot in group])
-                tracks = tuple(member.track for member in members)
-                fused.append(Fused(vue_id=name, mean=mean, cov=cov, members=tracks))
-        return fused
+            if len(group) > 1 or group[0] not in unclear:
+                members = tuple(tracks[i] for i in places)
+                devices.append(Device(vue_id=name, members=members, places=places))
+        return moved, devices
 
     def _take(self, report: NetworkTrack) -> None:
         entry = self._entries.get(report.source)
@@ -228,8 +248,9 @@ class TrackFusion:
             self._association.end(self._entries.pop(source).slot)
 
     def _grouped(
-        self, stamp_ns: int, live: list[_Entry], slots: Slots, moved: Moved, network: Slots
+        self, stamp_ns: int, live: list[_Entry], slots: Slots, moved: Moved
     ) -> tuple[list[list[int]], set[int]]:
+        network = np.array([self._order[entry.track.network] for entry in live])
         if self._config.association == "names":
             return by_name(slots, [entry.track.vue_id for entry in live]), set()
         self._association.scores.look(stamp_ns, slots, moved, network)
@@ -252,7 +273,7 @@ class TrackFusion:
             return track.vue_id
         return f"{track.network}_{track.vue_id}"
 
-    def _fuse(self, moved: Moved, indices: list[int]) -> tuple[Array, Array]:
+    def _fuse(self, moved: Moved, indices: Sequence[int]) -> tuple[Array, Array]:
         first, *others = indices
         mean, cov, own = moved.mean[first], moved.cov[first], moved.own_cov[first]
         for i in others:
