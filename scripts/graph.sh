@@ -104,3 +104,28 @@ graph_abandon() { # the script ends early (Ctrl-C, an error): leave nothing runn
   stop_s=5
   stop "${!pid_of[@]}" 2>/dev/null
 }
+
+start_trackers() { # SCENARIO_OR_BAG [ARGUMENT...]: one tracker, or one per network and the fusion of their tracks; waits
+  local source=$1 network names
+  shift
+  names=$(python -c 'import sys; from netpos.tracking.settings import settings_from; print(*settings_from(sys.argv[1]).networks)' "$source")
+  trackers=()
+  for network in $names; do
+    trackers+=("ekf_tracker_$network")
+    start "ekf_tracker_$network" ekf_tracker ekf_tracker --ros-args -r __node:="ekf_tracker_$network" -p network:="$network" -p scenario:="$source" -p subscribers:=1 "$@"
+  done
+  if [ -n "$names" ]; then
+    start track_fusion track_fusion track_fusion --ros-args -p scenario:="$source" -p subscribers:=1
+    start_up track_fusion
+  else
+    trackers=(ekf_tracker)
+    start ekf_tracker ekf_tracker ekf_tracker --ros-args -p scenario:="$source" -p subscribers:=1 "$@"
+  fi
+  start_up "${trackers[@]}"
+}
+
+stop_trackers() { # first those whose last tracks the fusion waits for
+  stop "${trackers[@]}"
+  sleep 0.5
+  stop track_fusion
+}

@@ -24,12 +24,11 @@ bag=${positional[0]} out=${positional[1]} rate=${positional[2]:-1}
 graph_begin "$(basename "$out")"
 start netpos_record netpos_bag record --output "$out" --log-time clock
 start_up netpos_record
-start ekf_tracker ekf_tracker ekf_tracker --ros-args -p scenario:="$bag" -p subscribers:=1 "$@"
-start_up ekf_tracker
-start netpos_play netpos_bag play "$bag" --rate "$rate" --input-only --subscribers 2 --wait-timeout 60
+start_trackers "$bag" "$@"
+start netpos_play netpos_bag play "$bag" --rate "$rate" --input-only --subscribers "$((1 + ${#trackers[@]}))" --wait-timeout 60
 await netpos_play || give_up
 sleep 1 # the last messages are under way
-stop ekf_tracker
+stop_trackers
 sleep 0.5 # the tracker's last estimates, given out as it stopped
 stop netpos_record
 graph_end

@@ -22,13 +22,14 @@ scenario=${positional[0]} bag=${positional[1]} rate=${positional[2]:-1} seed=${p
 graph_begin "$(basename "$bag")"
 start netpos_record netpos_bag record --output "$bag" --log-time clock --metadata scenario="$scenario" seed="$seed" rate="$rate"
 start_up netpos_record # first of all: what is published before a recorder is up is lost
-start ekf_tracker ekf_tracker ekf_tracker --ros-args -p scenario:="$scenario" -p subscribers:=1 "$@"
-start rsu_sensor rsu_sensor rsu_sensor --ros-args -p scenario:="$scenario" -p seed:="$seed" -p subscribers:=2
-start_up ekf_tracker rsu_sensor
+start_trackers "$scenario" "$@"
+start rsu_sensor rsu_sensor rsu_sensor --ros-args -p scenario:="$scenario" -p seed:="$seed" -p subscribers:="$((1 + ${#trackers[@]}))"
+start_up rsu_sensor
 start vue_sim vue_sim vue_sim --ros-args -p scenario:="$scenario" -p seed:="$seed" -p rate:="$(LC_ALL=C printf '%.6f' "$rate")" -p subscribers:=2
 await vue_sim || give_up
 sleep 1 # the last messages are under way
-stop rsu_sensor ekf_tracker
+stop rsu_sensor
+stop_trackers
 sleep 0.5 # the tracker's last estimates, given out as it stopped
 stop netpos_record
 graph_end

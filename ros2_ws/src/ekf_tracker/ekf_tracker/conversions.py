@@ -6,9 +6,12 @@ from collections.abc import Iterable
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from netpos.messages.network_tracks import network_track_to_msg
 from netpos.messages.values import TrackState, TrackStatus
 from netpos.tracking.health import RsuReport, RsuState
 from netpos_node import CODEC
+
+__all__ = ["diagnostics_to_msg", "network_track_to_msg"]
 
 _LEVELS = {
     TrackState.WAITING: DiagnosticStatus.WARN,
@@ -26,28 +29,32 @@ _RSU_LEVELS = {
 
 
 def diagnostics_to_msg(
-    statuses: Iterable[TrackStatus], rsu_count: int, reports: Iterable[RsuReport] = ()
+    statuses: Iterable[TrackStatus],
+    rsu_count: int,
+    reports: Iterable[RsuReport] = (),
+    network: str = "",
 ) -> Any:
     """diagnostic_msgs/DiagnosticArray with one entry per device and per RSU heard, stamped with
-    the newest epoch."""
+    the newest epoch; ``network``: the one this tracker is of."""
+    tracker = f"ekf_tracker {network}".rstrip()
     array = DiagnosticArray()
     newest = 0
     for status in statuses:
         newest = max(newest, status.stamp_ns)
-        array.status.append(_device(status))
+        array.status.append(_device(tracker, status))
     array.status.append(
         DiagnosticStatus(
             level=DiagnosticStatus.OK if rsu_count else DiagnosticStatus.WARN,
-            name="ekf_tracker: rsus",
+            name=f"{tracker}: rsus",
             message=f"{rsu_count} RSUs known" if rsu_count else "no /rsu/info received yet",
         )
     )
-    array.status.extend(_rsu(report) for report in reports)
+    array.status.extend(_rsu(tracker, report) for report in reports)
     array.header.stamp = CODEC.time(newest)
     return array
 
 
-def _rsu(report: RsuReport) -> Any:
+def _rsu(tracker: str, report: RsuReport) -> Any:
     values = {
         "age_s": f"{report.age_s:.1f}",
         "rate_hz": f"{report.rate_hz:.1f}",
@@ -58,14 +65,14 @@ def _rsu(report: RsuReport) -> Any:
     }
     return DiagnosticStatus(
         level=_RSU_LEVELS[report.state],
-        name=f"ekf_tracker: rsu {report.rsu_id}",
+        name=f"{tracker}: rsu {report.rsu_id}",
         message=report.text,
         hardware_id=report.rsu_id,
         values=[KeyValue(key=key, value=value) for key, value in values.items()],
     )
 
 
-def _device(status: TrackStatus) -> Any:
+def _device(tracker: str, status: TrackStatus) -> Any:
     values = {
         "position_sd_m": f"{status.position_sd_m:.3f}",
         "protection_level_m": f"{status.protection_level_m:.3f}",
@@ -76,7 +83,7 @@ def _device(status: TrackStatus) -> Any:
     }
     return DiagnosticStatus(
         level=_LEVELS[status.state],
-        name=f"ekf_tracker: {status.vue_id}",
+        name=f"{tracker}: {status.vue_id}",
         message=status.state.name.lower(),
         hardware_id=status.vue_id,
         values=[KeyValue(key=key, value=value) for key, value in values.items()],

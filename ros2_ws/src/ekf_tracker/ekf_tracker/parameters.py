@@ -26,19 +26,26 @@ def declare_parameters(node: Node) -> TrackerParameters:
     text = "scenario (name or YAML) or bag whose tracker parameters and devices are the defaults"
     settings = settings_from(declare(node, "scenario", "", text))
     defaults = TrackerConfig.from_mapping(settings.parameters)
+    config = declare_config(node, TrackerConfig, asdict(defaults))
     text = "devices whose topics exist from the start; others appear when first heard"
-    vue_ids = tuple(declare(node, "vues", list(settings.vue_ids), text))
+    vue_ids = tuple(declare(node, "vues", list(settings.names_by(config.network)), text))
     for vue_id in vue_ids:
         if not is_vue_id(vue_id):
             raise ValueError(f"vues: {vue_id!r} is no device name; use letters, digits and _")
+    if config.network and not is_vue_id(config.network):
+        raise ValueError(
+            f"network: {config.network!r} is no name of a network; use letters, digits and _"
+        )
+    text = "publish map -> base_link on /tf; a tracker of one network among several never does"
     return TrackerParameters(
         vue_ids=vue_ids,
-        publish_tf=declare(node, "publish_tf", True, "publish map -> base_link on /tf"),
+        publish_tf=declare(node, "publish_tf", True, text) and not config.network,
         subscribers=declare(
             node,
             "subscribers",
             0,
-            "listen to measurements once the estimates have so many subscribers (or after 30 s)",
+            "listen to measurements once the estimates have so many subscribers (or after 30 s);"
+            " tracks of a network need one more, the fusion",
         ),
-        config=declare_config(node, TrackerConfig, asdict(defaults)),
+        config=config,
     )

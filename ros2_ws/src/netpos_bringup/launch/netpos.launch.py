@@ -5,15 +5,43 @@ The launch ends when the scenario has ended. With ``bag:=DIR`` the run is record
 """
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandler, TimerAction
+from launch.actions import (
+    DeclareLaunchArgument,
+    EmitEvent,
+    OpaqueFunction,
+    RegisterEventHandler,
+    TimerAction,
+)
 from launch.conditions import IfCondition
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration, PythonExpression
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
+from netpos.tracking.settings import settings_from
 
 FLUSH_S = 1.0  # the last messages are under way when the simulator ends
+
+
+def _trackers(context):
+    """One tracker, or one per network of the scenario and the fusion of their tracks."""
+    name = LaunchConfiguration("scenario").perform(context)
+    scenario = {"scenario": name}
+    networks = settings_from(name).networks
+    if not networks:
+        return [Node(package="ekf_tracker", executable="ekf_tracker", parameters=[scenario])]
+    return [
+        Node(package="track_fusion", executable="track_fusion", parameters=[scenario]),
+        *(
+            Node(
+                package="ekf_tracker",
+                executable="ekf_tracker",
+                name=f"ekf_tracker_{network}",
+                parameters=[scenario, {"network": network}],
+            )
+            for network in networks
+        ),
+    ]
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -37,7 +65,7 @@ def generate_launch_description() -> LaunchDescription:
                 arguments=["--output", bag],
                 condition=IfCondition(PythonExpression(["'", bag, "' != ''"])),
             ),
-            Node(package="ekf_tracker", executable="ekf_tracker", parameters=[scenario]),
+            OpaqueFunction(function=_trackers),
             Node(package="rsu_sensor", executable="rsu_sensor", parameters=[scenario, seed]),
             vue_sim,
             RegisterEventHandler(

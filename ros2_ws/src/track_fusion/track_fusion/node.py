@@ -1,2 +1,51 @@
+"""Fusion node: tracks of several networks in, one odometry per device out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from netpos.messages import topics
+from netpos.tracking.networks.tertiary import TrackFusion
+from netpos_msgs.msg import NetworkTrack
+from netpos_node import run
+from netpos_node.estimating import EstimatingNode, spin
+
+from track_fusion.conversions import diagnostics_to_msg, network_track_from_msg
+from track_fusion.parameters import declare_parameters
+
+
+class TrackFusionNode(EstimatingNode):
+    """Feeds a ``TrackFusion``."""
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__("track_fusion", **node_options)
+        parameters = declare_parameters(self)
+        self._fusion = TrackFusion(parameters.networks, parameters.config)
+        self._begin(self._fusion, publish_tf=parameters.publish_tf)
+        self._diagnostics_pub = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
+        for vue_id in parameters.vue_ids:
+            self._add_outputs(vue_id)
+        self._wait_for_subscribers(parameters.subscribers)
+        for network in parameters.networks:
+            self._listen(NetworkTrack, topics.tracks_of(network), self._on_track)
+        self._be_ready()
+        self.get_logger().info(f"fusing the tracks of {', '.join(parameters.networks)}")
+
+    def _on_track(self, msg: Any) -> None:
+        track = network_track_from_msg(msg)
+        reason = self._fusion.add(track)
+        if reason is not None:
+            self.get_logger().warning(
+                f"refused a track of {track.network!r}: {reason}", throttle_duration_sec=2.0
+            )
+
+    def _publish_diagnostics(self) -> None:
+        self._diagnostics_pub.publish(
+            diagnostics_to_msg(self._statuses.values(), self._fusion.network_reports())
+        )
+
+
 def main() -> None:
-    raise SystemExit
+    """Entry point of ``ros2 run track_fusion track_fusion``."""
+    run(TrackFusionNode, spin)

@@ -64,7 +64,7 @@ def answering_of(scenario: Scenario, rsus: tuple[RsuInfo, ...]) -> tuple[Answeri
     return tuple(
         Answering(
             rsus=np.array([i for i, rsu in enumerate(rsus) if rsu.network == network.name]),
-            names=_names(scenario, network),
+            names=names_of(scenario, network),
             position_sd_m=network.position_sd_m or sd,
             network=network,
         )
@@ -72,8 +72,8 @@ def answering_of(scenario: Scenario, rsus: tuple[RsuInfo, ...]) -> tuple[Answeri
     )
 
 
-def _names(scenario: Scenario, network: Network) -> dict[str, str]:
-    """What a network calls each device."""
+def names_of(scenario: Scenario, network: Network) -> dict[str, str]:
+    """What a network calls each device, by its name in the scenario."""
     vues = scenario.vue_ids
     if not network.own_names:
         return {vue: vue for vue in vues}

@@ -30,6 +30,12 @@ class TrackerSettings:
     vue_ids: tuple[str, ...] = ("vue_1",)
     networks: tuple[str, ...] = ()
     fusion: Mapping[str, Any] = field(default_factory=dict)
+    names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """What each network calls the devices, where it has names of its own."""
+
+    def names_by(self, network: str) -> tuple[str, ...]:
+        """What a network calls the devices to expect."""
+        return self.names.get(network, self.vue_ids)
 
 
 DEFAULTS = TrackerSettings()
@@ -73,6 +79,7 @@ def settings_from(source: str) -> TrackerSettings:
 
 def _scenario_settings(source: str) -> TrackerSettings:
     from netpos.scenario import load_scenario  # noqa: PLC0415 - a bag of a real run needs none
+    from netpos.scenario.networks import names_of  # noqa: PLC0415
 
     scenario = load_scenario(source)
     return TrackerSettings(
@@ -80,4 +87,8 @@ def _scenario_settings(source: str) -> TrackerSettings:
         tuple(scenario.vue_ids),
         tuple(network.name for network in scenario.networks),
         dict(scenario.fusion),
+        {
+            network.name: tuple(names_of(scenario, network).values())
+            for network in scenario.networks
+        },
     )

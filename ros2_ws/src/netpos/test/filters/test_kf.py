@@ -181,3 +181,36 @@ def test_no_variance_turns_negative(gain_floor: Array, row: Maker) -> None:
             assert (np.diag(cov) > 0.0).all()
             assert (cov == cov.T).all()
         assert np.isfinite(mean).all()
+
+
+@pytest.mark.parametrize("gain_floor", [kf.NO_FLOOR, kf.DVORNIKOV_FLOOR])
+def test_own_share_is_what_the_noise_alone_makes(
+    gain_floor: Array, row: Maker, random_cov: Maker
+) -> None:
+    """Against a sum over each fix's noise, carried through the gains found by perturbation."""
+    rng = np.random.default_rng(8)
+    start = random_cov(rng, 8)
+    variances = [9.0, 4.0, 1.0]
+
+    def passed(noise: Array) -> Array:
+        mean, cov, own = np.zeros(8), start.copy(), np.zeros((8, 8))
+        for value, variance in zip(noise, variances, strict=True):
+            h = np.eye(6)[0]
+            rows = np.array([row(Kind.LINEAR, value, variance, 0, h=h, gate_variance=variance)])
+            kf.update_shared(mean, cov, rows, 0.0, OPEN, np.zeros(1), gain_floor, own)
+        shares.append(own)
+        covs.append(cov)
+        return mean
+
+    shares: list[Array] = []
+    covs: list[Array] = []
+    effect = np.array([passed(unit) for unit in np.eye(3)]) - passed(np.zeros(3))
+    expected = sum(v * np.outer(e, e) for v, e in zip(variances, effect, strict=True))
+    np.testing.assert_allclose(shares[0], expected, rtol=1e-9, atol=1e-12)
+    assert np.linalg.eigvalsh(covs[0] - shares[0])[0] > -1e-9
+    mean, cov = np.zeros(8), start.copy()
+    for variance in variances:
+        h = np.eye(6)[0]
+        rows = np.array([row(Kind.LINEAR, 0.0, variance, 0, h=h, gate_variance=variance)])
+        kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), gain_floor)
+    np.testing.assert_array_equal(cov, covs[0])

@@ -3,8 +3,9 @@
 The difference of two tracks of one device is Gaussian with the sum of their covariances (an upper
 bound where they share motion noise). Its squared Mahalanobis distance and -2 ln of its density are
 averaged over time with a fading memory: devices that meet look alike for an instant, not for a
-minute. A pair is fused once it fits better than every rival by a margin, and is given up for
-another only by the same margin, so that crossing devices keep their tracks.
+minute. A pair is fused once the best assignment of all tracks beats the best one without it by a
+margin, and is given up only where another assignment is better by the same margin, so that
+crossing devices keep their tracks.
 
 References: Kosaka, Meng and Kak 1993 (track-to-track association with memory); Bar-Shalom and Li
 1995, ch. 8 (the test and the assignment).
@@ -27,6 +28,7 @@ Slots = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 _DOF = 6
+_FORBIDDEN = 1e9
 _FIRST_LOOK_S = 0.1  # what a pair's first comparison counts for
 
 
@@ -155,9 +157,10 @@ class Association:
         plain, passes = self.scores.costs(groups, slots)
         known = np.array([[self._are_partners(g, s) for s in slots.tolist()] for g in groups])
         cost = np.where(known, plain - self._config.decision_margin, plain)
+        rows, columns = linear_sum_assignment(cost)
         joined: dict[int, int] = {}
         unclear: set[int] = set()
-        for row, column in zip(*linear_sum_assignment(cost), strict=True):
+        for row, column in zip(rows, columns, strict=True):
             slot = int(slots[column])
             if not passes[row, column]:
                 continue
@@ -170,10 +173,11 @@ class Association:
         return joined, unclear
 
     def _is_clear(self, cost: Array, row: int, column: int) -> bool:
-        """Whether a pair fits better than all others of its group and of its track."""
-        rivals = np.append(np.delete(cost[row], column), np.delete(cost[:, column], row))
-        best = float(rivals.min()) if rivals.size else np.inf
-        return bool(best - cost[row, column] >= self._config.decision_margin)
+        """Whether the best assignment with a pair fits better than the best one without."""
+        without = cost.copy()
+        without[row, column] = _FORBIDDEN
+        best, other = (table[linear_sum_assignment(table)].sum() for table in (cost, without))
+        return bool(other - best >= self._config.decision_margin)
 
     def _are_partners(self, group: Sequence[int], slot: int) -> bool:
         return all(slot in self._partners.get(member, ()) for member in group)

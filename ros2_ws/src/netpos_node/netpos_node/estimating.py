@@ -1,0 +1,187 @@
+"""What the nodes that estimate have in common: order, silence, outputs, services."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol
+
+from nav_msgs.msg import Odometry
+from netpos.messages import topics
+from netpos.messages.values import TrackStatus
+from netpos.tracking import TrackOutput
+from netpos_msgs.msg import ClockState
+from netpos_msgs.msg import TrackStatus as TrackStatusMsg
+from rclpy.clock import JumpThreshold, TimeJump
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+from std_srvs.srv import SetBool, Trigger
+from tf2_msgs.msg import TFMessage
+
+from netpos_node import BACKLOG, CDR, STREAM, spin_until_stopped, wait_until_heard
+
+_SILENCE_S = 2.0  # long: a stalled machine must not look like the end of the measurements
+_DELIVERY_S = 1
+_PATIENCE_S = 30.0
+
+
+class Core(Protocol):
+    """What such a node feeds."""
+
+    enabled: bool
+
+    def process(self) -> list[TrackOutput]:
+        """Estimates of all that is complete."""
+
+    def flush(self) -> list[TrackOutput]:
+        """Estimates of all that is pending."""
+
+    def reset(self) -> None:
+        """Forget all tracks."""
+
+
+class EstimatingNode(Node):
+    """Feeds a ``Core``.
+
+    Whoever spins the node hands messages over in the order of their arrival, so that no topic
+    overtakes another.
+    """
+
+    def _begin(self, core: Core, *, publish_tf: bool) -> None:
+        """Set up what all share; first of all."""
+        self._core = core
+        self._inputs: list[tuple[Subscription, Callable[[Any], None]]] = []
+        self._outputs: dict[str, tuple[Publisher, ...]] = {}
+        self._statuses: dict[str, TrackStatus] = {}
+        self._heard_since_tick = False
+        self._tf_pub = self.create_publisher(TFMessage, topics.TF, STREAM) if publish_tf else None
+
+    def _be_ready(self) -> None:
+        """Services, timers and the watch over the clock; last of all."""
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_service(SetBool, "~/enable", self._on_enable)
+        self.create_timer(_SILENCE_S, self._on_silence_tick)
+        self.create_timer(1.0, self._publish_diagnostics)
+        threshold = JumpThreshold(
+            min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
+        )
+        self._jump_handle = self.get_clock().create_jump_callback(
+            threshold, post_callback=self._on_clock_jump
+        )
+        gc.collect()
+        gc.freeze()  # what is here stays: looking at it again stalls a tracker of many devices
+
+    def _wait_for_subscribers(self, wanted: int, extra: Iterable[Publisher] = ()) -> None:
+        """Hear no measurement before the estimates are heard: what is given out is then seen.
+        Publishers ``extra`` need one subscriber more."""
+        publishers = {pub.topic_name: pub for pubs in self._outputs.values() for pub in pubs}
+        required = dict.fromkeys(publishers, wanted)
+        for pub in extra if wanted else ():
+            publishers[pub.topic_name], required[pub.topic_name] = pub, wanted + 1
+        unheard = wait_until_heard(publishers, required, _PATIENCE_S, settle_s=0.0)
+        if unheard:
+            self.get_logger().warning(
+                f"fewer than {wanted} subscribers to {', '.join(unheard)}; going on all the same"
+            )
+
+    # inputs
+
+    def _listen(
+        self,
+        msg_type: Any,
+        topic: str,
+        handler: Callable[[Any], None],
+        qos: Any = BACKLOG,
+        *,
+        raw: bool = False,
+    ) -> None:
+        def on_message(msg: Any) -> None:
+            self._heard_since_tick = True
+            handler(msg)
+            self._publish(self._core.process())
+
+        subscription = self.create_subscription(msg_type, topic, on_message, qos, raw=raw)
+        self._inputs.append((subscription, on_message))
+
+    @staticmethod
+    def _take_waiting(subscription: Subscription, on_message: Callable[[Any], None]) -> None:
+        kind = subscription.msg_type, subscription.raw
+        with subscription.handle:
+            while taken := subscription.handle.take_message(*kind):
+                on_message(taken[0])
+
+    # outputs
+
+    def _add_outputs(self, vue_id: str, network: str = "", *, smoothed: bool = False) -> None:
+        outputs = [
+            (Odometry, topics.ODOMETRY),
+            (ClockState, topics.CLOCK_STATE),
+            (TrackStatusMsg, topics.TRACK_STATUS),
+        ]
+        if smoothed:
+            outputs.append((Odometry, topics.ODOMETRY_SMOOTHED))
+        self._outputs[vue_id] = tuple(
+            self.create_publisher(kind, topics.of_vue(vue_id, name, network), STREAM)
+            for kind, name in outputs
+        )
+
+    def _publish(self, outputs: list[TrackOutput]) -> None:
+        for output in outputs:
+            self._publish_one(output)
+
+    def _publish_one(self, output: TrackOutput) -> None:
+        vue_id = output.status.vue_id
+        if vue_id not in self._outputs:
+            self._add_outputs(vue_id, output.network)
+        self._statuses[vue_id] = output.status
+        odometry_pub, clock_pub, status_pub, *smoothed_pub = self._outputs[vue_id]
+        if output.odometry is not None:
+            odometry_pub.publish(CDR.odometry(output.odometry))
+            if self._tf_pub is not None and not output.revised:
+                self._tf_pub.publish(CDR.transform(output.odometry))
+        if output.clock is not None:
+            clock_pub.publish(CDR.clock_state(output.clock))
+        status_pub.publish(CDR.track_status(output.status))
+        for odometry in output.smoothed:
+            smoothed_pub[0].publish(CDR.odometry(odometry))
+
+    def _publish_diagnostics(self) -> None:
+        raise NotImplementedError
+
+    def finish(self) -> None:
+        """Give out what still follows from all that has arrived, and see it delivered."""
+        for waiting in self._inputs:
+            self._take_waiting(*waiting)
+        self._publish(self._core.flush())
+        for publisher in self.publishers:
+            publisher.wait_for_all_acked(Duration(seconds=_DELIVERY_S))
+
+    # time and services
+
+    def _on_silence_tick(self) -> None:
+        if not self._heard_since_tick:
+            self._publish(self._core.flush())
+        self._heard_since_tick = False
+
+    def _on_clock_jump(self, jump: TimeJump) -> None:
+        self.get_logger().warning("the clock jumped back: all tracks start anew")
+        self._core.reset()
+
+    def _on_reset(self, _: Any, response: Any) -> Any:
+        self._core.reset()
+        response.success, response.message = True, "all tracks start anew"
+        return response
+
+    def _on_enable(self, request: Any, response: Any) -> Any:
+        self._core.enabled = bool(request.data)
+        response.success = True
+        response.message = "enabled" if request.data else "disabled: measurements are refused"
+        return response
+
+
+def spin(node: Node) -> None:
+    """Spin an ``EstimatingNode`` until it is stopped, then let it finish."""
+    assert isinstance(node, EstimatingNode)
+    spin_until_stopped(node, node.finish)
