@@ -86,16 +86,19 @@ class Sequencer:
         needs_pose: bool = False,
         history_ns: int = 0,
         future_ns: int = 1 << 62,
+        live_ns: int = _LIVE_NS,
     ) -> None:
         """``needs_pose``: nothing is complete before an initial pose, so that it is waited for.
 
         ``history_ns``: how much older than the newest applied epoch an item may be.
         ``future_ns``: a stamp this far ahead of all others counts once a second one confirms it.
+        ``live_ns``: a channel this far behind the newest stamp is not waited for.
         """
         self._hold_ns = hold_ns
         self._needs_pose = needs_pose
         self._history_ns = history_ns
         self._future_ns = future_ns
+        self._live_ns = live_ns
         self._pending: dict[int, Epoch] = {}
         self._applied: dict[int, Epoch] = {}
         self._late: list[tuple[int, Item]] = []
@@ -213,7 +216,9 @@ class Sequencer:
             return True
         stamp = epoch.stamp_ns
         reached = all(
-            w >= stamp or w < newest - _LIVE_NS for c, w in self._watermark.items() if c != POSE
+            w >= stamp or w < newest - self._live_ns
+            for c, w in self._watermark.items()
+            if c != POSE
         )
         closed = epoch.rsu_complete() or self._watermark.get(RSU, 0) > epoch.stamp_ns
         return reached and closed and (newest > epoch.stamp_ns or not epoch.only_a_pose())

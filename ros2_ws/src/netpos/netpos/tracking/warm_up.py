@@ -10,7 +10,31 @@ from netpos.tracking.tracker import Tracker
 
 
 def warm_up() -> None:
-    """Run a tiny track through every kernel: first fix, prediction, gate, update."""
+    """Run tiny tracks through every kernel: first fix, prediction, gate, update."""
+    _angles_and_ranges()
+    _fixes_of_a_network()
+
+
+def _fixes_of_a_network() -> None:
+    config = TrackerConfig(
+        network="n", hold_s=0.0, filter="kf", motion_model="constant_acceleration"
+    )
+    tracker = Tracker(config)
+    tracker.add_rsu(RsuInfo(rsu_id="a", position=np.zeros(3), network="n"))
+    for k in range(1, 5):
+        m = RsuMeasurement(
+            stamp_ns=k * 100_000_000,
+            rsu_id="a",
+            vue_id="warm_up",
+            fields=Field.POSITION,
+            position=np.array([1.0, 1.0, 0.0]),
+            position_cov=np.eye(3),
+        )
+        tracker.add(m)
+        tracker.process()
+
+
+def _angles_and_ranges() -> None:
     tracker = Tracker(TrackerConfig(hold_s=0.0, manoeuvre_speed_sd_mps=1.0))
     for name, x in (("a", 0.0), ("b", 40.0)):
         tracker.add_rsu(RsuInfo(rsu_id=name, position=np.array([x, 0.0, 0.0])))

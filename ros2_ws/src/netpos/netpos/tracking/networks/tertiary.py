@@ -104,10 +104,12 @@ class TrackFusion:
 
     def reset(self) -> None:
         """Forget all tracks; the counts go on."""
-        hold_ns, future_ns = (
-            int(seconds * 1e9) for seconds in (self._config.hold_s, self._config.max_future_s)
+        config = self._config
+        self._sequencer = Sequencer(
+            int(config.hold_s * 1e9),
+            future_ns=int(config.max_future_s * 1e9),
+            live_ns=int(config.stale_s * 1e9),
         )
-        self._sequencer = Sequencer(hold_ns, future_ns=future_ns)
         self._association = Association(self._config)
         self._entries: dict[str, _Entry] = {}
         self._yaw: dict[str, float] = {}
@@ -116,10 +118,7 @@ class TrackFusion:
         """Take a network's track; returns the reason when it is refused (also counted)."""
         reason = self._fault(track)
         if reason is None:
-            # The sequencer asks an item for its stamp and its source only.
-            reason = self._sequencer.add(cast(Item, track))
-            if self._sequencer.set_back:
-                self.reset()
+            reason = self._sequence(track)
         network = self._networks.get(track.network)
         if network is None:
             self._unknown["unknown_network"] += 1
@@ -128,6 +127,18 @@ class TrackFusion:
         else:
             network.accepted += 1
             network.newest_ns = track.stamp_ns
+        return reason
+
+    def _sequence(self, track: NetworkTrack) -> str | None:
+        if not self._sequencer.newest_ns:
+            for name in self._order:  # what has not been heard yet is waited for, too
+                self._sequencer.mark(name, track.stamp_ns - 1)
+        # The sequencer asks an item for its stamp and its source only.
+        reason = self._sequencer.add(cast(Item, track))
+        if reason is None:
+            self._sequencer.mark(track.network, track.stamp_ns)
+        elif self._sequencer.set_back:
+            self.reset()
         return reason
 
     def _fault(self, track: NetworkTrack) -> str | None:
