@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "ros2_ws" / "src"
 LIBRARY = SOURCE / "netpos" / "netpos"
-NODE_PACKAGES = ("rsu_sensor", "vue_sim", "pdr_node", "ekf_tracker")
+NODE_PACKAGES = ("rsu_sensor", "vue_sim", "pdr_node", "ekf_tracker", "track_fusion")
 MAX_LINES = 450
 
 # A room may import itself and the rooms named here; nothing imports backwards.
