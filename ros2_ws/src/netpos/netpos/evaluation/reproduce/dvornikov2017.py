@@ -169,27 +169,23 @@ def _paper(summary: NetworkSummary) -> Iterator[Row]:
         label = f"{summary.setting.name}, {network}"
         at = summary.axis_rmse_m(network, LIMIT_FROM_S, LIMIT_FROM_S + 0.5)
         yield at_most(f"{label}: RMSE of x at the 15th second", "m", at, LIMIT_M)
+        claimed = summary.axis_sd_m(network, LIMIT_FROM_S)
+        yield shown(f"{label}: sd of x the covariance gives at the 15th second", "m", claimed)
         steady = summary.axis_rmse_m(network, STEADY_S)
         yield at_most(f"{label}: RMSE of x in steady state", "m", steady, LIMIT_M)
         share = summary.axis_share_within(network, LIMIT_M, STEADY_S)
         yield shown(f"{label}: share of errors of x within 5 m in steady state", "1", share)
-        largest = float(
-            np.abs(summary.errors[network][:, summary.within(STEADY_S, np.inf), 0]).max()
-        )
+        largest = summary.axis_largest_m(network, STEADY_S)
         name = f"{label}: largest error of x in steady state, all runs"
-        yield (
-            at_most(name, "m", largest, LIMIT_M) if network == FUSED else shown(name, "m", largest)
-        )
+        demanded = network == FUSED
+        yield at_most(name, "m", largest, LIMIT_M) if demanded else shown(name, "m", largest)
 
 
 def _nees(summary: NetworkSummary, name: str, *, demanded: bool = True) -> Iterator[Row]:
     test = summary.nees_test(name, LIMIT_FROM_S)
     label = f"{summary.setting.name}, {name}: NEES, mean from the 15th second (expected 2)"
-    yield (
-        required(label, "1", test.mean, test.consistent)
-        if demanded
-        else shown(label, "1", test.mean)
-    )
+    ok = test.consistent if demanded else None
+    yield Row(name=label, unit="1", paper=None, ours=test.mean, ok=ok)
     yield shown(f"{summary.setting.name}, {name}: NEES, lower 95 % bound", "1", test.bounds[0])
     yield shown(f"{summary.setting.name}, {name}: NEES, upper 95 % bound", "1", test.bounds[1])
 
@@ -202,9 +198,8 @@ def _tertiary(summary: NetworkSummary) -> Iterator[Row]:
     fused, central = (summary.rmse_m(name, LIMIT_FROM_S) for name in (FUSED, CENTRAL))
     for name, rmse in alone.items():
         yield shown(f"{label}, {name}: RMSE", "m", rmse)
-    yield required(
-        f"{label}, fused: RMSE (better network {better:.3f})", "m", fused, fused < better
-    )
+    yield required(f"{label}, fused: RMSE", "m", fused, fused < better)
+    yield shown(f"{label}: RMSE fused over the better network", "1", fused / better)
     yield shown(f"{label}, centralised: RMSE", "m", central)
     yield shown(f"{label}: RMSE fused over centralised", "1", fused / central)
     for name in (*alone, FUSED):

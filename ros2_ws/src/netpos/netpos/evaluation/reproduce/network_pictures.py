@@ -86,7 +86,7 @@ def stages(summaries: Sequence[NetworkSummary], fused: str) -> Figure:
     figure = Figure(figsize=(12.0, 3.2 * len(summaries)), layout="constrained")
     panels = figure.subplots(len(summaries), 2, squeeze=False)
     for (left, right), summary in zip(panels, summaries, strict=True):
-        names = [n.name for n in summary.setting.networks] + [fused, CENTRAL, "independent"]
+        names = [n.name for n in summary.setting.networks] + [CENTRAL, "independent", fused]
         for name, colour in zip(names, TRACK_COLOURS, strict=False):
             rmse = np.sqrt((summary.errors[name] ** 2).sum(axis=2).mean(axis=0))
             left.plot(summary.time_s, rmse, color=colour, lw=1.0, label=name)

@@ -40,6 +40,10 @@ class NetworkSummary:
         error = self.errors[name][:, self.within(from_s, to_s), 0]
         return float(np.sqrt((error**2).mean()))
 
+    def axis_sd_m(self, name: str, at_s: float) -> float:
+        """Standard deviation of the coordinate x in the covariance, from the first instant on."""
+        return float(np.sqrt(self.covs[name][self.within(at_s, np.inf)][0, 0, 0]))
+
     def axis_share_within(self, name: str, limit_m: float, from_s: float) -> float:
         """Share of errors of the coordinate x within a limit."""
         error = self.errors[name][:, self.within(from_s, np.inf), 0]

@@ -56,7 +56,9 @@ def test_order_of_arrival_does_not_matter(track: Maker) -> None:
     fast = [track("wimax", 0.1 + 0.2 * k, 0.1 * k) for k in range(5)]
     slow = [track("wifi", 0.2 * k, 0.1 * k, var=9.0) for k in range(5)]
     results = []
-    for places in itertools.combinations(range(8), 4):  # after the first of each
+    for places in itertools.islice(
+        itertools.combinations(range(8), 4), 0, None, 9
+    ):  # after the first of each
         one, two = iter(fast), iter(slow)
         made = fusion(hold_s=3.0)
         arrived = [next(two), next(one)]
