@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from netpos.inertial.gait import GaitModel, walk
 from netpos.inertial.imu import ImuModel, MagnetometerModel, interval_ns
 from netpos.radio.arrays import AntennaArray
 from netpos.radio.clocks import ClockModel, NetworkClockModel
@@ -16,7 +17,7 @@ from netpos.radio.noise import generator
 from netpos.radio.propagation import UMA_HIGHEST_DEVICE_M, LosModel, PathLoss
 from netpos.radio.waveform import Waveform
 from netpos.world.maps import METIS_MADRID
-from netpos.world.motion import Motion, QuadraticMotion, follow
+from netpos.world.motion import BodyMotion, QuadraticMotion, follow
 from netpos.world.routes import random_route, rectangle
 
 Array = npt.NDArray[np.float64]
@@ -256,11 +257,14 @@ class Network(Section):
 
 
 class Device(Section):
-    """One device, or ``count`` devices with the same settings and draws of their own."""
+    """One device, or ``count`` devices with the same settings and draws of their own.
+
+    It drives along its route at ``speed_mps``, or a person walks with it there (``gait``)."""
 
     count: int = Field(default=1, ge=1)
     route: Route
     speed_mps: Positive | None = None
+    gait: GaitModel | None = None
     acceleration_mps2: Positive | None = None
     antenna_height_m: Finite = 0.0
     beacon_interval_s: Positive
@@ -275,13 +279,21 @@ class Device(Section):
         """Beacon interval [integer ns]."""
         return round(self.beacon_interval_s * NS)
 
-    def motion(self, seed: int, vue_id: str) -> Motion:
+    def motion(self, seed: int, vue_id: str) -> BodyMotion:
         """The true motion; a random route is drawn from the stream ``<vue>/route``."""
         if isinstance(self.route, QuadraticRoute):
             return self.route.motion()
+        points = self.route.waypoints(generator(seed, f"{vue_id}/route"))
+        if self.gait is not None:
+            return walk(
+                points,
+                self.gait,
+                corner_radius_m=self.route.corner_radius_m,
+                pauses_s=self.route.pauses_s,
+            )
         assert self.speed_mps is not None
         return follow(
-            self.route.waypoints(generator(seed, f"{vue_id}/route")),
+            points,
             self.speed_mps,
             corner_radius_m=self.route.corner_radius_m,
             acceleration_mps2=self.acceleration_mps2,
@@ -291,10 +303,14 @@ class Device(Section):
     @model_validator(mode="after")
     def _drivable(self) -> Self:
         own_velocity = isinstance(self.route, QuadraticRoute)
-        if self.speed_mps is None and not own_velocity:
-            raise ValueError("speed_mps is missing")
-        if self.speed_mps is not None and own_velocity:
-            raise ValueError("a quadratic route has its own velocity; remove speed_mps")
+        if own_velocity and (self.speed_mps is not None or self.gait is not None):
+            raise ValueError("a quadratic route has its own velocity; remove speed_mps and gait")
+        if not own_velocity and (self.gait is None) == (self.speed_mps is None):
+            raise ValueError(
+                "a device needs either speed_mps (it drives) or gait (a person walks with it)"
+            )
+        if self.gait is not None and self.acceleration_mps2 is not None:
+            raise ValueError("a gait starts and stops by itself; remove acceleration_mps2")
         if self.beacon_interval_ns < 1:
             raise ValueError("beacon_interval_s must be at least 1e-9")
         sensors = [sensor for sensor in (self.imu, self.magnetometer) if sensor is not None]
@@ -303,7 +319,7 @@ class Device(Section):
         if self.ground_truth_rate_hz is not None:
             interval_ns(self.ground_truth_rate_hz)
         smooth = self.motion(0, "vue_1").smooth
-        if isinstance(self.route, RandomRoute):
+        if isinstance(self.route, RandomRoute) and self.gait is None:
             smooth = self.route.corner_radius_m > 0
         if self.imu and not smooth:
             raise ValueError(

@@ -48,7 +48,6 @@ from netpos.scenario.build import (
 )
 from netpos.scenario.networks import Answering, answering_of
 from netpos.scenario.schema import Device, Scenario
-from netpos.world.frames import quaternion_from_yaw
 
 Array = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
@@ -235,6 +234,7 @@ class _Vue:
         self._motion = device.motion(scenario.seed, vue_id)
         limit_s = scenario.max_duration_s or self._motion.duration_s
         self._duration_ns = int(min(limit_s, self._motion.duration_s) * NS)
+        self._antenna = np.array([0.0, 0.0, device.antenna_height_m])
         self.sites = sites
         self.sight = sight
 
@@ -244,14 +244,13 @@ class _Vue:
     @cached_property
     def beacons(self) -> Beacons:
         elapsed = self._grid(self._device.beacon_interval_ns)
-        state = self._motion.at(elapsed / NS)
+        state = self._motion.body_at(elapsed / NS)
         stamps = self._start_ns + elapsed
         offset, drift = simulate_clock(self._device.clock, stamps, self._seed, self._vue_id)
-        height = np.full(len(stamps), self._device.antenna_height_m)
         return Beacons(
             stamp_ns=stamps,
-            position=np.column_stack([state.position, height]),
-            velocity=state.velocity,
+            position=state.position + self._antenna,
+            velocity=state.velocity[:, :2],
             clock_offset_s=offset,
             clock_drift=drift,
         )
@@ -285,17 +284,18 @@ class _Vue:
             elapsed = np.union1d(
                 elapsed, self._grid(interval_ns(self._device.ground_truth_rate_hz))
             )
-        state = self._motion.at(elapsed / NS)
-        quaternions = quaternion_from_yaw(state.yaw)
-        speed = np.hypot(state.velocity[:, 0], state.velocity[:, 1])
+        state = self._motion.body_at(elapsed / NS)
+        quaternions = state.rotation.as_quat()
+        places = state.position + self._antenna
+        velocities = state.rotation.inv().apply(state.velocity)
         for i, stamp in enumerate((self._start_ns + elapsed).tolist()):
             yield Odometry(
                 stamp_ns=stamp,
                 vue_id=self._vue_id,
-                position=np.array([*state.position[i], self._device.antenna_height_m]),
+                position=places[i],
                 quaternion=quaternions[i],
-                linear_velocity=np.array([speed[i], 0.0, 0.0]),
-                angular_velocity=np.array([0.0, 0.0, state.yaw_rate[i]]),
+                linear_velocity=velocities[i],
+                angular_velocity=state.angular_velocity[i],
             )
 
     def _clock(self) -> Iterator[Event]:

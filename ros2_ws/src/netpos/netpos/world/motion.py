@@ -10,9 +10,13 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from netpos.world.frames import quaternion_from_yaw
 
 Array = npt.NDArray[np.float64]
 
@@ -30,6 +34,36 @@ class Kinematics:
     acceleration: Array
     yaw: Array
     yaw_rate: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BodyState:
+    """Motion of a body in space at n instants: position, velocity (n, 3) in map; ``rotation`` n
+    rotations body -> map; angular_velocity (n, 3) rad/s in body axes."""
+
+    position: Array
+    velocity: Array
+    rotation: Rotation
+    angular_velocity: Array
+
+
+class BodyMotion(Protocol):
+    """What carries a device: a vehicle's ``Motion`` or a person's gait."""
+
+    duration_s: float
+    smooth: bool
+
+    def body_at(self, time_s: npt.ArrayLike) -> BodyState:
+        """State at times (n,) since the start [s]; z is the height over the route."""
+        ...
+
+
+def check_times(time_s: npt.ArrayLike, duration_s: float) -> Array:
+    """(n,) times; ``ValueError`` where one is not finite or outside [0, duration_s]."""
+    t = np.atleast_1d(np.asarray(time_s, dtype=np.float64))
+    if not ((t >= 0) & (t <= duration_s + _TIME_TOLERANCE_S)).all():
+        raise ValueError(f"time must be in [0, {duration_s}] s, got {t.min()} to {t.max()}")
+    return t
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,15 +103,12 @@ class Motion:
             [(p.x, p.y, p.yaw, p.curvature, p.speed, p.acceleration, p.spin) for p in pieces]
         )
 
-    def _pieces_at(self, time_s: npt.ArrayLike) -> tuple[Array, npt.NDArray[np.int64]]:
-        """Times (n,) as an array and the piece of each."""
-        t = np.atleast_1d(np.asarray(time_s, dtype=np.float64))
-        if not ((t >= 0) & (t <= self.duration_s + _TIME_TOLERANCE_S)).all():
-            raise ValueError(
-                f"time must be in [0, {self.duration_s}] s, got {t.min()} to {t.max()}"
-            )
-        k = np.maximum(np.searchsorted(self._start, t, side="right") - 1, 0)
-        return t, k
+    @property
+    def knots(self) -> tuple[Array, Array]:
+        """Instants (k,) between which the heading changes evenly, and the heading there: the
+        start of every piece and the end."""
+        last = self.at(self.duration_s).yaw
+        return np.append(self._start, self.duration_s), np.append(self._table[:, 2], last)
 
     def at(self, time_s: npt.ArrayLike) -> Kinematics:
         """State at times (n,) since the start [s]; at a jump, the state after it.
@@ -86,7 +117,8 @@ class Motion:
         ------
         ValueError  a time is not finite or outside [0, duration_s]
         """
-        t, k = self._pieces_at(time_s)
+        t = check_times(time_s, self.duration_s)
+        k = np.maximum(np.searchsorted(self._start, t, side="right") - 1, 0)
         x, y, yaw, curvature, speed, acceleration, spin = self._table[k].T
         tau = t - self._start[k]
         way = speed * tau + acceleration * tau**2 / 2
@@ -106,8 +138,23 @@ class Motion:
             yaw_rate=curvature * now + spin,
         )
 
+    def body_at(self, time_s: npt.ArrayLike) -> BodyState:
+        """The same as a level body in space."""
+        return _level(self.at(time_s))
 
-class QuadraticMotion(Motion):
+
+def _level(state: Kinematics) -> BodyState:
+    """A plane motion as that of a level body in space."""
+    zero = np.zeros((len(state.yaw), 2))
+    return BodyState(
+        position=np.hstack([state.position, zero[:, :1]]),
+        velocity=np.hstack([state.velocity, zero[:, :1]]),
+        rotation=Rotation.from_quat(quaternion_from_yaw(state.yaw)),
+        angular_velocity=np.hstack([zero, state.yaw_rate[:, None]]),
+    )
+
+
+class QuadraticMotion:
     """Per axis a polynomial of degree 2 at a time: stretches of constant acceleration, the
     position and the velocity continuous (dvornikov2017: curves of the second order)."""
 
@@ -149,7 +196,8 @@ class QuadraticMotion(Motion):
 
         Raises ``ValueError`` as ``Motion.at``.
         """
-        t, k = self._pieces_at(time_s)
+        t = check_times(time_s, self.duration_s)
+        k = np.maximum(np.searchsorted(self._start, t, side="right") - 1, 0)
         tau = (t - self._start[k])[:, None]
         p, v, a = np.hsplit(self._stretches[k], 3)
         now = v + tau * a
@@ -162,6 +210,10 @@ class QuadraticMotion(Motion):
             yaw=np.arctan2(now[:, 1], now[:, 0]),
             yaw_rate=np.divide(across, speed2, out=np.zeros_like(speed2), where=speed2 > 0),
         )
+
+    def body_at(self, time_s: npt.ArrayLike) -> BodyState:
+        """The same as a level body in space."""
+        return _level(self.at(time_s))
 
 
 def follow(

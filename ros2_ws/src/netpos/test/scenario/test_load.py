@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
-from netpos.scenario import ScenarioError, load_scenario, scenario_names
+from netpos.messages.values import Odometry
+from netpos.scenario import ScenarioError, Simulation, load_scenario, scenario_names
+from scipy.spatial.transform import Rotation
 
 GOOD = """\
 seed: 3
@@ -45,7 +48,7 @@ def test_a_good_file(tmp_path: Path) -> None:
     ("old", "new", "complaint"),
     [
         ("speed_mps: 1.0", "sped_mps: 1.0", "line 10: devices.0.sped_mps: unknown key"),
-        ("    speed_mps: 1.0\n", "", "line 9: devices.0: speed_mps is missing"),
+        ("    speed_mps: 1.0\n", "", "line 9: devices.0: a device needs either speed_mps"),
         ("speed_mps: 1.0", "speed_mps: -1.0", "line 10: devices.0.speed_mps: .*got -1.0"),
         ("speed_mps: 1.0", "speed_mps: .nan", "line 10: devices.0.speed_mps: .*got nan"),
         ("speed_mps: 1.0", "speed_mps: fast", "line 10: devices.0.speed_mps: .*got 'fast'"),
@@ -134,3 +137,49 @@ def test_variants_differ_in_one_value_only() -> None:
     wide, narrow = plain("intersection_turn"), plain("intersection_turn_30m")
     narrow["measurement"]["los"]["max_distance_m"] = 40.0  # type: ignore[index]
     assert wide == narrow
+
+
+WALKER = """\
+  - route: {kind: rectangle, width_m: 5.7, height_m: 4.5, pauses_s: [0.51, 0.51, 0.51, 0.51, 0.51]}
+    gait: {step_length_m: 0.6375, cadence_hz: 1.568627450980392}
+    antenna_height_m: 1.0
+    beacon_interval_s: 0.1
+    imu: {}
+    magnetometer: {disturbances: [{center: [5, 2], radius_m: 0.7, field_t: [15.0e-6, 0, 0]}]}
+"""
+
+
+def _walker(tmp_path: Path, text: str = WALKER) -> str:
+    return _write(tmp_path, GOOD[: GOOD.index("  - route")] + text)
+
+
+def test_a_person_walks_a_route(tmp_path: Path) -> None:
+    scenario = load_scenario(_walker(tmp_path))
+    assert scenario.duration_s == pytest.approx(25.5)
+    simulation = Simulation(scenario)
+    beacons = simulation.beacons("vue_1")
+    assert np.ptp(beacons.position[:, 2]) == pytest.approx(0.04, rel=0.1)
+    assert beacons.position[0, 2] == 1.0
+    truth = [e for e in simulation.events() if isinstance(e, Odometry)]
+    for state, position, velocity in zip(truth, beacons.position, beacons.velocity, strict=True):
+        np.testing.assert_array_equal(state.position, position)
+        turned = Rotation.from_quat(state.quaternion).apply(state.linear_velocity)
+        np.testing.assert_allclose(turned[:2], velocity, atol=1e-12)
+    assert len(simulation.imu("vue_1")) == 2550
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("    gait:", "    speed_mps: 1.0\n    gait:", "devices.0: a device needs either"),
+        ("    gait:", "    acceleration_mps2: 1.0\n    gait:", "remove acceleration_mps2"),
+        ("pauses_s: [0.51, 0.51, 0.51, 0.51, 0.51]", "laps: 1", "give each a pause in pauses_s"),
+        ("step_length_m: 0.6375", "step_length_m: 0.0", "step_length_m: input should be greater"),
+        ("cadence_hz", "cadence", "gait.cadence: unknown key"),
+        ("radius_m: 0.7", "radius_m: -1", "radius_m: input should be greater"),
+    ],
+)
+def test_complaints_about_a_walker(tmp_path: Path, old: str, new: str, complaint: str) -> None:
+    assert old in WALKER
+    with pytest.raises(ScenarioError, match=complaint):
+        load_scenario(_walker(tmp_path, WALKER.replace(old, new)))
