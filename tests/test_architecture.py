@@ -25,7 +25,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "bags": {"messages", "inertial"},
     "scenario": {"messages", "world", "radio", "inertial", "bags"},
     "tracking": {"messages", "filters", "inertial", "bags", "scenario"},
-    "evaluation": {"messages", "world", "radio", "filters", "bags", "scenario", "tracking"},
+    "evaluation": {
+        *("messages", "world", "radio", "inertial", "filters", "bags", "scenario", "tracking"),
+    },
 }
 
 

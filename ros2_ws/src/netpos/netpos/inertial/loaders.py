@@ -40,12 +40,18 @@ class ImuRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WalkingBout:
-    """Reference walking bout; ``initial_contact_ns`` is sorted, without NaN or repeats."""
+    """Reference walking bout.
+
+    initial_contact_ns : (k,) sorted, without repeats
+    untimed : (start, end, count) of contacts the reference lists without a time: how many lie
+        between two timed ones
+    """
 
     start_ns: int
     end_ns: int
     length_m: float
     initial_contact_ns: Stamps
+    untimed: tuple[tuple[int, int, int], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,6 +117,14 @@ def waist_to_flu(array: Array) -> Array:
     return np.column_stack([array[:, 2], -array[:, 1], array[:, 0]])
 
 
+def _untimed(contacts: Array) -> tuple[tuple[int, int, int], ...]:
+    """(start, end, count) of each run of NaN between contacts [s] in order."""
+    timed = np.flatnonzero(np.isfinite(contacts))
+    ns = np.rint(contacts[timed] * 1e9).astype(np.int64).tolist()
+    gaps = zip(ns[:-1], ns[1:], np.diff(timed).tolist(), strict=True)
+    return tuple((start, end, step - 1) for start, end, step in gaps if step > 1)
+
+
 def load_waist_imu(path: Path) -> WaistRecord:
     """``waist_imu/*/data.mat``: trial TimeMeasure1/Test11/Trial1, sensor LowerBack, INDIP bouts.
 
@@ -132,7 +146,8 @@ def load_waist_imu(path: Path) -> WaistRecord:
             entries += contacts.size
             finite = np.unique(np.rint(contacts[np.isfinite(contacts)] * 1e9).astype(np.int64))
             start, end = round(bout["Start"] * 1e9), round(bout["End"] * 1e9)
-            bouts.append(WalkingBout(start, end, float(bout["Length"]), finite))
+            untimed = _untimed(contacts)
+            bouts.append(WalkingBout(start, end, float(bout["Length"]), finite, untimed))
     except (KeyError, TypeError, IndexError) as error:
         raise _malformed(path, repr(error)) from error
     return WaistRecord(imu, tuple(bouts), entries)

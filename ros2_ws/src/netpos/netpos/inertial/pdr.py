@@ -13,7 +13,8 @@ accelerometer and gyro are quiet. In between (start of a walk, handling, a singl
 velocity is unknown: zero with ``undecided_speed_sd_mps`` and ``moving`` True.
 
 Time is the stamp of the samples; there is no clock. Bad data never raises: it is counted in
-``PedestrianDeadReckoning.counters`` under its reason.
+``PedestrianDeadReckoning.counters`` under its reason, and what lasts is told once
+(``take_notices``).
 """
 
 from __future__ import annotations
@@ -21,95 +22,20 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from netpos.inertial.attitude import AttitudeConfig, AttitudeFilter, HeadingReference, wrap_angle
-from netpos.inertial.steps import Step, StepConfig, StepDetector, weinberg_length
+from netpos.inertial.attitude import AttitudeFilter, HeadingReference, wrap_angle
+from netpos.inertial.length import LengthScale, frequency_length, weinberg_length
+from netpos.inertial.pdr_config import PdrConfig
+from netpos.inertial.steps import Step, StepDetector
+from netpos.inertial.watch import Conditions, StreamWatch
 
 Array = npt.NDArray[np.float64]
 Vector = tuple[float, float, float]
 VectorLike = npt.NDArray[np.floating] | Sequence[float]
-
-_POSITIVE = (
-    "output_rate_hz",
-    "weinberg_k",
-    "length_sd_fraction",
-    "heading_sd_rad",
-    "still_speed_sd_mps",
-    "undecided_speed_sd_mps",
-    "still_rate_radps",
-    "max_gap_s",
-    "min_rate_hz",
-    "max_rate_hz",
-    "accelerometer_range_mps2",
-    "gyro_range_radps",
-    "clock_reset_s",
-)
-_NOT_NEGATIVE = ("heading_drift_radps", "gap_rate_sd_radps", "speed_drift_mps2")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PdrConfig:
-    """All parameters of the core; a bad value raises ``ValueError`` here.
-
-    weinberg_k : m (m/s^2)^(-1/4); 0.44 is the one scale fitted to a surveyed 122.9 m walk
-        with a hand-held phone; calibrate per person over a known distance
-    length_sd_fraction : sd of a step length over the length; k varies that much between people
-    heading_sd_rad : heading sd at alignment, or with a magnetometer in use
-    heading_drift_radps : growth of the heading sd without an accepted magnetic sample
-    mount_heading_rad : walking direction minus the body x axis, counter-clockwise
-    speed_drift_mps2 : growth of the velocity sd with the age of the last step
-    gap_rate_sd_radps : how fast the device may turn unseen, for the heading sd after a gap
-    clock_reset_s : a stamp this far in the past restarts the core instead of being refused
-    """
-
-    output_rate_hz: float = 10.0
-    weinberg_k: float = 0.44
-    length_sd_fraction: float = 0.2
-    heading_sd_rad: float = 0.1
-    heading_drift_radps: float = 0.001
-    mount_heading_rad: float = 0.0
-    still_speed_sd_mps: float = 0.05
-    undecided_speed_sd_mps: float = 1.0
-    still_rate_radps: float = 0.2
-    speed_drift_mps2: float = 0.2
-    max_gap_s: float = 0.25
-    gap_rate_sd_radps: float = 0.5
-    min_rate_hz: float = 25.0
-    max_rate_hz: float = 2000.0
-    accelerometer_range_mps2: float = 156.0
-    gyro_range_radps: float = 34.8
-    clock_reset_s: float = 1.0
-    attitude: AttitudeConfig = field(default_factory=AttitudeConfig)
-    steps: StepConfig = field(default_factory=StepConfig)
-
-    def __post_init__(self) -> None:
-        for name in _POSITIVE:
-            value = getattr(self, name)
-            if not 0 < value < math.inf:
-                raise ValueError(f"pdr.{name} must be finite and > 0, got {value}")
-        for name in _NOT_NEGATIVE:
-            value = getattr(self, name)
-            if not 0 <= value < math.inf:
-                raise ValueError(f"pdr.{name} must be finite and >= 0, got {value}; use 0 for off")
-        if not abs(self.mount_heading_rad) <= math.pi:
-            raise ValueError(
-                f"pdr.mount_heading_rad must be in [-pi, pi] rad, got {self.mount_heading_rad}; "
-                "is it in degrees?"
-            )
-        if self.max_rate_hz <= self.min_rate_hz:
-            raise ValueError(
-                f"pdr.max_rate_hz ({self.max_rate_hz}) must exceed min_rate_hz "
-                f"({self.min_rate_hz}); raise it"
-            )
-        if self.max_gap_s * self.min_rate_hz <= 1:
-            raise ValueError(
-                f"pdr.max_gap_s ({self.max_gap_s}) must exceed 1 / min_rate_hz "
-                f"({1 / self.min_rate_hz:.3g} s), or every sample is a gap; raise it"
-            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,19 +126,33 @@ class PedestrianDeadReckoning:
     ``accelerometer_saturated``, ``gyro_saturated`` (sample refused); ``gap``, ``clock_reset``
     (restart); ``rate_out_of_range`` (per second of stream); ``gravity_implausible`` (an
     alignment window without 1 g: wrong unit?); ``magnetic_*`` (field sample not used).
+    ``conditions``: ``rate``, ``axes``, ``gravity``, ``no_magnetic_field``, ``magnetic_disturbed``.
     """
 
     def __init__(self, config: PdrConfig | None = None) -> None:
         self.config = config if config is not None else PdrConfig()
         self._count = 0
         self._counters: Counter[str] = Counter()
+        self._conditions = Conditions()
+        self._watch = StreamWatch(self.config, self._conditions, self._counters)
         self._attitude = AttitudeFilter(self.config.attitude)
         self._detector = StepDetector(self.config.steps)
+        self.length_scale = LengthScale(self.config.length_scale, self.config.length_scale_sd)
+        """Of this person; ``observe`` references to calibrate it."""
         self._restart()
 
     @property
     def counters(self) -> dict[str, int]:
         return dict(self._counters)
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """Names of what is wrong with the input now."""
+        return self._conditions.active
+
+    def take_notices(self) -> list[str]:
+        """Sentences about the input since the last call; each condition is told once."""
+        return self._conditions.take()
 
     @property
     def attitude(self) -> AttitudeFilter:
@@ -227,6 +167,8 @@ class PedestrianDeadReckoning:
         self._heading_fix_ns = 0
         self._gap_sd_rad = 0.0
         self._last_field_ns: int | None = None
+        self._aligned_ns: int | None = None
+        self._mounted = True
         self._restart_detector()
 
     def _restart_detector(self) -> None:
@@ -234,9 +176,7 @@ class PedestrianDeadReckoning:
         self._step: StepEvent | None = None
         self._forward: deque[tuple[int, float, float]] = deque()
         self._turn_rate = math.inf
-        self._rate_start_ns: int | None = None
-        self._rate_n = 0
-        self._rate_ok = True
+        self._watch.reset()
 
     def add_imu(
         self, stamp_ns: int, angular_velocity: VectorLike, specific_force: VectorLike
@@ -255,7 +195,7 @@ class PedestrianDeadReckoning:
         """
         rate, force = _vector(angular_velocity), _vector(specific_force)
         if isinstance(rate, str) or isinstance(force, str):
-            self._counters[rate if isinstance(rate, str) else str(force)] += 1
+            self._refuse(rate if isinstance(rate, str) else str(force))
             return None
         reason = self._sample_fault(stamp_ns, rate, force)
         if reason is not None:
@@ -265,7 +205,8 @@ class PedestrianDeadReckoning:
         if dt_s > self.config.max_gap_s:
             self._on_gap(dt_s)
         self._last_ns = stamp_ns
-        self._watch_rate(stamp_ns)
+        self._watch.rate(stamp_ns)
+        self._mounted = self._watch.mounted(dt_s, force)
         if not self._update_attitude(stamp_ns, dt_s, rate, force):
             return None
         steps = [self._event(stamp_ns, s) for s in self._detector.add(stamp_ns, force)]
@@ -311,42 +252,43 @@ class PedestrianDeadReckoning:
                 return "stamp_duplicate" if stamp_ns == last else "stamp_backwards"
             self._counters["clock_reset"] += 1
             self._restart()
-        if max(map(abs, force)) >= self.config.accelerometer_range_mps2:
-            return "accelerometer_saturated"
-        if max(map(abs, rate)) >= self.config.gyro_range_radps:
-            return "gyro_saturated"
-        return None
+        return self._watch.saturated(rate, force)
+
+    def _refuse(self, reason: str) -> None:
+        """Count a sample that cannot be read; the first of a kind is told."""
+        if not self._counters[reason]:
+            self._conditions.tell(
+                f"{reason}: IMU samples without three finite values are left out"
+            )
+        self._counters[reason] += 1
 
     def _on_gap(self, dt_s: float) -> None:
+        if not self._counters["gap"]:
+            self._conditions.tell(
+                f"a gap of {dt_s:.2f} s in the IMU stream (more than max_gap_s "
+                f"{self.config.max_gap_s:g}): the heading is kept with a larger sd, steps start "
+                "anew; further gaps are only counted"
+            )
         self._counters["gap"] += 1
         unseen = self.config.gap_rate_sd_radps * dt_s
         self._gap_sd_rad = min(math.hypot(self._gap_sd_rad, unseen), math.pi)
         self._attitude.reset(keep_heading=True)
         self._restart_detector()
 
-    def _watch_rate(self, stamp_ns: int) -> None:
-        if self._rate_start_ns is None:
-            self._rate_start_ns = stamp_ns
-            return
-        self._rate_n += 1
-        span_s = (stamp_ns - self._rate_start_ns) * 1e-9
-        if span_s < 1.0:
-            return
-        rate_hz = self._rate_n / span_s
-        self._rate_ok = self.config.min_rate_hz <= rate_hz <= self.config.max_rate_hz
-        if not self._rate_ok:
-            self._counters["rate_out_of_range"] += 1
-        self._rate_start_ns, self._rate_n = stamp_ns, 0
-
     def _update_attitude(self, stamp_ns: int, dt_s: float, rate: Vector, force: Vector) -> bool:
         was_aligned = self._attitude.aligned
         if not self._attitude.add_imu(stamp_ns, rate, force):
             if self._attitude.alignment_failed:
                 self._counters["gravity_implausible"] += 1
+                self._tell_gravity(True)
             self._detector.add(stamp_ns, force)
             return False
-        if not was_aligned and self._heading_fix_ns == 0:
-            self._heading_fix_ns = stamp_ns
+        if not was_aligned:
+            self._tell_gravity(False)
+            self._aligned_ns = stamp_ns
+            if self._heading_fix_ns == 0:
+                self._heading_fix_ns = stamp_ns
+        self._watch_field(stamp_ns)
         bias = self._attitude.bias_radps
         norm = math.sqrt(sum((r - b) ** 2 for r, b in zip(rate, bias, strict=True)))
         a = min(dt_s / 0.5, 1.0) if self._turn_rate < math.inf else 1.0
@@ -359,6 +301,37 @@ class PedestrianDeadReckoning:
                 self._forward.popleft()
         return True
 
+    def _tell_gravity(self, implausible: bool) -> None:
+        self._conditions.set(
+            "gravity",
+            implausible,
+            "the mean specific force is not 9.8 m/s^2: is it in g, or without gravity? "
+            "No attitude and no steps until it is",
+            "the specific force is plausible now",
+        )
+
+    def _watch_field(self, stamp_ns: int) -> None:
+        """Tell when the heading has done without the magnetic field for a while, and why."""
+        since_ns = max(self._heading_fix_ns, self._aligned_ns or 0)
+        late = (stamp_ns - since_ns) * 1e-9 > self.config.field_patience_s
+        heard = self._last_field_ns is not None and (
+            (stamp_ns - self._last_field_ns) * 1e-9 <= self.config.field_patience_s
+        )
+        drift = f"its sd grows by {self.config.heading_drift_radps:g} rad/s"
+        self._conditions.set(
+            "no_magnetic_field",
+            late and not heard,
+            f"no magnetic field is heard: the heading comes from the gyro alone, {drift}. Is mag "
+            "published with the stamps of the IMU?",
+            "the magnetic field gives the heading again",
+        )
+        self._conditions.set(
+            "magnetic_disturbed",
+            late and heard,
+            f"the magnetic field is disturbed: the heading comes from the gyro alone, {drift}",
+            "the magnetic field gives the heading again",
+        )
+
     def _event(self, stamp_ns: int, step: Step) -> StepEvent:
         x, y = self._attitude.forward
         inside = [f for f in self._forward if step.start_ns <= f[0] <= step.end_ns]
@@ -367,7 +340,8 @@ class PedestrianDeadReckoning:
             y = sum(f[2] for f in inside) / len(inside)
         horizontal = math.hypot(x, y)
         heading = math.atan2(y, x) + self.config.mount_heading_rad
-        length = weinberg_length(step.prominence_mps2, self.config.weinberg_k)
+        length = self.length_scale.mean * self._model_length(step)
+        spread = self.length_scale.sd / self.length_scale.mean
         self._count += 1
         return StepEvent(
             stamp_ns=stamp_ns,
@@ -377,13 +351,21 @@ class PedestrianDeadReckoning:
             length_m=length,
             heading_rad=wrap_angle(heading),
             heading_sd_rad=self._heading_sd(stamp_ns, horizontal),
-            length_sd_m=self.config.length_sd_fraction * length,
+            length_sd_m=math.hypot(spread, self.config.step_sd_fraction) * length,
             cadence_hz=step.cadence_hz,
             heading_reference=self._attitude.reference,
         )
 
+    def _model_length(self, step: Step) -> float:
+        """Length of the person's step before the scale [m]."""
+        if self.config.length_model == "weinberg":
+            return weinberg_length(step.bounce_mps2, self.config.weinberg_k)
+        return frequency_length(step.cadence_hz, self.config.height_m)
+
     def _heading_sd(self, stamp_ns: int, horizontal: float) -> float:
         """Heading sd; a nearly vertical forward axis (small ``horizontal``) spoils it."""
+        if not self._mounted:
+            return math.pi
         drift = self.config.heading_drift_radps * max(stamp_ns - self._heading_fix_ns, 0) * 1e-9
         base = math.hypot(self.config.heading_sd_rad, drift)
         return min(math.hypot(base / max(horizontal, 1e-3), self._gap_sd_rad), math.pi)
@@ -400,7 +382,7 @@ class PedestrianDeadReckoning:
 
     def _velocity(self, stamp_ns: int) -> StepVelocity:
         cfg, reference = self.config, self._attitude.reference
-        if not self._rate_ok:
+        if not (self._watch.rate_ok and self._mounted):
             return self._isotropic(stamp_ns, cfg.undecided_speed_sd_mps, True)
         if self._detector.still and self._turn_rate < cfg.still_rate_radps:
             return self._isotropic(stamp_ns, cfg.still_speed_sd_mps, False)

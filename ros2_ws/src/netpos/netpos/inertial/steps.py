@@ -1,18 +1,20 @@
 """Streaming step detection from specific force: sample by sample, bounded delay.
 
 1. Each sample is averaged into cells of 20 ms, so 50-285 Hz streams give the same signal.
-2. The vertical component is the projection on gravity, low-passed with 1 s: it does not
-   depend on how the device is turned (pocket, bag, hand, armband, waist).
-3. A zero-phase difference of Gaussians passes 0.6-3 Hz; the smooth peak after each initial
-   contact is the step (Zijlstra and Hof, Gait & Posture 18(2), 2003; Gaussian smoothing as in
-   McCamley et al., Gait & Posture 36(2), 2012).
+2. The signal is one of two:
+   ``bounce``  the vertical component, the projection on gravity low-passed with 1 s. It does not
+      depend on how the device is turned (pocket, bag, hand, armband). The smooth peak after each
+      initial contact is the step (Zijlstra and Hof, Gait & Posture 18(2), 2003; Gaussian
+      smoothing as in McCamley et al., Gait & Posture 36(2), 2012).
+   ``impact``  the norm of the jerk. At the lower back every foot contact shows as a short burst
+      on all axes, even where a slow, unsteady gait hardly bounces.
+3. A zero-phase Gaussian smooths the impacts; a zero-phase difference of two, from 0.6 to 3 Hz,
+   passes the bounce.
 4. A peak counts when its prominence exceeds a floor and a fraction of the running prominence.
 5. A device being turned in the hand is not walking: peaks with a fast tilt are refused.
 6. ``bout_steps`` peaks in a row start a bout; the first ones are then released together.
 
-Step length is Weinberg's L = k (a_max - a_min)^(1/4), Analog Devices AN-602, 2002; the range
-is that of the band-passed vertical acceleration. Stillness is the moving-variance detector
-(Skog et al., IEEE Trans. Biomed. Eng. 57(11), 2010).
+Stillness is the moving-variance detector (Skog et al., IEEE Trans. Biomed. Eng. 57(11), 2010).
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -29,17 +32,23 @@ Vector = tuple[float, float, float]
 
 CELL_NS = 20_000_000
 CELL_S = CELL_NS * 1e-9
+_SLOWEST_HZ, _FASTEST_HZ = 0.8, 2.5  # cadences whose attenuation is made good
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepConfig:
-    """Parameters of ``StepDetector``; a bad value raises ``ValueError`` here."""
+    """Parameters of ``StepDetector``; a bad value raises ``ValueError`` here.
 
+    The defaults are for a device carried anyhow; ``waist()`` for one worn at the lower back.
+    ``min_prominence`` is in m/s^2 of ``bounce`` and in m/s^3 of ``impact``, which has no trend.
+    """
+
+    signal: Literal["bounce", "impact"] = "bounce"
     smooth_sd_s: float = 0.08
     trend_sd_s: float = 0.4
     filter_half_width_s: float = 0.5
     peak_half_width_s: float = 0.1
-    min_prominence_mps2: float = 0.3
+    min_prominence: float = 0.3
     prominence_fraction: float = 0.4
     prominence_memory_s: float = 4.0
     min_height_fraction: float = 0.1
@@ -56,7 +65,10 @@ class StepConfig:
     def __post_init__(self) -> None:
         for name in self.__slots__:
             value = getattr(self, name)
-            if name == "contact_lag_s":
+            if name == "signal":
+                if value not in ("bounce", "impact"):
+                    raise ValueError(f"steps.signal must be bounce or impact, got {value!r}")
+            elif name == "contact_lag_s":
                 if not -0.3 <= value <= 0.3:
                     raise ValueError(f"steps.{name} must be within +-0.3 s, got {value}")
             elif not 0 < value < math.inf:
@@ -80,6 +92,21 @@ class StepConfig:
                 f"{self.filter_half_width_s}"
             )
 
+    @classmethod
+    def waist(cls) -> StepConfig:
+        """For a device worn at the waist, also by slow and unsteady walkers."""
+        return cls(
+            signal="impact",
+            smooth_sd_s=0.05,
+            filter_half_width_s=0.2,
+            min_prominence=8.0,
+            prominence_fraction=0.2,
+            max_interval_s=2.5,
+            contact_lag_s=-0.085,
+            max_tilt_change_rad=math.pi,  # a person who bends down may well be walking
+            bout_steps=2,
+        )
+
     @property
     def delay_s(self) -> float:
         """Longest time from a peak to the sample that reveals it (steps within a bout)."""
@@ -92,12 +119,13 @@ class Step:
 
     start_ns, end_ns : initial contacts that bound it; ``start_ns`` is the previous step's
         ``end_ns`` inside a bout, else one typical period earlier
-    prominence_mps2 : range of the band-passed vertical acceleration over the step
+    bounce_mps2 : range of the vertical acceleration over the step, with the attenuation of the
+        band-pass at the step's cadence made good
     """
 
     start_ns: int
     end_ns: int
-    prominence_mps2: float
+    bounce_mps2: float
 
     @property
     def duration_s(self) -> float:
@@ -108,19 +136,24 @@ class Step:
         return 1.0 / self.duration_s
 
 
-def weinberg_length(range_mps2: float, k: float) -> float:
-    """Step length [m] = k (a_max - a_min)^(1/4); range [m/s^2] >= 0, k [m (m/s^2)^(-1/4)]."""
-    return k * math.sqrt(math.sqrt(max(range_mps2, 0.0)))
+def smoothing_kernel(smooth_sd_s: float, half_width_s: float) -> Array:
+    """(2n+1,) symmetric Gaussian of unit area on the cell grid."""
+    n = round(half_width_s / CELL_S)
+    kernel: Array = np.exp(-0.5 * (np.arange(-n, n + 1) * CELL_S / smooth_sd_s) ** 2)
+    kernel /= kernel.sum()
+    return kernel
 
 
 def band_pass_kernel(smooth_sd_s: float, trend_sd_s: float, half_width_s: float) -> Array:
     """(2n+1,) symmetric difference of two unit-area Gaussians on the cell grid; sums to 0."""
-    n = round(half_width_s / CELL_S)
+    return smoothing_kernel(smooth_sd_s, half_width_s) - smoothing_kernel(trend_sd_s, half_width_s)
+
+
+def amplitude_response(kernel: Array, frequency_hz: float) -> float:
+    """Gain of a symmetric kernel on the cell grid at a frequency."""
+    n = kernel.size // 2
     t = np.arange(-n, n + 1) * CELL_S
-    smooth = np.exp(-0.5 * (t / smooth_sd_s) ** 2)
-    trend = np.exp(-0.5 * (t / trend_sd_s) ** 2)
-    kernel: Array = smooth / smooth.sum() - trend / trend.sum()
-    return kernel
+    return float(kernel @ np.cos(2 * np.pi * frequency_hz * t))
 
 
 class CellAverager:
@@ -191,7 +224,12 @@ class StepDetector:
 
     def __init__(self, config: StepConfig | None = None) -> None:
         cfg = self.config = config if config is not None else StepConfig()
-        self._kernel = band_pass_kernel(cfg.smooth_sd_s, cfg.trend_sd_s, cfg.filter_half_width_s)
+        if cfg.signal == "impact":
+            self._kernel = smoothing_kernel(cfg.smooth_sd_s, cfg.filter_half_width_s)
+        else:
+            self._kernel = band_pass_kernel(
+                cfg.smooth_sd_s, cfg.trend_sd_s, cfg.filter_half_width_s
+            )
         self._half = self._kernel.size // 2
         self._wing = max(round(cfg.peak_half_width_s / CELL_S), 1)
         self._decay = math.exp(-CELL_S / cfg.prominence_memory_s)
@@ -205,11 +243,14 @@ class StepDetector:
         self._cells = CellAverager()
         self._gravity = _Mean(cfg.gravity_memory_s)
         self._fast, self._slow = _Mean(0.5), _Mean(2.0)
-        self._raw = np.zeros(2 * self._kernel.size)  # double buffer: the window is contiguous
+        # rows: signal, vertical; a double buffer, so that the window is contiguous
+        self._raw = np.zeros((2, 2 * self._kernel.size))
+        self._previous_force: Vector | None = None
         self._count = 0
         self._tilt: deque[float] = deque(maxlen=self._half + self._wing + 1)
         size = self._valley_cells + 2 * self._wing + 1
         self._band: deque[float] = deque(maxlen=size)
+        self._vertical: deque[float] = deque(maxlen=size)
         self._level = 0.0
         self._period_s = 0.6
         self._last_peak_ns: int | None = None
@@ -248,16 +289,29 @@ class StepDetector:
         self._tilt.append(_angle(self._fast.add(force), self._slow.add(force)))
         self._force.append(force)
         vertical = (force[0] * g[0] + force[1] * g[1] + force[2] * g[2]) / norm - norm
+        signal, late_ns = vertical, (self._half + self._wing) * CELL_NS
+        if self.config.signal == "impact":
+            signal = self._jerk(force)
+            late_ns += CELL_NS // 2  # of the difference of two cells
         size = self._kernel.size
         slot = self._count % size
-        self._raw[slot] = self._raw[slot + size] = vertical
+        self._raw[0, slot] = self._raw[0, slot + size] = signal
+        self._raw[1, slot] = self._raw[1, slot + size] = vertical
         self._count += 1
         if self._count < size:
             return []
-        window = self._raw[slot + 1 : slot + 1 + size]
-        self._band.append(float(self._kernel @ window))
+        band = self._raw[:, slot + 1 : slot + 1 + size] @ self._kernel
+        self._band.append(float(band[0]))
+        self._vertical.append(float(band[1]))
         self._level *= self._decay
-        return self._peak(centre_ns - (self._half + self._wing) * CELL_NS)
+        return self._peak(centre_ns - late_ns)
+
+    def _jerk(self, force: Vector) -> float:
+        """Norm of the change of the specific force from one cell to the next [m/s^3]."""
+        last = self._previous_force if self._previous_force is not None else force
+        self._previous_force = force
+        x, y, z = force[0] - last[0], force[1] - last[1], force[2] - last[2]
+        return math.sqrt(x * x + y * y + z * z) / CELL_S
 
     def _peak(self, stamp_ns: int) -> list[Step]:
         """Judge the band-passed cell at ``stamp_ns``, which now has both its wings."""
@@ -271,8 +325,9 @@ class StepDetector:
         since = math.inf
         if self._last_peak_ns is not None:
             since = (stamp_ns - self._last_peak_ns) * 1e-9
-        prominence = self._prominence(since)
-        floor = max(cfg.min_prominence_mps2, cfg.prominence_fraction * self._level)
+        recent = self._since_last_peak(since)
+        prominence = value - min(self._band[i] for i in recent)
+        floor = max(cfg.min_prominence, cfg.prominence_fraction * self._level)
         if (
             since < max(cfg.min_interval_s, cfg.min_interval_fraction * self._period_s)
             or prominence <= floor
@@ -285,32 +340,36 @@ class StepDetector:
         self._last_peak_ns = stamp_ns
         if self._tilt[0] > cfg.max_tilt_change_rad:
             return []
-        return self._confirm(stamp_ns, prominence)
+        bounce = [self._vertical[i] for i in recent]
+        lowest = min(range(len(bounce)), key=bounce.__getitem__)
+        return self._confirm(stamp_ns, max(bounce[lowest:]) - bounce[lowest])
 
-    def _prominence(self, since_s: float) -> float:
-        """Height of the judged cell over the lowest since the last peak, at most 0.8 s back."""
-        band = list(self._band)[: len(self._band) - self._wing]
+    def _since_last_peak(self, since_s: float) -> range:
+        """Cells from the last peak, at most 0.8 s back, to the judged one."""
+        judged = len(self._band) - 1 - self._wing
         back = min(self._valley_cells, round(min(since_s, 60.0) / CELL_S))
-        return band[-1] - min(band[max(len(band) - 1 - back, 0) :])
+        return range(max(judged - back, 0), judged + 1)
 
-    def _confirm(self, peak_ns: int, prominence: float) -> list[Step]:
+    def _confirm(self, peak_ns: int, bounce_mps2: float) -> list[Step]:
         limit_ns = round(self.config.max_interval_s * 1e9)
         previous = self._pending[-1][0] if self._pending else self._previous_peak
         if previous is None or peak_ns - previous > limit_ns:
             self._pending, self._in_bout, self._end_ns = [], False, None
-        self._pending.append((peak_ns, prominence))
+        self._pending.append((peak_ns, bounce_mps2))
         self._previous_peak = peak_ns
         if not self._in_bout and len(self._pending) < self.config.bout_steps:
             return []
         self._in_bout = True
-        steps = [self._step(t, p) for t, p in self._pending]
+        steps = [self._step(t, b) for t, b in self._pending]
         self._pending = []
         return steps
 
-    def _step(self, peak_ns: int, prominence: float) -> Step:
+    def _step(self, peak_ns: int, bounce_mps2: float) -> Step:
         end_ns = peak_ns + round(self.config.contact_lag_s * 1e9)
         start_ns = self._end_ns
         if start_ns is None:
             start_ns = end_ns - round(self._period_s * 1e9)
         self._end_ns = end_ns
-        return Step(start_ns, end_ns, prominence)
+        cadence_hz = min(max(1e9 / (end_ns - start_ns), _SLOWEST_HZ), _FASTEST_HZ)
+        gain = amplitude_response(self._kernel, cadence_hz)
+        return Step(start_ns, end_ns, bounce_mps2 / gain)

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from netpos.inertial.pdr import (
-    PdrConfig,
     PedestrianDeadReckoning,
     StepEvent,
     StepVelocity,
     step_velocity,
 )
+from netpos.inertial.pdr_config import PdrConfig
 from netpos.inertial.steps import StepConfig
 from scipy.spatial.transform import Rotation
 
@@ -119,7 +119,7 @@ def test_straight_walk_with_magnetometer_heads_along_the_map(heading_deg: float)
     assert len(events) == round(20.0 * CADENCE_HZ)
     assert [e.count for e in events] == list(range(1, len(events) + 1))
     for e in events:
-        assert e.length_sd_m == pytest.approx(PdrConfig().length_sd_fraction * e.length_m)
+        assert e.length_sd_m == pytest.approx(math.hypot(0.1, 0.06) * e.length_m)
         assert e.heading_reference == "map"
         assert heading_error(e, heading_deg) < 0.04  # tilt error times tan(dip)
         assert e.cadence_hz == pytest.approx(CADENCE_HZ, rel=0.2)

@@ -5,16 +5,23 @@ The data are not redistributed: set NETPOS_DATA, or keep them in ``<repo>/../sha
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from netpos.evaluation.pedestrian import (
+    ContactScore,
+    PdrRun,
+    heading_and_tilt_error,
+    run_core,
+    score_contacts,
+    score_walk,
+)
 from netpos.inertial import loaders
-from netpos.inertial.pdr import PedestrianDeadReckoning, StepEvent
-from scipy.spatial.transform import Rotation
-
-TOLERANCE_NS = 150_000_000
+from netpos.inertial.pdr import PedestrianDeadReckoning
+from netpos.inertial.pdr_config import PdrConfig, Placement
 
 
 def data_file(relative: str) -> Path:
@@ -25,32 +32,9 @@ def data_file(relative: str) -> Path:
     return path
 
 
-def run(
-    imu: loaders.ImuRecord, magnetic: bool = True
-) -> tuple[PedestrianDeadReckoning, list[StepEvent], np.ndarray]:
-    """-> core, events, (n, 4) attitude w x y z after each sample."""
-    core, attitude = PedestrianDeadReckoning(), []
-    events: list[StepEvent] = []
-    zero = np.zeros_like(imu.specific_force)
-    rate = imu.angular_velocity if imu.angular_velocity is not None else zero
-    for i, stamp in enumerate(imu.stamp_ns.tolist()):
-        out = core.add_imu(stamp, rate[i], imu.specific_force[i])
-        if magnetic and imu.magnetic_field is not None:
-            core.add_magnetic_field(stamp, imu.magnetic_field[i])
-        events += out.steps if out else ()
-        attitude.append(core.attitude.quaternion)
-    return core, events, np.array(attitude)
-
-
-def match(found_ns: np.ndarray, contact_ns: np.ndarray) -> int:
-    """Reference contacts with an own detection within the tolerance (greedy, in time)."""
-    left, hits = sorted(found_ns.tolist()), 0
-    for contact in np.sort(contact_ns).tolist():
-        near = [f for f in left if abs(f - contact) <= TOLERANCE_NS]
-        if near:
-            left.remove(min(near, key=lambda f: abs(f - contact)))
-            hits += 1
-    return hits
+def run(imu: loaders.ImuRecord, placement: Placement = "carried", magnetic: bool = True) -> PdrRun:
+    core = PedestrianDeadReckoning(PdrConfig.of(placement))
+    return run_core(imu, core, with_magnetometer=magnetic)
 
 
 @pytest.mark.parametrize(
@@ -60,37 +44,26 @@ def match(found_ns: np.ndarray, contact_ns: np.ndarray) -> int:
 def test_phone_step_count_within_one_percent(name: str, total: int) -> None:
     record = loaders.load_steps_phone(data_file(f"steps_phone/{name}.csv"))
     assert record.true_step_ns.size == total
-    core, events, _ = run(record.imu)
-    assert abs(len(events) - total) <= 0.01 * total
-    assert core.counters == {}
+    got = run(record.imu)
+    assert abs(len(got.events) - total) <= 0.01 * total
+    assert got.core.counters == {}
+    assert got.core.conditions == ("no_magnetic_field",)
 
 
 @pytest.mark.parametrize(
-    ("name", "entries", "usable", "hits", "false"),
-    [("HA_001", 63, 63, 60, 6), ("HA_002", 54, 46, 32, 20)],
+    ("name", "entries", "expected"),
+    [("HA_001", 63, ContactScore(63, 61, 6, 0)), ("HA_002", 54, ContactScore(46, 40, 6, 7))],
 )
-def test_waist_initial_contacts(
-    name: str, entries: int, usable: int, hits: int, false: int
-) -> None:
-    """Slow, hard gait. HA_002 lists 8 NaN; most misses there have no vertical signature."""
+def test_waist_initial_contacts(name: str, entries: int, expected: ContactScore) -> None:
+    """Slow, hard gait, pinned. 95 % found is met on HA_001 only; see docs/results.md."""
     record = loaders.load_waist_imu(data_file(f"waist_imu/{name}/data.mat"))
     assert record.contact_entries == entries
-    _, events, _ = run(record.imu)
-    found = np.array([e.end_ns for e in events])
-    got = wrong = listed = 0
-    for bout in record.bouts:
-        first = bout.start_ns - TOLERANCE_NS
-        last = max(bout.initial_contact_ns[-1], bout.start_ns) + TOLERANCE_NS
-        inside = found[(found > first) & (found < last)]
-        n = match(inside, bout.initial_contact_ns)
-        got, wrong, listed = (
-            got + n,
-            wrong + inside.size - n,
-            listed + bout.initial_contact_ns.size,
-        )
-    assert listed == usable
-    assert got >= hits
-    assert wrong <= false
+    got = run(record.imu, "waist")
+    score = score_contacts([e.end_ns for e in got.events], record.bouts)
+    assert score.listed == expected.listed
+    assert score.found >= expected.found
+    assert score.false <= expected.false
+    assert score.unlisted <= sum(n for b in record.bouts for *_, n in b.untimed)
 
 
 def test_waist_mapping_is_flu_and_right_handed() -> None:
@@ -107,28 +80,19 @@ def test_waist_mapping_is_flu_and_right_handed() -> None:
         assert np.corrcoef(seen[100:-100, axis], model[100:-100, axis])[0, 1] > 0.5
 
 
-@pytest.mark.parametrize(("magnetic", "limit_m"), [(False, 1.5), (True, 2.3)])
-def test_phone_walk_shape_and_distance(magnetic: bool, limit_m: float) -> None:
-    """RMSE at 17 waypoints after the best rotation and translation (no scale)."""
+@pytest.mark.parametrize("magnetic", [False, True])
+def test_phone_walk_shape_and_distance(magnetic: bool) -> None:
+    """3 % of the path, for the distance and at every way-point (best turn and shift, no scale)."""
     record = loaders.load_pdr_phone(data_file("pdr_phone/site1_F1.txt"))
-    _, events, _ = run(record.imu, magnetic)
-    xy = np.cumsum(
-        [[e.length_m * np.cos(e.heading_rad), e.length_m * np.sin(e.heading_rad)] for e in events],
-        axis=0,
-    )
-    truth = record.waypoint_m
-    walked = float(np.sum(np.linalg.norm(np.diff(truth, axis=0), axis=1)))
-    assert walked == pytest.approx(122.9, abs=0.1)
-    assert sum(e.length_m for e in events) == pytest.approx(walked, rel=0.02)
-    assert len(events) == pytest.approx(179, rel=0.05)
-    ends = np.array([e.end_ns for e in events])
-    at = np.stack([np.interp(record.waypoint_ns, ends, xy[:, i]) for i in (0, 1)], axis=1)
-    a, b = at - at.mean(axis=0), truth - truth.mean(axis=0)
-    turn = np.angle(np.sum((b @ [1, 1j]) * np.conj(a @ [1, 1j])))
+    got = run(record.imu, magnetic=magnetic)
+    score = score_walk(got.events, record)
+    assert score.true_distance_m == pytest.approx(122.9, abs=0.1)
+    assert score.distance_m == pytest.approx(score.true_distance_m, rel=0.03)
+    assert score.steps == pytest.approx(179, rel=0.05)
+    assert score.max_m < 0.03 * score.true_distance_m
+    assert score.rmse_m < 0.02 * score.true_distance_m
     if magnetic:  # the axes of the loader and the field agree with the surveyed map
-        assert abs(float(np.degrees(turn))) < 15.0
-    aligned = (a @ [1, 1j]) * np.exp(1j * turn)
-    assert float(np.sqrt(np.mean(np.abs(aligned - b @ [1, 1j]) ** 2))) < limit_m
+        assert abs(math.degrees(score.turn_rad)) < 15.0
 
 
 @pytest.mark.parametrize(("magnetic", "limit_deg"), [(True, 2.0), (False, 8.0)])
@@ -136,14 +100,12 @@ def test_attitude_against_optical_reference(magnetic: bool, limit_deg: float) ->
     """Undisturbed slow rotation; without a magnetometer the start heading is 0 by accident."""
     name = "imu_mag_attitude/04_undisturbed_slow_rotation_with_breaks_A.mat"
     record = loaders.load_imu_mag_attitude(data_file(name))
-    _, _, attitude = run(record.imu, magnetic)
+    got = run(record.imu, magnetic=magnetic)
     use = record.moving & np.all(np.isfinite(record.quaternion), axis=1)
-    ours = Rotation.from_quat(attitude[use][:, [1, 2, 3, 0]])
-    error = (ours * Rotation.from_quat(record.quaternion[use][:, [1, 2, 3, 0]]).inv()).as_quat()
-    heading = 2 * np.degrees(np.arctan(error[:, 2] / error[:, 3]))
-    tilt = 2 * np.degrees(np.arcsin(np.minimum(np.hypot(error[:, 0], error[:, 1]), 1.0)))
-    assert float(np.sqrt(np.mean(heading**2))) < limit_deg
-    assert float(np.sqrt(np.mean(tilt**2))) < 1.5
+    errors = heading_and_tilt_error(got.attitude[use], record.quaternion[use])
+    heading, tilt = (float(np.degrees(np.sqrt(np.mean(e**2)))) for e in errors)
+    assert heading < limit_deg
+    assert tilt < 1.5
 
 
 def test_loaders_name_an_absent_path(tmp_path: Path) -> None:

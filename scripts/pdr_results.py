@@ -1,0 +1,123 @@
+"""Measure dead reckoning on the public recordings: python scripts/pdr_results.py [DATA_FOLDER]."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from netpos.evaluation.pedestrian import (
+    heading_and_tilt_error,
+    run_core,
+    score_contacts,
+    score_walk,
+)
+from netpos.inertial import loaders
+from netpos.inertial.length import LengthScale
+from netpos.inertial.pdr import PedestrianDeadReckoning
+from netpos.inertial.pdr_config import PdrConfig
+
+Row = tuple[str, str, str, str, bool]
+
+STEPS = ("user1_bag", "user1_frontpocket", "user2_hand", "user2_armband")
+ATTITUDE = "imu_mag_attitude/04_undisturbed_slow_rotation_with_breaks_A.mat"
+
+
+def carried(**values: object) -> PedestrianDeadReckoning:
+    return PedestrianDeadReckoning(PdrConfig.from_mapping(values))
+
+
+def step_rows(data: Path) -> Iterator[Row]:
+    for name in STEPS:
+        record = loaders.load_steps_phone(data / f"steps_phone/{name}.csv")
+        count, true = len(run_core(record.imu, carried()).events), record.true_step_ns.size
+        error = 100 * (count / true - 1)
+        yield f"{name}: steps", f"{count} of {true}", f"{error:+.2f} %", "1 %", abs(error) <= 1
+
+
+def contact_rows(data: Path) -> Iterator[Row]:
+    for name in ("HA_001", "HA_002"):
+        record = loaders.load_waist_imu(data / f"waist_imu/{name}/data.mat")
+        run = run_core(record.imu, carried(placement="waist"))
+        s = score_contacts([e.end_ns for e in run.events], record.bouts)
+        found, false = 100 * s.found / s.listed, 100 * s.false / (s.found + s.false)
+        text = f"{s.found} of {s.listed}"
+        yield f"{name}: contacts found", text, f"{found:.1f} %", ">= 95 %", found >= 95
+        text = f"{s.false}, and {s.unlisted} untimed"
+        yield f"{name}: false detections", text, f"{false:.1f} %", "<= 5 %", false <= 5
+
+
+def walk_rows(data: Path) -> Iterator[Row]:
+    record = loaders.load_pdr_phone(data / "pdr_phone/site1_F1.txt")
+    for with_mag in (True, False):
+        for model in ("weinberg", "frequency"):
+            core = carried(length_model=model)
+            run = run_core(record.imu, core, with_magnetometer=with_mag)
+            s = score_walk(run.events, record)
+            name = f"phone walk, {model}{'' if with_mag else ', no magnetometer'}"
+            ratio = 100 * (s.distance_m / s.true_distance_m - 1)
+            text = f"{s.distance_m:.1f} of {s.true_distance_m:.1f} m"
+            yield f"{name}: distance", text, f"{ratio:+.2f} %", "3 %", abs(ratio) <= 3
+            for what, value in (("RMS", s.rmse_m), ("largest", s.max_m)):
+                share = 100 * value / s.true_distance_m
+                text = f"{value:.2f} m"
+                yield f"{name}: way-points, {what}", text, f"{share:.2f} %", "3 %", share <= 3
+    yield from calibrated_rows(record)
+
+
+def calibrated_rows(record: loaders.WaypointRecord) -> Iterator[Row]:
+    """The scale calibrated on one half of the walk, scored on the other."""
+    legs = np.hypot(*np.diff(record.waypoint_m, axis=0).T)
+    middle = int(np.searchsorted(np.cumsum(legs), legs.sum() / 2))
+    for model in ("weinberg", "frequency"):
+        events = run_core(record.imu, carried(length_model=model)).events
+        ends = np.array([e.end_ns for e in events])
+        way = np.interp(record.waypoint_ns, ends, np.cumsum([e.length_m for e in events]))
+        ours = np.diff(way)
+        halves = (slice(0, middle + 1), slice(middle + 1, None))
+        for learn, test in (halves, halves[::-1]):
+            scale = LengthScale(1.0, PdrConfig().length_scale_sd)
+            for modelled, true in zip(ours[learn], legs[learn], strict=True):
+                scale.observe(float(modelled), float(true), 1.0)
+            distance, true = scale.mean * ours[test].sum(), legs[test].sum()
+            ratio = 100 * (distance / true - 1)
+            half = "second" if test is halves[1] else "first"
+            name = f"phone walk, {model}, {half} half after the other: distance"
+            yield (
+                name,
+                f"{distance:.1f} of {true:.1f} m",
+                f"{ratio:+.2f} %",
+                "3 %",
+                abs(ratio) <= 3,
+            )
+
+
+def attitude_rows(data: Path) -> Iterator[Row]:
+    record = loaders.load_imu_mag_attitude(data / ATTITUDE)
+    for with_mag in (True, False):
+        run = run_core(record.imu, carried(), with_magnetometer=with_mag)
+        use = record.moving & np.isfinite(record.quaternion).all(axis=1)
+        errors = heading_and_tilt_error(run.attitude[use], record.quaternion[use])
+        for what, error in zip(("heading", "tilt"), errors, strict=True):
+            rms = float(np.degrees(np.sqrt(np.mean(error**2))))
+            name = f"attitude{'' if with_mag else ', gyro only'}: {what}, RMS"
+            yield name, f"{rms:.2f} deg", "", "3 deg" if with_mag else "", rms <= 3 or not with_mag
+
+
+def main() -> None:
+    """Print the table; exit 1 where a recording is absent."""
+    default = Path(__file__).resolve().parents[1].parent / "shared" / "data"
+    data = Path(sys.argv[1] if len(sys.argv) > 1 else os.environ.get("NETPOS_DATA", default))
+    print("| what | measured | error | aim | met |\n|---|---|---|---|---|")
+    try:
+        for rows in (step_rows, contact_rows, walk_rows, attitude_rows):
+            for name, text, error, aim, met in rows(data):
+                print(f"| {name} | {text} | {error} | {aim} | {'yes' if met else '**no**'} |")
+    except FileNotFoundError as error:
+        sys.exit(f"netpos: {error}")
+
+
+if __name__ == "__main__":
+    main()
