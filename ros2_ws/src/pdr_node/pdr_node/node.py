@@ -24,7 +24,6 @@ class PdrNode(Node):
         parameters = declare_parameters(self)
         self._vue_id = vue = parameters.vue_id
         self._core = PedestrianDeadReckoning(parameters.config)
-        self._counted: dict[str, int] = {}
         self._step_pub = self.create_publisher(Step, topics.of_vue(vue, topics.STEP), STREAM)
         self._velocity_pub = self.create_publisher(
             TwistWithCovarianceStamped, topics.of_vue(vue, topics.STEP_VELOCITY), STREAM
@@ -33,11 +32,12 @@ class PdrNode(Node):
         self.create_subscription(
             MagneticField, topics.of_vue(vue, topics.MAG), self._on_magnetic_field, BACKLOG
         )
-        self.create_timer(2.0, self._report_refusals)
 
     def _on_imu(self, msg: Any) -> None:
         imu = CODEC.imu_from_msg(msg)
         output = self._core.add_imu(imu.stamp_ns, imu.angular_velocity, imu.specific_force)
+        for notice in self._core.take_notices():
+            self.get_logger().warning(notice)
         if output is None:
             return
         for event in output.steps:
@@ -49,13 +49,6 @@ class PdrNode(Node):
     def _on_magnetic_field(self, msg: Any) -> None:
         sample = CODEC.magnetic_field_from_msg(msg)
         self._core.add_magnetic_field(sample.stamp_ns, sample.magnetic_field)
-
-    def _report_refusals(self) -> None:
-        counters = self._core.counters
-        if counters != self._counted:
-            text = ", ".join(f"{reason} {n}" for reason, n in sorted(counters.items()))
-            self.get_logger().warning(f"IMU samples refused or restarts so far: {text}")
-            self._counted = dict(counters)
 
 
 def main() -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
-from netpos.inertial.pdr import PdrConfig
+from netpos.inertial.pdr_config import PdrConfig
 from netpos.messages.topics import is_vue_id
+from netpos.scenario import load_scenario
 from netpos_node import declare
 from rclpy.node import Node
 
@@ -19,11 +22,31 @@ class PdrParameters:
 
 
 def declare_parameters(node: Node) -> PdrParameters:
-    """Declare and read all parameters; every number of ``PdrConfig`` is one, under its name."""
-    plain = PdrConfig()
-    numbers = [e.name for e in fields(PdrConfig) if isinstance(getattr(plain, e.name), float)]
-    values = {name: declare(node, name, getattr(plain, name), "see PdrConfig") for name in numbers}
+    """Declare and read all parameters; every entry of ``PdrConfig`` is one, under its name (with
+    a dot inside ``attitude`` and ``steps``).
+
+    A scenario gives the defaults of its device, explicit values win.
+    """
     vue_id = declare(node, "vue", "vue_1", "device whose imu and mag are read")
     if not is_vue_id(vue_id):
         raise ValueError(f"vue: {vue_id!r} is no device name; use letters, digits and _")
-    return PdrParameters(vue_id=vue_id, config=PdrConfig(**values))
+    text = "scenario (name or YAML) whose device gives the defaults"
+    defaults = _of_device(declare(node, "scenario", "", text), vue_id)
+    text = "carried (anyhow) or waist (worn at the lower back): chooses the other defaults"
+    placement = declare(node, "placement", defaults.get("placement", "carried"), text)
+    base = PdrConfig.from_mapping({**defaults, "placement": placement}).flat()
+    values = {
+        name: declare(node, name, default, "see PdrConfig") for name, default in base.items()
+    }
+    return PdrParameters(
+        vue_id=vue_id, config=PdrConfig.from_mapping({"placement": placement, **values})
+    )
+
+
+def _of_device(scenario: str, vue_id: str) -> Mapping[str, Any]:
+    if not scenario:
+        return {}
+    devices = dict(load_scenario(scenario).each_device)
+    if vue_id not in devices:
+        raise ValueError(f"vue: scenario {scenario} has {', '.join(devices)}, not {vue_id}")
+    return devices[vue_id].dead_reckoning

@@ -7,10 +7,15 @@ The middle of the body follows the route; the waist moves about it with the phas
     e    step rate over cadence: 0 at rest, 1 in steady walking (smootherstep over one step, so
          that position, velocity and acceleration are continuous)
     a    = 2 pi (u - 1/2 - d),  b = a / 2 (strides: every other step is a left one)
-    forward   e surge/2 sin a,        left      e sway/2 sin b
-    up       -e bounce/2 (cos a + h cos 2a)
-    yaw       mean direction of the next and last half step of the way + e yaw_swing cos b
-    pitch     lean + e pitch_swing cos a,    roll   e roll_swing sin b                    (G1)
+    forward   e^2 surge/2 sin a,        left      e^2 sway/2 sin b
+    up       -e^2 bounce/2 (cos a + h cos 2a)
+    yaw       mean direction of the next and last half step of the way + e^2 yaw_swing cos b
+    pitch     lean + e^2 pitch_swing cos a,    roll   e^2 roll_swing sin b                (G1)
+
+After each contact the jolt of the heel runs through the body, up and half as much back: with the
+time t since the contact
+
+    impact / w^2 (1 - exp(-t / 0.01 s))^3 exp(-t / 0.06 s) sin(w t),    w = 2 pi 12 Hz       (G2)
 
 Foot contacts are at u = 1/2, 3/2, ... n - 1/2, when the body is midway between the feet; the
 waist is lowest and fastest ``LATE`` of a step after them (inverted pendulum: Zijlstra and Hof,
@@ -39,6 +44,8 @@ Array = npt.NDArray[np.float64]
 
 LATE = 0.08  # of a step: from foot contact to the lowest point of the waist
 SECOND_HARMONIC = 0.1  # h: sharp contacts, flat mid-stance
+_JOLT_RADPS = 2 * math.pi * 12
+_JOLT_RISE_S, _JOLT_DECAY_S = 0.01, 0.06
 _NO_TURN_RAD = 1e-9
 
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -55,6 +62,7 @@ class GaitModel:
     bounce_m: float = Field(default=0.04, ge=0)
     sway_m: float = Field(default=0.04, ge=0)
     surge_m: float = Field(default=0.02, ge=0)
+    impact_mps2: float = Field(default=4.0, ge=0)
     yaw_swing_deg: float = Field(default=4.0, ge=0, le=45)
     roll_swing_deg: float = Field(default=3.0, ge=0, le=45)
     pitch_swing_deg: float = Field(default=1.5, ge=0, le=45)
@@ -195,7 +203,7 @@ class Gait:
         b, db = a / 2 + np.pi * run.before, da / 2
 
         def swing(amplitude: float, wave: Array, slope: Array) -> tuple[Array, Array]:
-            return amplitude * e * wave, amplitude * (de * wave + e * slope)
+            return amplitude * e**2 * wave, amplitude * (2 * e * de * wave + e**2 * slope)
 
         h = SECOND_HARMONIC
         surge, d_surge = swing(m.surge_m / 2, np.sin(a), np.cos(a) * da)
@@ -205,6 +213,10 @@ class Gait:
             np.cos(a) + h * np.cos(2 * a),
             -(np.sin(a) + 2 * h * np.sin(2 * a)) * da,
         )
+        jolt, d_jolt = _jolt(t - run.start_s, run.n, 1.0 / m.cadence_hz)
+        up, d_up = up + m.impact_mps2 * jolt, d_up + m.impact_mps2 * d_jolt
+        surge = surge - m.impact_mps2 / 2 * jolt
+        d_surge = d_surge - m.impact_mps2 / 2 * d_jolt
         yaw, d_yaw = swing(math.radians(m.yaw_swing_deg), np.cos(b), -np.sin(b) * db)
         pitch, d_pitch = swing(math.radians(m.pitch_swing_deg), np.cos(a), -np.sin(a) * da)
         roll, d_roll = swing(math.radians(m.roll_swing_deg), np.sin(b), np.cos(b) * db)
@@ -319,6 +331,18 @@ def _progress(tau: Array, n: int, step_s: float) -> tuple[Array, Array, Array, A
     steady = np.clip(tau / step_s - 0.5, 0.5, None)
     u = np.where(near < 1, np.where(rising, done, n - done), steady)
     return u, e / step_s, e, de
+
+
+def _jolt(tau: Array, n: int, step_s: float) -> tuple[Array, Array]:
+    """Jolt of the last contact for an impact of 1 m/s^2 [m] and its rate, into a run (G2)."""
+    last = np.clip(np.floor(tau / step_s), 0, n)
+    t = np.where(last > 0, tau - last * step_s, 0.0)
+    rest = np.exp(-t / _JOLT_RISE_S)
+    rise, d_rise = (1 - rest) ** 3, 3 * (1 - rest) ** 2 * rest / _JOLT_RISE_S
+    decay = np.exp(-t / _JOLT_DECAY_S) / _JOLT_RADPS**2
+    wave, d_wave = np.sin(_JOLT_RADPS * t), _JOLT_RADPS * np.cos(_JOLT_RADPS * t)
+    rate = d_rise * decay * wave + rise * decay * (d_wave - wave / _JOLT_DECAY_S)
+    return rise * decay * wave, rate
 
 
 def _body_rate(

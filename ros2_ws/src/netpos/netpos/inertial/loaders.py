@@ -6,6 +6,7 @@ path. Stamps are int64 nanoseconds.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -43,8 +44,8 @@ class WalkingBout:
     """Reference walking bout.
 
     initial_contact_ns : (k,) sorted, without repeats
-    untimed : (start, end, count) of contacts the reference lists without a time: how many lie
-        between two timed ones
+    untimed : (start, end, count) of contacts without a time, between two timed ones: those the
+        reference lists as NaN, and one of the other foot where the same foot lands twice
     """
 
     start_ns: int
@@ -117,12 +118,17 @@ def waist_to_flu(array: Array) -> Array:
     return np.column_stack([array[:, 2], -array[:, 1], array[:, 0]])
 
 
-def _untimed(contacts: Array) -> tuple[tuple[int, int, int], ...]:
-    """(start, end, count) of each run of NaN between contacts [s] in order."""
-    timed = np.flatnonzero(np.isfinite(contacts))
-    ns = np.rint(contacts[timed] * 1e9).astype(np.int64).tolist()
-    gaps = zip(ns[:-1], ns[1:], np.diff(timed).tolist(), strict=True)
-    return tuple((start, end, step - 1) for start, end, step in gaps if step > 1)
+def _untimed(contacts: Array, feet: list[str]) -> tuple[tuple[int, int, int], ...]:
+    """(start, end, count) of untimed contacts between timed ones; contacts (k,) s, in order."""
+    slots = []
+    timed = np.flatnonzero(np.isfinite(contacts)).tolist()
+    for a, b in itertools.pairwise(timed):
+        count = b - a - 1
+        if (count % 2 == 0) == (feet[a] == feet[b]):
+            count += 1  # feet alternate
+        if count > 0:
+            slots.append((round(contacts[a] * 1e9), round(contacts[b] * 1e9), count))
+    return tuple(slots)
 
 
 def load_waist_imu(path: Path) -> WaistRecord:
@@ -146,7 +152,7 @@ def load_waist_imu(path: Path) -> WaistRecord:
             entries += contacts.size
             finite = np.unique(np.rint(contacts[np.isfinite(contacts)] * 1e9).astype(np.int64))
             start, end = round(bout["Start"] * 1e9), round(bout["End"] * 1e9)
-            untimed = _untimed(contacts)
+            untimed = _untimed(contacts, np.atleast_1d(bout["InitialContact_LeftRight"]).tolist())
             bouts.append(WalkingBout(start, end, float(bout["Length"]), finite, untimed))
     except (KeyError, TypeError, IndexError) as error:
         raise _malformed(path, repr(error)) from error

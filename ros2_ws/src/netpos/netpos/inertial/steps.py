@@ -10,7 +10,9 @@
       on all axes, even where a slow, unsteady gait hardly bounces.
 3. A zero-phase Gaussian smooths the impacts; a zero-phase difference of two, from 0.6 to 3 Hz,
    passes the bounce.
-4. A peak counts when its prominence exceeds a floor and a fraction of the running prominence.
+4. A peak counts when its prominence exceeds a floor and a fraction of the running prominence. An
+   impact must also be sharp: its frequency, told by the ratio of the second to the first
+   difference, 2 sin(pi f cell), is above ``min_impact_hz``; setting off and bending are slower.
 5. A device being turned in the hand is not walking: peaks with a fast tilt are refused.
 6. ``bout_steps`` peaks in a row start a bout; the first ones are then released together.
 
@@ -52,6 +54,7 @@ class StepConfig:
     prominence_fraction: float = 0.4
     prominence_memory_s: float = 4.0
     min_height_fraction: float = 0.1
+    min_impact_hz: float = 5.0
     min_interval_s: float = 0.3
     min_interval_fraction: float = 0.45
     max_interval_s: float = 1.5
@@ -73,6 +76,10 @@ class StepConfig:
                     raise ValueError(f"steps.{name} must be within +-0.3 s, got {value}")
             elif not 0 < value < math.inf:
                 raise ValueError(f"steps.{name} must be finite and > 0, got {value}")
+        if self.min_impact_hz >= 0.5 / CELL_S:
+            raise ValueError(
+                f"steps.min_impact_hz must be below {0.5 / CELL_S:g} Hz, got {self.min_impact_hz}"
+            )
         for name in ("prominence_fraction", "min_height_fraction", "min_interval_fraction"):
             if getattr(self, name) >= 1:
                 raise ValueError(f"steps.{name} must be below 1, got {getattr(self, name)}")
@@ -243,14 +250,16 @@ class StepDetector:
         self._cells = CellAverager()
         self._gravity = _Mean(cfg.gravity_memory_s)
         self._fast, self._slow = _Mean(0.5), _Mean(2.0)
-        # rows: signal, vertical; a double buffer, so that the window is contiguous
-        self._raw = np.zeros((2, 2 * self._kernel.size))
+        # rows: signal, vertical, sharpness; a double buffer, so that the window is contiguous
+        self._raw = np.zeros((3, 2 * self._kernel.size))
         self._previous_force: Vector | None = None
+        self._previous_step: Vector = (0.0, 0.0, 0.0)
         self._count = 0
         self._tilt: deque[float] = deque(maxlen=self._half + self._wing + 1)
         size = self._valley_cells + 2 * self._wing + 1
         self._band: deque[float] = deque(maxlen=size)
         self._vertical: deque[float] = deque(maxlen=size)
+        self._sharp: deque[float] = deque(maxlen=size)
         self._level = 0.0
         self._period_s = 0.6
         self._last_peak_ns: int | None = None
@@ -289,29 +298,40 @@ class StepDetector:
         self._tilt.append(_angle(self._fast.add(force), self._slow.add(force)))
         self._force.append(force)
         vertical = (force[0] * g[0] + force[1] * g[1] + force[2] * g[2]) / norm - norm
-        signal, late_ns = vertical, (self._half + self._wing) * CELL_NS
+        signal, sharp, late_ns = vertical, 0.0, (self._half + self._wing) * CELL_NS
         if self.config.signal == "impact":
-            signal = self._jerk(force)
+            signal, sharp = self._jerk(force)
             late_ns += CELL_NS // 2  # of the difference of two cells
         size = self._kernel.size
         slot = self._count % size
-        self._raw[0, slot] = self._raw[0, slot + size] = signal
-        self._raw[1, slot] = self._raw[1, slot + size] = vertical
+        self._raw[:, slot] = self._raw[:, slot + size] = (signal, vertical, sharp)
         self._count += 1
         if self._count < size:
             return []
         band = self._raw[:, slot + 1 : slot + 1 + size] @ self._kernel
         self._band.append(float(band[0]))
         self._vertical.append(float(band[1]))
+        self._sharp.append(float(band[2]))
         self._level *= self._decay
         return self._peak(centre_ns - late_ns)
 
-    def _jerk(self, force: Vector) -> float:
-        """Norm of the change of the specific force from one cell to the next [m/s^3]."""
+    def _jerk(self, force: Vector) -> tuple[float, float]:
+        """Norms of the first and second difference of the specific force over a cell [m/s^3]."""
         last = self._previous_force if self._previous_force is not None else force
         self._previous_force = force
         x, y, z = force[0] - last[0], force[1] - last[1], force[2] - last[2]
-        return math.sqrt(x * x + y * y + z * z) / CELL_S
+        u, v, w = self._previous_step
+        self._previous_step = (x, y, z)
+        second = math.hypot(x - u, y - v, z - w)
+        return math.hypot(x, y, z) / CELL_S, second / CELL_S
+
+    def _impact(self, value: float) -> bool:
+        """Whether the judged peak of the jerk is a sharp one."""
+        if self.config.signal != "impact":
+            return True
+        w, near = self._wing, 3  # the second difference may peak a little beside the first
+        sharpest = max(list(self._sharp)[-1 - w - near : len(self._sharp) - w + near])
+        return sharpest >= 2 * math.sin(math.pi * self.config.min_impact_hz * CELL_S) * value
 
     def _peak(self, stamp_ns: int) -> list[Step]:
         """Judge the band-passed cell at ``stamp_ns``, which now has both its wings."""
@@ -332,6 +352,7 @@ class StepDetector:
             since < max(cfg.min_interval_s, cfg.min_interval_fraction * self._period_s)
             or prominence <= floor
             or value < cfg.min_height_fraction * prominence  # rebound after the last step
+            or not self._impact(value)
         ):
             return []
         steady = since < cfg.max_interval_s

@@ -21,6 +21,7 @@ STILL_BODY = {
     "bounce_m": 0.0,
     "sway_m": 0.0,
     "surge_m": 0.0,
+    "impact_mps2": 0.0,
     "yaw_swing_deg": 0.0,
     "roll_swing_deg": 0.0,
     "pitch_swing_deg": 0.0,
@@ -98,7 +99,9 @@ def test_strapdown_of_perfect_samples_returns_the_walk(gait: Gait) -> None:
 
 
 def test_amplitudes_are_those_of_the_model() -> None:
-    model = GaitModel(bounce_m=0.05, sway_m=0.06, surge_m=0.0, yaw_swing_deg=6, lean_deg=10)
+    model = GaitModel(
+        bounce_m=0.05, sway_m=0.06, surge_m=0.0, impact_mps2=0.0, yaw_swing_deg=6, lean_deg=10
+    )
     gait = walk([[0, 0], [0, 40]], model)
     steady = gait.body_at(np.linspace(2.0, gait.duration_s - 2.0, 5001))
     assert np.ptp(steady.position[:, 2]) == pytest.approx(0.05, rel=1e-3)
@@ -112,7 +115,7 @@ def test_amplitudes_are_those_of_the_model() -> None:
 
 
 def test_the_waist_is_lowest_just_after_each_contact_and_sways_to_alternate_sides() -> None:
-    gait = walk([[0, 0], [20, 0]], GaitModel())
+    gait = walk([[0, 0], [20, 0]], GaitModel(impact_mps2=0.0))
     assert gait.contact_s.size == 31
     np.testing.assert_allclose(gait.step_length_m, 20 / 31)
     for contact in gait.contact_s[1:-1]:
@@ -122,6 +125,22 @@ def test_the_waist_is_lowest_just_after_each_contact_and_sways_to_alternate_side
     middle = gait.contact_s[:-1] + (0.5 + 0.08) / 1.57
     side = np.sign(gait.body_at(middle).position[1:-1, 1])
     assert (side[1:] == -side[:-1]).all()
+
+
+def test_each_contact_jolts_the_waist_and_nothing_else_does() -> None:
+    """Against a walker without impacts: a burst of the stated size within 50 ms, over in 0.4 s."""
+    soft, hard = (walk([[0, 0], [10, 0]], GaitModel(impact_mps2=i)) for i in (0.0, 4.0))
+    a, b = (simulate_imu(PERFECT, g, 0, 1, "v") for g in (soft, hard))
+    jolt = np.linalg.norm(b.specific_force - a.specific_force, axis=1)
+    t = b.stamp_ns * 1e-9
+    since = t[:, None] - hard.contact_s
+    since = np.where(since > 0, since, np.inf).min(axis=1)
+    assert jolt[t < hard.contact_s[0]].max() < 1e-9
+    assert jolt[since > 0.4].max() < 0.02
+    for contact in hard.contact_s:
+        burst = (t > contact) & (t < contact + 0.3)
+        assert 2.0 < jolt[burst].max() < 5.0
+        assert t[burst][np.argmax(jolt[burst])] - contact < 0.07
 
 
 def test_a_stiff_walker_is_a_vehicle() -> None:
