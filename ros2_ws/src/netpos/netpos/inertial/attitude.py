@@ -4,9 +4,13 @@ R. Mahony, T. Hamel, J.-M. Pflimlin, "Nonlinear complementary filters on the spe
 group", IEEE Trans. Automatic Control 53(5), 2008, eqs. 47-48 (passive form with bias), with two
 changes usual in walking: the accelerometer is down-weighted when it does not measure 1 g, and
 the magnetometer corrects heading only, so that a disturbed field cannot tilt the estimate.
+A field whose norm, dip or heading contradicts what came before is not used: iron beside the way
+may turn the horizontal field by tens of degrees where norm and dip hardly change.
 
     q' = q * (0, w - b + kp e) / 2,   b' = -ki e,   e = f/|f| x R' z            (A1)
     heading error  d = (pi/2 - declination) - atan2(m_north, m_east)            (A2)
+    used while |d| <= 3 sqrt(s^2 + s_m^2); s grows by ``gyro_heading_drift_radps`` t and falls
+    with the gain to s_m / 2 as samples are used                                (A3)
 
 Body is FLU, map is ENU, quaternions are (w, x, y, z) body -> map.
 """
@@ -47,6 +51,9 @@ class AttitudeConfig:
     field_tolerance: float = 0.25
     dip_tolerance_rad: float = 0.26
     field_memory_s: float = 15.0
+    magnetic_heading_sd_rad: float = 0.09
+    first_heading_sd_rad: float = 0.5
+    gyro_heading_drift_radps: float = 0.005
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
@@ -151,6 +158,8 @@ class AttitudeFilter:
             self._reference: HeadingReference = "relative"
             self._field: tuple[float, float] | None = None  # norm [T], dip [rad]
             self._last_field_ns: int | None = None
+            self._heading_sd = self._cfg.first_heading_sd_rad
+            self._heading_used_ns = 0
         self._restart_heading = kept
         self.alignment_failed = False  # the last window had no plausible gravity
         self._q = None
@@ -240,8 +249,15 @@ class AttitudeFilter:
         error = wrap_angle(math.pi / 2 - self._cfg.declination_rad - math.atan2(my, mx))
         gain = 1.0
         if self._reference == "map" and previous_ns is not None:
+            if self._contradicts(stamp_ns, error):
+                return "disturbed"
             dt = min(max((stamp_ns - previous_ns) * 1e-9, 0.0), 0.1)
             gain = min(self._cfg.heading_gain_per_s * dt, 1.0)
+            floor = 0.5 * self._cfg.magnetic_heading_sd_rad
+            self._heading_sd += gain * (floor - self._heading_sd)
+        else:
+            self._heading_sd = self._cfg.first_heading_sd_rad
+        self._heading_used_ns = stamp_ns
         self._reference = "map"
         self.turn(gain * error)
         return "used"
@@ -276,6 +292,12 @@ class AttitudeFilter:
             abs(norm - norm0) > self._cfg.field_tolerance * norm0
             or abs(dip - dip0) > self._cfg.dip_tolerance_rad
         )
+
+    def _contradicts(self, stamp_ns: int, error_rad: float) -> bool:
+        """Whether a magnetic heading is too far from the one kept by the gyro (A3)."""
+        since_s = max(stamp_ns - self._heading_used_ns, 0) * 1e-9
+        kept_sd = self._heading_sd + self._cfg.gyro_heading_drift_radps * since_s
+        return abs(error_rad) > 3.0 * math.hypot(kept_sd, self._cfg.magnetic_heading_sd_rad)
 
     def _align(self, stamp_ns: int, rate: Vector, force: Vector) -> bool:
         if self._start_ns is None:

@@ -144,7 +144,8 @@ class Gait:
         runs: Sequence[_Run],
         stands: Sequence[_Stand],
     ) -> None:
-        self._model, self._legs, self._runs, self._stands = model, legs, runs, stands
+        self.model = model
+        self._legs, self._runs, self._stands = legs, runs, stands
         self.duration_s = max([r.end_s for r in runs] + [s.end_s for s in stands])
         t = 1.0 / model.cadence_hz
         self.contact_s: Array = np.array(
@@ -183,7 +184,7 @@ class Gait:
         share = (t - stand.start_s) / span
         eased, rate, _ = _smootherstep(share)
         zero = np.zeros_like(t)
-        lean = math.radians(self._model.lean_deg) + zero
+        lean = math.radians(self.model.lean_deg) + zero
         yaw, yaw_rate = stand.yaw + stand.turn * eased, stand.turn * rate / span
         body_rate = _body_rate(lean, zero, yaw_rate, zero, zero)
         still = np.zeros((len(t), 4))
@@ -191,7 +192,7 @@ class Gait:
         return np.hstack([place, still, np.column_stack([yaw, lean, zero]), body_rate])
 
     def _walking(self, run: _Run, t: Array) -> Array:
-        m = self._model
+        m = self.model
         u, du, e, de = _progress(t - run.start_s, run.n, 1.0 / m.cadence_hz)
         leg, way = self._legs[run.leg], run.way_m + run.length_m * u
         path = leg.way.at(np.clip(way, 0.0, leg.length_m))

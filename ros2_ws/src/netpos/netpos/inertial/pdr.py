@@ -9,8 +9,9 @@ completed by the off-diagonal term they leave out):
     C = J diag(sd_L^2, sd_psi^2) J^T                                            (petukhov:7-8)
 
 Without a step the pseudo-measurement is zero velocity; it is stated tightly only when the
-accelerometer and gyro are quiet. In between (start of a walk, handling, a single step) the
-velocity is unknown: zero with ``undecided_speed_sd_mps`` and ``moving`` True.
+accelerometer and gyro are quiet, less so when the body turns on the spot. In between (start of a
+walk, handling, a single step) the velocity is unknown: zero with ``undecided_speed_sd_mps`` and
+``moving`` True.
 
 Time is the stamp of the samples; there is no clock. Bad data never raises: it is counted in
 ``PedestrianDeadReckoning.counters`` under its reason, and what lasts is told once
@@ -30,7 +31,7 @@ import numpy.typing as npt
 from netpos.inertial.attitude import AttitudeFilter, HeadingReference, wrap_angle
 from netpos.inertial.length import LengthScale, frequency_length, weinberg_length
 from netpos.inertial.pdr_config import PdrConfig
-from netpos.inertial.steps import Step, StepDetector
+from netpos.inertial.steps import LONGEST_STEP, Step, StepDetector
 from netpos.inertial.watch import Conditions, StreamWatch
 
 Array = npt.NDArray[np.float64]
@@ -384,13 +385,17 @@ class PedestrianDeadReckoning:
         cfg, reference = self.config, self._attitude.reference
         if not (self._watch.rate_ok and self._mounted):
             return self._isotropic(stamp_ns, cfg.undecided_speed_sd_mps, True)
-        if self._detector.still and self._turn_rate < cfg.still_rate_radps:
-            return self._isotropic(stamp_ns, cfg.still_speed_sd_mps, False)
+        if self._detector.still:
+            turning = self._turn_rate >= cfg.still_rate_radps
+            sd = cfg.turning_speed_sd_mps if turning else cfg.still_speed_sd_mps
+            return self._isotropic(stamp_ns, sd, turning)
         step = self._step
-        horizon_s = cfg.steps.max_interval_s + cfg.steps.delay_s
-        if step is None or (stamp_ns - step.end_ns) * 1e-9 > horizon_s:
+        if step is None:
             return self._isotropic(stamp_ns, cfg.undecided_speed_sd_mps, True)
         duration_s = (step.end_ns - step.start_ns) * 1e-9
+        overdue_s = LONGEST_STEP * duration_s + cfg.steps.delay_s  # of the next step's detection
+        if (stamp_ns - step.end_ns) * 1e-9 > overdue_s:
+            return self._isotropic(stamp_ns, cfg.undecided_speed_sd_mps, True)
         velocity, cov = step_velocity(
             step.length_m, duration_s, step.heading_rad, step.length_sd_m, step.heading_sd_rad
         )

@@ -22,6 +22,7 @@ _POSITIVE = (
     "step_sd_fraction",
     "heading_sd_rad",
     "still_speed_sd_mps",
+    "turning_speed_sd_mps",
     "undecided_speed_sd_mps",
     "still_rate_radps",
     "max_gap_s",
@@ -52,7 +53,9 @@ class PdrConfig:
     max_mount_tilt_rad : a mean specific force further from the body z axis than this means
         swapped axes: the heading is then unknown; pi for a device carried anyhow
     field_patience_s : how long the heading may do without magnetic samples before it is said
-    speed_drift_mps2 : growth of the velocity sd with the age of the last step
+    turning_speed_sd_mps : of the zero velocity of a body that only turns
+    speed_drift_mps2 : growth of the velocity sd with the age of the last step: people stop within
+        a step, and the next step is known only ``steps.delay_s`` after it
     gap_rate_sd_radps : how fast the device may turn unseen, for the heading sd after a gap
     clock_reset_s : a stamp this far in the past restarts the core instead of being refused
     """
@@ -70,9 +73,10 @@ class PdrConfig:
     max_mount_tilt_rad: float = math.pi
     field_patience_s: float = 3.0
     still_speed_sd_mps: float = 0.05
+    turning_speed_sd_mps: float = 0.3
     undecided_speed_sd_mps: float = 1.0
     still_rate_radps: float = 0.2
-    speed_drift_mps2: float = 0.2
+    speed_drift_mps2: float = 0.5
     max_gap_s: float = 0.25
     gap_rate_sd_radps: float = 0.5
     min_rate_hz: float = 25.0

@@ -34,6 +34,7 @@ Vector = tuple[float, float, float]
 
 CELL_NS = 20_000_000
 CELL_S = CELL_NS * 1e-9
+LONGEST_STEP = 1.5  # typical periods; what is longer began with standing
 _SLOWEST_HZ, _FASTEST_HZ = 0.8, 2.5  # cadences whose attenuation is made good
 
 
@@ -112,6 +113,7 @@ class StepConfig:
             contact_lag_s=-0.085,
             max_tilt_change_rad=math.pi,  # a person who bends down may well be walking
             bout_steps=2,
+            still_window_s=0.4,
         )
 
     @property
@@ -125,7 +127,7 @@ class Step:
     """One detected step.
 
     start_ns, end_ns : initial contacts that bound it; ``start_ns`` is the previous step's
-        ``end_ns`` inside a bout, else one typical period earlier
+        ``end_ns``; at the start of a bout and after a stand, one typical period earlier
     bounce_mps2 : range of the vertical acceleration over the step, with the attenuation of the
         band-pass at the step's cadence made good
     """
@@ -264,7 +266,7 @@ class StepDetector:
         self._period_s = 0.6
         self._last_peak_ns: int | None = None
         self._end_ns: int | None = None
-        self._pending: list[tuple[int, float]] = []
+        self._pending: list[tuple[int, float, float]] = []
         self._previous_peak: int | None = None
         self._in_bout = False
         self._force: deque[Vector] = deque(maxlen=self._still_cells)
@@ -355,6 +357,7 @@ class StepDetector:
             or not self._impact(value)
         ):
             return []
+        period_s = self._period_s
         steady = since < cfg.max_interval_s
         self._period_s = 0.7 * self._period_s + 0.3 * since if steady else 0.6
         self._level = 0.6 * self._level + 0.4 * prominence if self._level > 0 else prominence
@@ -363,7 +366,7 @@ class StepDetector:
             return []
         bounce = [self._vertical[i] for i in recent]
         lowest = min(range(len(bounce)), key=bounce.__getitem__)
-        return self._confirm(stamp_ns, max(bounce[lowest:]) - bounce[lowest])
+        return self._confirm((stamp_ns, max(bounce[lowest:]) - bounce[lowest], period_s))
 
     def _since_last_peak(self, since_s: float) -> range:
         """Cells from the last peak, at most 0.8 s back, to the judged one."""
@@ -371,25 +374,26 @@ class StepDetector:
         back = min(self._valley_cells, round(min(since_s, 60.0) / CELL_S))
         return range(max(judged - back, 0), judged + 1)
 
-    def _confirm(self, peak_ns: int, bounce_mps2: float) -> list[Step]:
+    def _confirm(self, peak: tuple[int, float, float]) -> list[Step]:
+        """Steps of a peak: its stamp, bounce [m/s^2] and the typical period before it [s]."""
         limit_ns = round(self.config.max_interval_s * 1e9)
         previous = self._pending[-1][0] if self._pending else self._previous_peak
-        if previous is None or peak_ns - previous > limit_ns:
+        if previous is None or peak[0] - previous > limit_ns:
             self._pending, self._in_bout, self._end_ns = [], False, None
-        self._pending.append((peak_ns, bounce_mps2))
-        self._previous_peak = peak_ns
+        self._pending.append(peak)
+        self._previous_peak = peak[0]
         if not self._in_bout and len(self._pending) < self.config.bout_steps:
             return []
         self._in_bout = True
-        steps = [self._step(t, b) for t, b in self._pending]
+        steps = [self._step(*pending) for pending in self._pending]
         self._pending = []
         return steps
 
-    def _step(self, peak_ns: int, bounce_mps2: float) -> Step:
+    def _step(self, peak_ns: int, bounce_mps2: float, period_s: float) -> Step:
         end_ns = peak_ns + round(self.config.contact_lag_s * 1e9)
         start_ns = self._end_ns
-        if start_ns is None:
-            start_ns = end_ns - round(self._period_s * 1e9)
+        if start_ns is None or end_ns - start_ns > LONGEST_STEP * period_s * 1e9:
+            start_ns = end_ns - round(period_s * 1e9)
         self._end_ns = end_ns
         cadence_hz = min(max(1e9 / (end_ns - start_ns), _SLOWEST_HZ), _FASTEST_HZ)
         gain = amplitude_response(self._kernel, cadence_hz)

@@ -173,6 +173,39 @@ def test_dip_gate_at_its_boundary(turn_rad: float, result: str) -> None:
     assert f.add_magnetic_field(last + DT_NS, tup(dipped)) == result
 
 
+@pytest.mark.parametrize(("factor", "result"), [(0.99, "used"), (1.01, "disturbed")])
+@pytest.mark.parametrize("silent_s", [0.01, 20.0])
+def test_heading_gate_at_its_boundary(factor: float, result: str, silent_s: float) -> None:
+    """3 sd of the kept heading, which widens with time, and of the field; norm and dip agree."""
+    config = AttitudeConfig(
+        heading_gain_per_s=0.0, first_heading_sd_rad=0.1, magnetic_heading_sd_rad=0.05
+    )
+    f = AttitudeFilter(config)
+    last = rest(f, Rotation.identity())
+    f.add_magnetic_field(last, tup(FIELD_MAP))
+    limit = 3 * math.hypot(0.1 + 0.005 * silent_s, 0.05)
+    turned = Rotation.from_euler("z", factor * limit).apply(FIELD_MAP)
+    assert f.add_magnetic_field(last + round(silent_s * 1e9), tup(turned)) == result
+
+
+def test_heading_trust_grows_with_use_and_a_lasting_change_is_taken_in_the_end() -> None:
+    """sd falls from 0.5 to 0.045 rad: a turn of 0.6 is used at first and refused after 20 s; the
+    gyro's drift opens the gate again after (0.6^2 / 9 - 0.09^2)^0.5 rad - 0.045 at 0.005 rad/s.
+    """
+    f = AttitudeFilter(AttitudeConfig())
+    last = rest(f, Rotation.identity())
+    f.add_magnetic_field(last, tup(FIELD_MAP))
+    turned = tup(Rotation.from_euler("z", 0.6).apply(FIELD_MAP))
+    assert f.add_magnetic_field(last + DT_NS, turned) == "used"
+    for i in range(2, 2001):
+        f.add_magnetic_field(last + i * DT_NS, tup(FIELD_MAP))
+    end = last + 2000 * DT_NS
+    assert f.add_magnetic_field(end + DT_NS, turned) == "disturbed"
+    opens_s = (math.sqrt(0.6**2 / 9 - 0.09**2) - 0.045) / 0.005
+    assert f.add_magnetic_field(end + round((opens_s - 1.0) * 1e9), turned) == "disturbed"
+    assert f.add_magnetic_field(end + round((opens_s + 1.5) * 1e9), turned) == "used"
+
+
 def test_the_expected_field_follows_a_lasting_change() -> None:
     """norm0 relaxes to the new norm with ``field_memory_s``: a 20 % step is half learnt after
     0.69 memories, so 1.32 is then within 25 % of 1.1 although it never was of 1.

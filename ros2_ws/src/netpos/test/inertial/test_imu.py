@@ -91,11 +91,11 @@ def test_specific_force_at_rest_points_up_and_left_in_a_left_turn() -> None:
 
 
 def test_noise_and_biases_have_the_stated_size() -> None:
-    motion = follow([[0, 0], [300, 0]], 1.0)
+    motion = follow([[0, 0], [100, 0]], 1.0)
     model = ImuModel()
     clean = simulate_imu(PERFECT, motion, START_NS, 1, "v")
     constants = []
-    for seed in range(200):
+    for seed in range(80):
         noisy = simulate_imu(model, motion, START_NS, seed, "v")
         error = np.hstack(
             [
