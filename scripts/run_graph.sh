@@ -25,9 +25,17 @@ start_up netpos_record # first of all: what is published before a recorder is up
 start_trackers "$scenario" "$@"
 start rsu_sensor rsu_sensor rsu_sensor --ros-args -p scenario:="$scenario" -p seed:="$seed" -p subscribers:="$((1 + ${#trackers[@]}))"
 start_up rsu_sensor
+walkers=$(python "$NETPOS_ROOT/scripts/walkers.py" "$scenario") || give_up
+pdr_nodes=()
+for vue in $walkers; do # who walks is dead-reckoned
+  start "pdr_$vue" pdr_node pdr_node --ros-args -r __node:="pdr_$vue" -p vue:="$vue" -p scenario:="$scenario"
+  pdr_nodes+=("pdr_$vue")
+done
+[ "${#pdr_nodes[@]}" = 0 ] || start_up "${pdr_nodes[@]}"
 start vue_sim vue_sim vue_sim --ros-args -p scenario:="$scenario" -p seed:="$seed" -p rate:="$(LC_ALL=C printf '%.6f' "$rate")" -p subscribers:=2
 await vue_sim || give_up
 sleep 1 # the last messages are under way
+[ "${#pdr_nodes[@]}" = 0 ] || stop "${pdr_nodes[@]}"
 stop rsu_sensor
 stop_trackers
 sleep 0.5 # the tracker's last estimates, given out as it stopped

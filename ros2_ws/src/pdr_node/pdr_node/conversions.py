@@ -1,39 +1,20 @@
-"""Output of the dead-reckoning core to the values that are published."""
+"""Output of the dead-reckoning core to messages."""
 
 from __future__ import annotations
 
-from netpos.inertial.pdr import StepEvent, StepVelocity
-from netpos.messages.values import Step, Velocity
+from collections.abc import Iterator
+from typing import Any
+
+from netpos.inertial.pdr import PdrOutput
+from netpos.inertial.pdr_values import values_of
+from netpos.messages.values import Step
+from netpos_node import CODEC
 
 
-def frame_of(vue_id: str, heading_reference: str) -> str:
-    """``map`` where a magnetometer gives north, else a frame of the device's own start."""
-    return "map" if heading_reference == "map" else f"{vue_id}/pdr_start"
-
-
-def step_value(vue_id: str, event: StepEvent) -> Step:
-    """Step of a core event."""
-    return Step(
-        stamp_ns=event.stamp_ns,
-        vue_id=vue_id,
-        frame_id=frame_of(vue_id, event.heading_reference),
-        start_ns=event.start_ns,
-        end_ns=event.end_ns,
-        count=event.count,
-        length_m=event.length_m,
-        length_var=event.length_sd_m**2,
-        heading_rad=event.heading_rad,
-        heading_var=event.heading_sd_rad**2,
-        cadence_hz=event.cadence_hz,
-    )
-
-
-def velocity_value(vue_id: str, velocity: StepVelocity) -> Velocity:
-    """Velocity of a core step velocity."""
-    return Velocity(
-        stamp_ns=velocity.stamp_ns,
-        vue_id=vue_id,
-        frame_id=frame_of(vue_id, velocity.heading_reference),
-        velocity=velocity.velocity,
-        cov=velocity.covariance,
-    )
+def messages(vue_id: str, output: PdrOutput | None) -> Iterator[tuple[bool, Any]]:
+    """Each message of one core output, and whether it is a step."""
+    for value in values_of(vue_id, output):
+        if isinstance(value, Step):
+            yield True, CODEC.step_to_msg(value)
+        else:
+            yield False, CODEC.velocity_to_msg(value)

@@ -12,7 +12,7 @@ from netpos_node import BACKLOG, CODEC, STREAM, run
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, MagneticField
 
-from pdr_node.conversions import step_value, velocity_value
+from pdr_node.conversions import messages
 from pdr_node.parameters import declare_parameters
 
 
@@ -38,13 +38,8 @@ class PdrNode(Node):
         output = self._core.add_imu(imu.stamp_ns, imu.angular_velocity, imu.specific_force)
         for notice in self._core.take_notices():
             self.get_logger().warning(notice)
-        if output is None:
-            return
-        for event in output.steps:
-            self._step_pub.publish(CODEC.step_to_msg(step_value(self._vue_id, event)))
-        if output.velocity is not None:
-            velocity = velocity_value(self._vue_id, output.velocity)
-            self._velocity_pub.publish(CODEC.velocity_to_msg(velocity))
+        for is_step, message in messages(self._vue_id, output):
+            (self._step_pub if is_step else self._velocity_pub).publish(message)
 
     def _on_magnetic_field(self, msg: Any) -> None:
         sample = CODEC.magnetic_field_from_msg(msg)

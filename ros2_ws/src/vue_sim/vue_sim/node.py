@@ -7,7 +7,7 @@ from contextlib import suppress
 from threading import Thread
 from typing import Any
 
-from netpos.messages.topics import BEACON, CLOCK, INITIAL_POSE, split
+from netpos.messages.topics import BEACON, CLOCK, IMU, INITIAL_POSE, MAG, split
 from netpos.messages.values import InitialPose
 from netpos.scenario import Simulation
 from netpos.scenario.offline import timeline
@@ -21,6 +21,7 @@ from vue_sim.parameters import declare_parameters
 
 _CLOCK_DEPTH = 10
 _INPUTS = (BEACON, INITIAL_POSE)  # what others need from the first message on
+_STEPS_INPUTS = (IMU, MAG)  # what dead reckoning needs of who walks
 _POLL_S = 0.02
 _DELIVERY_S = 5
 
@@ -75,14 +76,20 @@ class VueSimNode(Node):
     def _wait_for_subscribers(self) -> None:
         """Until all beacons are heard and for a while nobody new has subscribed to anything."""
         settings = self._settings
-        inputs = {t: settings.subscribers for t in self._pubs if split(t)[1] in _INPUTS}
+        walkers = {vue for vue, device in settings.scenario.each_device if device.walks}
+        inputs = {
+            topic: settings.subscribers
+            for topic in self._pubs
+            if split(topic)[1] in _INPUTS
+            or (split(topic)[0] in walkers and split(topic)[1] in _STEPS_INPUTS)
+        }
         unheard = wait_until_heard(
             self._pubs, inputs, settings.wait_for_subscribers_s, settings.settle_s
         )
         if unheard:
             self.get_logger().warning(
                 f"{', '.join(unheard)}: fewer than {settings.subscribers} subscribers; are "
-                "rsu_sensor and ekf_tracker running? Starting anyway"
+                "rsu_sensor, ekf_tracker and, for who walks, pdr_node running? Starting anyway"
             )
 
 

@@ -9,8 +9,11 @@ from pathlib import Path
 import yaml
 
 from netpos.bags import BagWriter, codec
+from netpos.inertial.pdr import PedestrianDeadReckoning
+from netpos.inertial.pdr_config import PdrConfig
+from netpos.inertial.pdr_values import values_of
 from netpos.messages.topics import CLOCK
-from netpos.messages.values import Beacon
+from netpos.messages.values import Beacon, ImuSample, MagneticSample, Step, Velocity
 from netpos.scenario.schema import NS, Scenario
 from netpos.scenario.simulation import Simulation
 from netpos.scenario.topics import Value, to_message, topic_of
@@ -69,6 +72,7 @@ def timeline(
     last = tick
     if measured:
         yield from simulation.rsus
+    walkers = _Walkers(simulation.scenario)
     for event in simulation.events():
         while tick <= event.stamp_ns:
             yield tick
@@ -77,5 +81,28 @@ def timeline(
         yield event
         if measured and isinstance(event, Beacon):
             yield from simulation.measure(event)
+        if measured and isinstance(event, ImuSample | MagneticSample):
+            yield from walkers.reckon(event)
     if tick - step != last:
         yield last
+
+
+class _Walkers:
+    """Dead reckoning of everybody who walks, as the nodes do it."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._cores = {
+            vue: PedestrianDeadReckoning(PdrConfig.from_mapping(device.dead_reckoning))
+            for vue, device in scenario.each_device
+            if device.walks
+        }
+
+    def reckon(self, sample: ImuSample | MagneticSample) -> Iterator[Step | Velocity]:
+        core = self._cores.get(sample.vue_id)
+        if core is None:
+            return
+        if isinstance(sample, MagneticSample):
+            core.add_magnetic_field(sample.stamp_ns, sample.magnetic_field)
+            return
+        out = core.add_imu(sample.stamp_ns, sample.angular_velocity, sample.specific_force)
+        yield from values_of(sample.vue_id, out)

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from netpos.inertial.gait import GaitModel, walk
 from netpos.inertial.imu import ImuModel, MagnetometerModel, interval_ns
+from netpos.inertial.pdr_config import PdrConfig
 from netpos.radio.arrays import AntennaArray
 from netpos.radio.clocks import ClockModel, NetworkClockModel
 from netpos.radio.noise import generator
@@ -259,7 +260,9 @@ class Network(Section):
 class Device(Section):
     """One device, or ``count`` devices with the same settings and draws of their own.
 
-    It drives along its route at ``speed_mps``, or a person walks with it there (``gait``)."""
+    It drives along its route at ``speed_mps``, or a person walks with it there (``gait``).
+    ``pdr`` holds parameters of its dead reckoning (``PdrConfig``); with a gait it is worn at the
+    waist unless ``placement`` says otherwise."""
 
     count: int = Field(default=1, ge=1)
     route: Route
@@ -272,12 +275,27 @@ class Device(Section):
     clock: ClockModel = ClockModel()
     imu: ImuModel | None = None
     magnetometer: MagnetometerModel | None = None
+    pdr: dict[str, Any] = {}
     initial_pose_sd_m: Positive | None = None
 
     @property
     def beacon_interval_ns(self) -> int:
         """Beacon interval [integer ns]."""
         return round(self.beacon_interval_s * NS)
+
+    @property
+    def walks(self) -> bool:
+        """Whether a person carries the device and its IMU tells the steps."""
+        return self.gait is not None and self.imu is not None
+
+    @property
+    def dead_reckoning(self) -> dict[str, Any]:
+        """Parameters of ``PdrConfig``; the declination is known as any map's."""
+        known: dict[str, Any] = {"placement": "waist" if self.gait else "carried"}
+        if self.magnetometer is not None:
+            declination = math.radians(self.magnetometer.declination_deg)
+            known["attitude.declination_rad"] = declination
+        return {**known, **self.pdr}
 
     def motion(self, seed: int, vue_id: str) -> BodyMotion:
         """The true motion; a random route is drawn from the stream ``<vue>/route``."""
@@ -311,6 +329,8 @@ class Device(Section):
             )
         if self.gait is not None and self.acceleration_mps2 is not None:
             raise ValueError("a gait starts and stops by itself; remove acceleration_mps2")
+        if self.pdr:
+            PdrConfig.from_mapping(self.dead_reckoning)
         if self.beacon_interval_ns < 1:
             raise ValueError("beacon_interval_s must be at least 1e-9")
         sensors = [sensor for sensor in (self.imu, self.magnetometer) if sensor is not None]

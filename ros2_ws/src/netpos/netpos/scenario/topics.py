@@ -16,6 +16,8 @@ from netpos.messages.values import (
     Odometry,
     RsuInfo,
     RsuMeasurement,
+    Step,
+    Velocity,
 )
 from netpos.scenario.schema import Scenario
 
@@ -28,6 +30,8 @@ Value = (
     | ImuSample
     | MagneticSample
     | InitialPose
+    | Step
+    | Velocity
 )
 
 _OF_DEVICE: dict[type, tuple[str, str]] = {
@@ -39,6 +43,11 @@ _OF_DEVICE: dict[type, tuple[str, str]] = {
     Beacon: (topics.BEACON, "netpos_msgs/msg/Beacon"),
 }
 
+_OF_PDR: dict[type, tuple[str, str]] = {
+    Step: (topics.STEP, "netpos_msgs/msg/Step"),
+    Velocity: (topics.STEP_VELOCITY, "geometry_msgs/msg/TwistWithCovarianceStamped"),
+}
+
 
 def topic_of(value: Value) -> str:
     """Topic of a simulated value; an Odometry or a ClockState is the truth here."""
@@ -46,7 +55,7 @@ def topic_of(value: Value) -> str:
         return topics.RSU_INFO
     if isinstance(value, RsuMeasurement):
         return topics.RSU_MEASUREMENTS
-    return topics.of_vue(value.vue_id, _OF_DEVICE[type(value)][0])
+    return topics.of_vue(value.vue_id, {**_OF_DEVICE, **_OF_PDR}[type(value)][0])
 
 
 def device_topics(scenario: Scenario) -> dict[str, str]:
@@ -64,6 +73,16 @@ def device_topics(scenario: Scenario) -> dict[str, str]:
     return found
 
 
+def pdr_topics(scenario: Scenario) -> dict[str, str]:
+    """Message type by topic of the dead reckoning of everybody who walks."""
+    return {
+        topics.of_vue(vue_id, name): type_name
+        for vue_id, device in scenario.each_device
+        for name, type_name in _OF_PDR.values()
+        if device.walks
+    }
+
+
 def to_message(codec: Codec, value: Value) -> Any:
     """The message of a value."""
     convert: dict[type, Callable[[Any], Any]] = {
@@ -74,6 +93,8 @@ def to_message(codec: Codec, value: Value) -> Any:
         ClockState: codec.clock_state_to_msg,
         ImuSample: codec.imu_to_msg,
         MagneticSample: codec.magnetic_field_to_msg,
+        Step: codec.step_to_msg,
+        Velocity: codec.velocity_to_msg,
         Beacon: codec.beacon_to_msg,
     }
     return convert[type(value)](value)
