@@ -69,7 +69,7 @@ def test_rows_json_and_pictures(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("none1999",), ("no paper 'none1999'", "known: fokin2020")),
+        (("none1999",), ("no paper 'none1999'", "known: ", "fokin2020")),
         (("fokin2020", "--runs", 0), ("runs must be at least 1",)),
         (("fokin2020", "--workers", 0), ("workers must be at least 1",)),
         (("fokin2020", "--seed", -3), ("seed must be at least 0",)),
