@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from netpos.bags import BagError, BagReader, codec
 from netpos.bags.importers import import_ble_aoa, import_uwb_anchors
+from netpos.bags.importers.common import truth_of_poses
 from netpos.messages.values import Array, Field, Odometry, RsuInfo, RsuMeasurement
 from scipy.spatial.transform import Rotation
 
@@ -118,6 +119,14 @@ def test_uwb_by_hand(tmp_path: Path) -> None:
     assert truth[1].angular_velocity[2] == pytest.approx(math.radians(72))
     ahead = [2 * math.cos(math.radians(9)), -2 * math.sin(math.radians(9)), 0.4]
     np.testing.assert_allclose(truth[1].linear_velocity, ahead, atol=1e-9)
+
+
+def test_a_heading_that_passes_180_degrees_does_not_spin() -> None:
+    headings = np.radians([170.0, 179.0, -172.0])
+    poses = np.column_stack([np.zeros((3, 3)), headings])
+    truth = truth_of_poses([0, 125_000_000, 250_000_000], poses, "vue_1")
+    for odometry in truth:
+        assert odometry.angular_velocity[2] == pytest.approx(math.radians(72))
 
 
 @pytest.mark.parametrize(

@@ -83,6 +83,33 @@ def yaw_quaternion(yaw_rad: float) -> Array:
     return np.array([0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2)])
 
 
+def truth_of_poses(stamps_ns: Sequence[int], poses: Array, vue_id: str) -> list[Odometry]:
+    """Ground truth of poses (n, 4), x y z m and heading rad, at increasing stamps, n >= 2; the
+    velocities are their differences, in the device's axes."""
+    track = poses.copy()
+    track[:, 3] = np.unwrap(track[:, 3])
+    rates = np.gradient(track, (np.array(stamps_ns) - stamps_ns[0]) / 1e9, axis=0)
+    return [
+        _moving(stamp_ns, vue_id, pose, rate)
+        for stamp_ns, pose, rate in zip(stamps_ns, track, rates, strict=True)
+    ]
+
+
+def _moving(stamp_ns: int, vue_id: str, pose: Array, rate: Array) -> Odometry:
+    """pose (4,): x y z m, heading rad; rate (4,): per second, in map axes."""
+    cos, sin = math.cos(pose[3]), math.sin(pose[3])
+    return Odometry(
+        stamp_ns=stamp_ns,
+        vue_id=vue_id,
+        position=pose[:3].copy(),
+        quaternion=yaw_quaternion(float(pose[3])),
+        linear_velocity=np.array(
+            [cos * rate[0] + sin * rate[1], cos * rate[1] - sin * rate[0], rate[2]]
+        ),
+        angular_velocity=np.array([0.0, 0.0, rate[3]]),
+    )
+
+
 def number_beacons(measurements: Sequence[RsuMeasurement]) -> list[RsuMeasurement]:
     """In stamp order, with one sequence number per stamp and ``expected`` its RSUs.
 

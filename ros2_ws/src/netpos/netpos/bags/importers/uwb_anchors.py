@@ -16,8 +16,8 @@ import numpy as np
 import yaml
 
 from netpos.bags.errors import BagError
-from netpos.bags.importers.common import read_rows, write_recording, yaw_quaternion
-from netpos.messages.values import Array, Field, Odometry, RsuInfo, RsuMeasurement
+from netpos.bags.importers.common import read_rows, truth_of_poses, write_recording
+from netpos.messages.values import Field, Odometry, RsuInfo, RsuMeasurement
 
 # The two anchors above each other (1.97 m and 0.5 m) tell the tag's height from the ranges alone;
 # the track's own z counts from the tag's start.
@@ -127,25 +127,4 @@ def _truth(file: Path, vue_id: str) -> list[Odometry]:
         track[-1].append(math.radians(row.number(4, "heading")))
     if len(stamps) < 2:
         raise BagError(f"{file} holds one pose; velocities need two")
-    seconds = (np.array(stamps) - stamps[0]) / 1e9
-    poses = np.array(track)
-    rates = np.gradient(poses, seconds, axis=0)
-    return [
-        _pose(stamp_ns, vue_id, pose, rate)
-        for stamp_ns, pose, rate in zip(stamps, poses, rates, strict=True)
-    ]
-
-
-def _pose(stamp_ns: int, vue_id: str, pose: Array, rate: Array) -> Odometry:
-    """pose (4,): x y z m, heading rad; rate (4,): per second, in map axes."""
-    cos, sin = math.cos(pose[3]), math.sin(pose[3])
-    return Odometry(
-        stamp_ns=stamp_ns,
-        vue_id=vue_id,
-        position=pose[:3].copy(),
-        quaternion=yaw_quaternion(float(pose[3])),
-        linear_velocity=np.array(
-            [cos * rate[0] + sin * rate[1], cos * rate[1] - sin * rate[0], rate[2]]
-        ),
-        angular_velocity=np.array([0.0, 0.0, rate[3]]),
-    )
+    return truth_of_poses(stamps, np.array(track), vue_id)
