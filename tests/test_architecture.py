@@ -21,7 +21,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "world": {"messages"},
     "radio": {"messages", "world"},
     "inertial": {"messages", "world", "radio"},
-    "filters": {"messages"},
+    "filters": {"messages", "inertial"},
     "bags": {"messages", "inertial"},
     "scenario": {"messages", "world", "radio", "inertial", "bags"},
     "tracking": {"messages", "filters", "inertial", "bags", "scenario"},

@@ -58,6 +58,21 @@ def uwb_trolley(
     _report(bag, counts)
 
 
+@importers.command("car-imu-rtk")
+def car_imu_rtk(
+    path: Annotated[Path, typer.Argument(help="Folder with imu_*.csv, .tag and gnss_*.pos.")],
+    bag: Bag,
+    fewest: Annotated[int, typer.Option(help="Fewest stations that hear an epoch.")] = 1,
+    nearest: Annotated[int, typer.Option(help="Most stations that hear an epoch.")] = 2,
+    seed: Annotated[int, typer.Option(help="Seed of the stations and of their errors.")] = 1,
+) -> None:
+    """Real IMU and RTK of a car; stations are simulated along its real way (deng2022)."""
+    from netpos.scenario.recorded_drive import import_car_drive  # noqa: PLC0415
+
+    counts = import_car_drive(path, bag, fewest=fewest, nearest=nearest, seed=seed)
+    _report(bag, counts)
+
+
 def _imu_command(recording_format: str, what: str) -> None:
     @importers.command(recording_format, help=what)
     def command(path: Annotated[Path, typer.Argument(help="The recording.")], bag: Bag) -> None:

@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 
 def reproduce(
     paper: Annotated[str, typer.Argument(help="Paper, for example fokin2020.")],
-    runs: Annotated[int, typer.Option(help="Runs (seeds) of each experiment.")] = 1000,
+    runs: Annotated[
+        int | None,
+        typer.Option(help="Runs (seeds) of each experiment. Default: 1000; deng2022: 100."),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the first run; run i has seed + i.")] = 1,
     workers: Annotated[
         int | None, typer.Option(help="Processes. Default: one per processor.")
@@ -47,6 +50,8 @@ def reproduce(
     finally:
         bar.stop()
     Console().print(_table(result))
+    for note in result.outcome.notes:
+        typer.echo(note, err=True)
     if json_file is not None:
         write_json(json_file, result.to_json())
     if out is not None:

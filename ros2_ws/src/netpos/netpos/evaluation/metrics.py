@@ -51,7 +51,8 @@ class Figures:
     the ground truth's span at which the newest ready estimate is at most 0.2 s old (5 Hz,
     fokin2020's priority passage), convergence included; an estimate is ready in state TRACKING.
     rmse_m, p50..max: horizontal position error; mean_error_m: mean horizontal error, which
-    fokin2020:eq.34 calls RMSE; rmse_3d_m with the vertical. velocity_rmse_mps: horizontal, map
+    fokin2020:eq.34 calls RMSE; rmse_3d_m with the vertical; north, east, down: by axis, as
+    deng2022 does. velocity_rmse_mps: horizontal, map
     axes. heading_rmse_deg: where the true speed exceeds 0.5 m/s. clock_offset_sd_ns: standard
     deviation of the clock offset error about its mean; clock_offset_rmse_ns: about zero. nees_*:
     horizontal position, 2 degrees of freedom, bounds for nees_n_eff independent epochs.
@@ -79,6 +80,9 @@ class Figures:
     rejected: int | None = None
     bound_ratio: float | None = None
     rmse_3d_m: float | None = None
+    north_rmse_m: float | None = None
+    east_rmse_m: float | None = None
+    down_rmse_m: float | None = None
     nees_n: int | None = None
     nees_n_eff: float | None = None
     nis_dof_mean: float | None = None
@@ -272,6 +276,9 @@ def _accuracy(scored: Pairs) -> dict[str, Any]:
         "duration_s": float((stamps[-1] - stamps[0]) / NS) if stamps.size else None,
         "rmse_m": rms(errors),
         "rmse_3d_m": rms(np.linalg.norm(scored.error, axis=1)),
+        "north_rmse_m": rms(scored.error[:, 1]),
+        "east_rmse_m": rms(scored.error[:, 0]),
+        "down_rmse_m": rms(scored.error[:, 2]),
         "mean_error_m": float(errors.mean()) if errors.size else None,
         "p50_m": p50,
         "p95_m": p95,

@@ -85,8 +85,8 @@ def is_angle(row: Array) -> bool:
 
 
 @leaf
-def _direction(row: Array, dx: float, dy: float, dz: float, h: Array) -> float:
-    """Angle or direction cosine of the offset d in the RSU's axes; its gradient to h[:2]."""
+def direction(row: Array, dx: float, dy: float, dz: float) -> tuple[float, float, float, float]:
+    """Angle or direction cosine of the offset d in the RSU's axes, and its gradient in map."""
     a = AXES
     ux = row[a] * dx + row[a + 1] * dy + row[a + 2] * dz
     uy = row[a + 3] * dx + row[a + 4] * dy + row[a + 5] * dz
@@ -109,9 +109,12 @@ def _direction(row: Array, dx: float, dy: float, dz: float, h: Array) -> float:
             gy += 1.0 / r
         else:
             gz += 1.0 / r
-    for i in range(2):
-        h[i] = gx * row[a + i] + gy * row[a + 3 + i] + gz * row[a + 6 + i]
-    return value
+    return (
+        value,
+        gx * row[a] + gy * row[a + 3] + gz * row[a + 6],
+        gx * row[a + 1] + gy * row[a + 4] + gz * row[a + 7],
+        gx * row[a + 2] + gy * row[a + 5] + gz * row[a + 8],
+    )
 
 
 @leaf
@@ -135,7 +138,7 @@ def _from_rsu(row: Array, mean: Array, height_m: float, h: Array) -> float:
             h[4] = 1.0
             value += mean[4]
     else:
-        value = _direction(row, dx, dy, dz, h)
+        value, h[0], h[1], _ = direction(row, dx, dy, dz)
     if heading >= 0:
         h[heading] = h[1] * lx - h[0] * ly
     return float(value)

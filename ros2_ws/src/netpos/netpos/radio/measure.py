@@ -20,7 +20,7 @@ import numpy.typing as npt
 from numba import njit
 
 from netpos.radio.clocks import clock_error
-from netpos.radio.noise import Key, draw_normals
+from netpos.radio.noise import Key, draw_normals, draw_uniform
 from netpos.radio.propagation import (
     LOS_MODELS,
     SPEED_OF_LIGHT_MPS,
@@ -60,6 +60,7 @@ class Sight(NamedTuple):
     model: int  # index into LOS_MODELS or ALWAYS_VISIBLE
     correlation_m: float
     device_height_m: float
+    fewest: int = 1 << 30  # below nearest: a number drawn evenly from fewest to nearest is heard
 
 
 class Errors(NamedTuple):
@@ -235,7 +236,12 @@ def observe(
         heard_by[i] = _nearest_hearing(
             position, sites, sight, errors.half_view_rad, hint, rsu[i], plane
         )
-        hint = rsu[i]
+        hint = rsu[i].copy()
+        if sight.fewest < nearest:
+            share = draw_uniform(stamps_ns[i], 1, sites.noise_key[0])  # 0 is its noise
+            most = sight.fewest + int(share * (nearest - sight.fewest + 1))
+            heard_by[i] = min(heard_by[i], most)
+            rsu[i, heard_by[i] :] = -1
         for j in range(heard_by[i]):
             k = rsu[i, j]
             x, y, z = _in_axes(position, k, sites)

@@ -74,6 +74,15 @@ def _uniform(word: np.uint64) -> float:
 
 
 @njit(cache=True)
+def draw_uniform(stamp: int, second: int, key: Key) -> float:
+    """A uniform number in (0, 1) of a counter (stamp, second, 0)."""
+    word, _, _, _ = philox(
+        np.uint64(stamp), np.uint64(second), np.uint64(0), np.uint64(0), key[0], key[1]
+    )
+    return float(_uniform(word))
+
+
+@njit(cache=True)
 def draw_normals(
     stamp: int, second: int, third: int, key: Key
 ) -> tuple[float, float, float, float]:

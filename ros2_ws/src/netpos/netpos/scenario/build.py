@@ -11,9 +11,9 @@ import numpy.typing as npt
 from netpos.messages.values import RsuInfo
 from netpos.radio.clocks import clock_tones
 from netpos.radio.measure import Errors, Sight, Sites, los_model_number
-from netpos.radio.noise import stream_key
+from netpos.radio.noise import generator, stream_key
 from netpos.radio.propagation import SPEED_OF_LIGHT_MPS
-from netpos.scenario.schema import Device, FixedErrors, Scenario
+from netpos.scenario.schema import Device, FixedErrors, Grid, Scenario
 from netpos.world.frames import quaternion_from_yaw, yaw_from_quaternion
 from netpos.world.maps import METIS_KERB_OFFSET_M, METIS_MADRID, METIS_RSU_SPACING_M
 
@@ -56,6 +56,8 @@ def _placed(scenario: Scenario) -> tuple[RsuInfo, ...]:
             )
             for i, (x, y) in enumerate(places)
         )
+    if scenario.rsus.grid is not None:
+        return _grid_rsus(scenario.rsus.grid, scenario)
     return tuple(
         RsuInfo(
             rsu_id=unit.id,
@@ -65,6 +67,27 @@ def _placed(scenario: Scenario) -> tuple[RsuInfo, ...]:
             stamp_ns=scenario.start_ns,
         )
         for unit in scenario.rsus.units
+    )
+
+
+def _grid_rsus(grid: Grid, scenario: Scenario) -> tuple[RsuInfo, ...]:
+    """Row by row from the south-west, heights from the stream ``rsus/height``."""
+    count = grid.columns * grid.rows
+    low, high = grid.height_min_m, grid.height_max_m
+    heights = generator(scenario.seed, "rsus/height").uniform(low, high, count)
+    return tuple(
+        RsuInfo(
+            rsu_id=f"rsu_{i + 1:03d}",
+            position=np.array(
+                [
+                    grid.x_min + grid.spacing_m * (i % grid.columns),
+                    grid.y_min + grid.spacing_m * (i // grid.columns),
+                    height,
+                ]
+            ),
+            stamp_ns=scenario.start_ns,
+        )
+        for i, height in enumerate(heights.tolist())
     )
 
 
@@ -120,6 +143,7 @@ def sight_of(scenario: Scenario, device: Device) -> Sight:
         model=los_model_number(los.probability),
         correlation_m=los.correlation_distance_m,
         device_height_m=device.antenna_height_m,
+        fewest=scenario.measurement.fewest or scenario.measurement.nearest,
     )
 
 

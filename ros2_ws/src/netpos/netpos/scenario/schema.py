@@ -18,7 +18,7 @@ from netpos.radio.noise import generator
 from netpos.radio.propagation import UMA_HIGHEST_DEVICE_M, LosModel, PathLoss
 from netpos.radio.waveform import Waveform
 from netpos.world.maps import METIS_MADRID
-from netpos.world.motion import BodyMotion, QuadraticMotion, follow
+from netpos.world.motion import BodyMotion, Hills, QuadraticMotion, follow
 from netpos.world.routes import random_route, rectangle
 
 Array = npt.NDArray[np.float64]
@@ -70,14 +70,33 @@ class RsuUnit(Section):
     network: str = ""
 
 
+class Grid(Section):
+    """RSUs on a square grid from its south-west corner, their heights drawn evenly per seed."""
+
+    spacing_m: Positive
+    columns: int = Field(ge=1)
+    rows: int = Field(ge=1)
+    x_min: Finite = 0.0
+    y_min: Finite = 0.0
+    height_min_m: Finite = 0.0
+    height_max_m: Finite = 0.0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.height_min_m > self.height_max_m:
+            raise ValueError("a grid needs height_min_m <= height_max_m")
+        return self
+
+
 class Rsus(Section):
     """``metis_madrid``: every 60 m along the streets (maps.StreetGrid.lamp_posts). ``list``: the
-    units listed."""
+    units listed. ``grid``: on a square grid."""
 
-    layout: Literal["metis_madrid", "list"] = "list"
+    layout: Literal["metis_madrid", "list", "grid"] = "list"
     units: tuple[RsuUnit, ...] = ()
     height_m: Finite = 0.0
     clock: NetworkClockModel | None = None
+    grid: Grid | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -85,6 +104,8 @@ class Rsus(Section):
             raise ValueError("layout 'list' needs at least one entry in units")
         if self.layout != "list" and self.units:
             raise ValueError(f"layout {self.layout!r} places the RSUs itself; remove units")
+        if (self.layout == "grid") != (self.grid is not None):
+            raise ValueError("layout 'grid' and the section grid need each other")
         ids = [unit.id for unit in self.units]
         twice = sorted({i for i in ids if ids.count(i) > 1})
         if twice:
@@ -125,16 +146,19 @@ class CramerRaoErrors(Section):
 
 
 class Measurement(Section):
-    """What the RSUs measure of each beacon; the ``nearest`` RSUs with a line of sight report
-    it."""
+    """What the RSUs measure of each beacon; the ``nearest`` RSUs with a line of sight report it,
+    or of these a number drawn evenly for each beacon, at least ``fewest`` (deng2022)."""
 
     quantities: tuple[Quantity, ...] = ("azimuth", "toa")
     nearest: int = Field(default=2, ge=1)
+    fewest: int | None = Field(default=None, ge=1)
     los: LineOfSight = LineOfSight()
     errors: Annotated[FixedErrors | CramerRaoErrors, Field(discriminator="model")]
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
+        if self.fewest is not None and self.fewest > self.nearest:
+            raise ValueError(f"fewest must be at most nearest ({self.nearest}), got {self.fewest}")
         if not self.quantities or len(set(self.quantities)) < len(self.quantities):
             raise ValueError(
                 "quantities must name each of azimuth, elevation, toa, range, position at most"
@@ -262,7 +286,9 @@ class Device(Section):
 
     It drives along its route at ``speed_mps``, or a person walks with it there (``gait``).
     ``pdr`` holds parameters of its dead reckoning (``PdrConfig``); with a gait it is worn at the
-    waist unless ``placement`` says otherwise."""
+    waist unless ``placement`` says otherwise. ``antenna_height_m`` is the height of base_link
+    where the road is flat, the antenna stands at ``lever_arm_m`` in base_link; the road rises and
+    falls as a sine in time."""
 
     count: int = Field(default=1, ge=1)
     route: Route
@@ -270,6 +296,9 @@ class Device(Section):
     gait: GaitModel | None = None
     acceleration_mps2: Positive | None = None
     antenna_height_m: Finite = 0.0
+    hill_amplitude_m: NotNegative = 0.0
+    hill_period_s: Positive = 180.0
+    lever_arm_m: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
     beacon_interval_s: Positive
     ground_truth_rate_hz: Positive | None = None
     clock: ClockModel = ClockModel()
@@ -316,6 +345,7 @@ class Device(Section):
             corner_radius_m=self.route.corner_radius_m,
             acceleration_mps2=self.acceleration_mps2,
             pauses_s=self.route.pauses_s,
+            hills=Hills(amplitude_m=self.hill_amplitude_m, period_s=self.hill_period_s),
         )
 
     @model_validator(mode="after")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -48,6 +48,7 @@ from netpos.scenario.build import (
 )
 from netpos.scenario.networks import Answering, answering_of
 from netpos.scenario.schema import Device, Scenario
+from netpos.world.motion import BodyState
 
 Array = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
@@ -105,7 +106,9 @@ class Simulation:
 
     def with_seed(self, seed: int) -> Simulation:
         """The same scenario under another seed (>= 0), without building the world anew; for many
-        runs."""
+        runs. A grid of RSUs has other heights."""
+        if self.scenario.rsus.grid is not None:
+            return Simulation(self.scenario.model_copy(update={"seed": seed}))
         other = copy(self)
         other.scenario = self.scenario.model_copy(update={"seed": seed})
         other._place_devices()
@@ -186,6 +189,17 @@ class Simulation:
         """All samples of a device's IMU; none where it has none."""
         return list(self._vues[vue_id].imu())
 
+    def imu_arrays(self, vue_id: str) -> ImuSamples:
+        """All samples of a device's IMU as arrays; the same values as of ``imu``.
+
+        Raises ``ValueError`` for a device without an IMU.
+        """
+        return self._vues[vue_id].imu_arrays()
+
+    def truth(self, vue_id: str, stamps_ns: Stamps) -> BodyState:
+        """The true motion of base_link at stamps (n,)."""
+        return self._vues[vue_id].truth(stamps_ns)
+
     def initial_pose(self, vue_id: str) -> InitialPose | None:
         """The position handed to the tracker, where the scenario asks for one."""
         return self._vues[vue_id].initial_pose
@@ -218,6 +232,7 @@ class Simulation:
             range_var=float(variance[RANGE]),
             position=fix,
             position_cov=fix_cov,
+            lever_arm=self._vues[beacon.vue_id].lever_arm_m,
         )
 
 
@@ -234,12 +249,23 @@ class _Vue:
         self._motion = device.motion(scenario.seed, vue_id)
         limit_s = scenario.max_duration_s or self._motion.duration_s
         self._duration_ns = int(min(limit_s, self._motion.duration_s) * NS)
-        self._antenna = np.array([0.0, 0.0, device.antenna_height_m])
+        self._base = np.array([0.0, 0.0, device.antenna_height_m])
+        self.lever_arm_m = device.lever_arm_m
         self.sites = sites
         self.sight = sight
 
     def _grid(self, step_ns: int) -> Stamps:
         return np.arange(self._duration_ns // step_ns + 1, dtype=np.int64) * step_ns
+
+    def _lever(self, state: BodyState) -> Array:
+        """(n, 3) from base_link to the antenna in map."""
+        if not any(self.lever_arm_m):
+            return np.zeros((len(state.position), 3))
+        return np.asarray(state.rotation.apply(self.lever_arm_m))
+
+    def truth(self, stamps_ns: Stamps) -> BodyState:
+        state = self._motion.body_at((stamps_ns - self._start_ns) / NS)
+        return replace(state, position=state.position + self._base)
 
     @cached_property
     def beacons(self) -> Beacons:
@@ -249,7 +275,7 @@ class _Vue:
         offset, drift = simulate_clock(self._device.clock, stamps, self._seed, self._vue_id)
         return Beacons(
             stamp_ns=stamps,
-            position=state.position + self._antenna,
+            position=state.position + self._base + self._lever(state),
             velocity=state.velocity[:, :2],
             clock_offset_s=offset,
             clock_drift=drift,
@@ -261,10 +287,11 @@ class _Vue:
         if sd is None:
             return None
         error = sd * generator(self._seed, f"{self._vue_id}/initial_pose").standard_normal(2)
+        start = np.array([self._start_ns], dtype=np.int64)
         return InitialPose(
             stamp_ns=self._start_ns,
             vue_id=self._vue_id,
-            position=self.beacons.position[0] + np.array([*error, 0.0]),
+            position=self.truth(start).position[0] + np.array([*error, 0.0]),
             cov=np.diag([sd**2, sd**2, 0.0]),
         )
 
@@ -286,7 +313,7 @@ class _Vue:
             )
         state = self._motion.body_at(elapsed / NS)
         quaternions = state.rotation.as_quat()
-        places = state.position + self._antenna
+        places = state.position + self._base
         velocities = state.rotation.inv().apply(state.velocity)
         for i, stamp in enumerate((self._start_ns + elapsed).tolist()):
             yield Odometry(
@@ -312,9 +339,7 @@ class _Vue:
         """All samples; none without an IMU."""
         if self._device.imu is None:
             return
-        imu: ImuSamples = simulate_imu(
-            self._device.imu, self._motion, self._start_ns, self._seed, self._vue_id
-        )
+        imu = self.imu_arrays()
         end_ns = self._start_ns + self._duration_ns
         for i, stamp in enumerate(imu.stamp_ns[imu.stamp_ns <= end_ns].tolist()):
             yield ImuSample(
@@ -325,6 +350,13 @@ class _Vue:
                 angular_velocity_var=imu.angular_velocity_var,
                 specific_force_var=imu.specific_force_var,
             )
+
+    def imu_arrays(self) -> ImuSamples:
+        if self._device.imu is None:
+            raise ValueError(f"{self._vue_id} has no imu; give its device one")
+        return simulate_imu(
+            self._device.imu, self._motion, self._start_ns, self._seed, self._vue_id
+        )
 
     def _magnetometer(self) -> Iterator[Event]:
         model = self._device.magnetometer

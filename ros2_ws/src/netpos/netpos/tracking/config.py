@@ -21,6 +21,7 @@ MOTION_MODELS = (
     "interacting",
     "inertial",
     "rigid_body",
+    "strapdown",
 )
 ROBUST = ("none", "huber", "student_t")
 
@@ -47,7 +48,7 @@ class TrackerConfig:
         MOTION_MODELS,
         "constant_velocity | constant_turn | constant_acceleration | interacting (stop, straight,"
         " turn) | inertial (driven by the device's IMU) | rigid_body (several antennas give a"
-        " heading of its own)",
+        " heading of its own) | strapdown (three dimensions, driven by the device's IMU)",
     )
     process_noise: str = _choice(
         "continuous",
@@ -76,23 +77,53 @@ class TrackerConfig:
         5.0, 1e-3, 1e6, "interacting: mean time a device keeps to one of the models"
     )
     inertial_accel_density_mps2_sqrthz: float = _real(
-        0.1, 1e-6, 1e3, "inertial: noise of the forward acceleration and side slip"
+        0.1,
+        1e-6,
+        1e3,
+        "inertial: noise of the forward acceleration and side slip; strapdown: of each axis",
     )
     gyro_noise_density: float = _real(
-        5e-3, 1e-9, 10.0, "inertial: noise of the yaw rate [rad/s/sqrt(Hz)]"
+        5e-3, 1e-9, 10.0, "inertial, strapdown: noise of the gyros [rad/s/sqrt(Hz)]"
     )
     gyro_bias_sd_radps: float = _real(
-        0.01, 1e-9, 10.0, "inertial: initial sd of the yaw-rate bias"
+        0.01,
+        1e-9,
+        10.0,
+        "inertial: initial sd of the yaw-rate bias; strapdown: sd of each gyro bias",
     )
     gyro_bias_walk: float = _real(
         1e-4, 0.0, 1.0, "inertial: walk of the yaw-rate bias [rad/s/sqrt(s)]"
     )
     accel_bias_sd_mps2: float = _real(
-        0.2, 1e-9, 100.0, "inertial: initial sd of the forward acceleration's bias"
+        0.2,
+        1e-9,
+        100.0,
+        "inertial: initial sd of the forward acceleration's bias; strapdown: of each axis",
     )
     accel_bias_walk: float = _real(
         1e-2, 0.0, 10.0, "inertial: walk of the forward acceleration's bias [m/s^2/sqrt(s)]"
     )
+    bias_correlation_time_s: float = _real(
+        100.0, 1.0, 1e6, "strapdown: correlation time of the IMU's biases (first-order Markov)"
+    )
+    sideways_sd_mps: float = _real(
+        0.0, 0.0, 10.0, "strapdown: a vehicle's speed to the side, ten times a second; 0: free"
+    )
+    upwards_sd_mps: float = _real(
+        0.0, 0.0, 10.0, "strapdown: a vehicle's speed off its floor, ten times a second; 0: free"
+    )
+    standstill_sd_mps: float = _real(
+        0.0, 0.0, 10.0, "strapdown: speed of a vehicle whose IMU is quiet; 0: not looked at"
+    )
+    still_force_mps2: float = _real(
+        0.2, 0.0, 100.0, "strapdown: a quiet IMU's specific force stays this close to its mean"
+    )
+    still_rate_radps: float = _real(0.05, 0.0, 10.0, "strapdown: a quiet IMU turns slower")
+    gravity_mps2: float = _real(9.80665, 9.0, 11.0, "strapdown: gravity of the place")
+    earth_rate: bool = field(
+        default=False, metadata={"text": "strapdown: the earth turns, as at latitude_deg"}
+    )
+    latitude_deg: float = _real(0.0, -90.0, 90.0, "strapdown: of the place, with earth_rate")
     position_gain_min: float = _real(
         0.0, 0.0, 1.0, "kf: floor of the position gain (dvornikov2017: 0.0926)"
     )
@@ -188,6 +219,8 @@ class TrackerConfig:
         self._check_combination()
 
     def _check_combination(self) -> None:
+        if self.motion_model == "strapdown":
+            self._check_strapdown()
         if self.backend == "filterpy" and self.filter not in ("ekf", "ukf"):
             raise ValueError(f"backend filterpy has filter ekf or ukf, not {self.filter!r}")
         if self.backend == "filterpy" and self.motion_model == "interacting":
@@ -205,10 +238,22 @@ class TrackerConfig:
                 f"motion_model interacting takes filter ekf or iekf, not {self.filter!r}"
             )
 
+    def _check_strapdown(self) -> None:
+        if self.filter not in ("ekf", "iekf") or self.backend != "compiled":
+            raise ValueError(
+                "motion_model strapdown has its own error-state filter; leave filter at iekf and"
+                f" backend at compiled, got {self.filter!r} and {self.backend!r}"
+            )
+        if self.robust != "none" or self.nlos_probability > 0.0 or self.fixed_lag_s > 0.0:
+            raise ValueError(
+                "motion_model strapdown has neither robust updates nor a smoother; leave robust at"
+                " none, nlos_probability and fixed_lag_s at 0"
+            )
+
     @property
     def use_imu(self) -> bool:
         """Whether the device's IMU is an input."""
-        return self.motion_model == "inertial"
+        return self.motion_model in ("inertial", "strapdown")
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> TrackerConfig:

@@ -34,8 +34,10 @@ class Posterior:
 
 def check_smoothable(config: TrackerConfig) -> None:
     """Raises ``ValueError`` for a tracker whose estimates cannot be smoothed."""
-    if config.motion_model == "interacting":
-        raise ValueError("motion_model interacting cannot be smoothed; use another motion model")
+    if config.motion_model in ("interacting", "strapdown"):
+        raise ValueError(
+            f"motion_model {config.motion_model} cannot be smoothed; use another motion model"
+        )
 
 
 def _stacked(

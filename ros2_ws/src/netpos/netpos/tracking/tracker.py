@@ -19,6 +19,9 @@ from netpos.tracking.health import HealthConfig, RsuHealth, RsuReport
 from netpos.tracking.rsus import Rsu
 from netpos.tracking.sequencer import IMU, Epoch, Item, Sequencer
 from netpos.tracking.smoothing import Posterior, check_smoothable
+from netpos.tracking.strapdown_engine import compile_kernels
+from netpos.tracking.strapdown_models import sensors_of
+from netpos.tracking.strapdown_track import StrapdownTrack
 from netpos.tracking.track import Track, TrackOutput
 
 
@@ -37,8 +40,10 @@ class Tracker:
         self._keep_posteriors = keep_posteriors
         if keep_posteriors:
             check_smoothable(self._config)
+        if self._config.motion_model == "strapdown":
+            compile_kernels(sensors_of(self._config))
         self._rsus: dict[str, Rsu] = {}
-        self._tracks: dict[str, Track] = {}
+        self._tracks: dict[str, Track | StrapdownTrack] = {}
         self._sequencers: dict[str, Sequencer] = {}
         settle_s = max(2.0, self._config.history_s + 1.0)
         self._health = RsuHealth(HealthConfig(settle_s=settle_s))
@@ -178,9 +183,11 @@ class Tracker:
             )
         return self._sequencers[vue_id]
 
-    def track(self, vue_id: str) -> Track:
+    def track(self, vue_id: str) -> Track | StrapdownTrack:
         """Track of a device, new where there is none."""
-        if vue_id not in self._tracks:
+        if vue_id not in self._tracks and self._config.motion_model == "strapdown":
+            self._tracks[vue_id] = StrapdownTrack(vue_id, self._config, self._rsus)
+        elif vue_id not in self._tracks:
             track = Track(vue_id, self._config, self._rsus, self._health)
             track.posteriors = [] if self._keep_posteriors else None
             self._tracks[vue_id] = track

@@ -66,6 +66,30 @@ def check_times(time_s: npt.ArrayLike, duration_s: float) -> Array:
     return t
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hills:
+    """Height of a road: a sine in time, along which a body on it points; amplitude 0: flat."""
+
+    amplitude_m: float = 0.0
+    period_s: float = 180.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.amplitude_m < math.inf:
+            raise ValueError(f"amplitude_m must be finite and >= 0, got {self.amplitude_m}")
+        if not 0 < self.period_s < math.inf:
+            raise ValueError(f"period_s must be finite and > 0, got {self.period_s}")
+
+    def at(self, time_s: Array) -> tuple[Array, Array, Array]:
+        """Height [m], climb [m/s] and its rate [m/s^2] at times (n,) [s]."""
+        rate = 2 * math.pi / self.period_s
+        sine, cosine = np.sin(rate * time_s), np.cos(rate * time_s)
+        a = self.amplitude_m
+        return a * sine, a * rate * cosine, -a * rate**2 * sine
+
+
+FLAT = Hills()
+
+
 @dataclass(frozen=True, slots=True)
 class _Segment:
     """A stretch of constant curvature."""
@@ -94,8 +118,11 @@ class _Piece:
 class Motion:
     """Motion along way-points, built by ``follow``."""
 
-    def __init__(self, pieces: Sequence[_Piece], duration_s: float, *, smooth: bool) -> None:
+    def __init__(
+        self, pieces: Sequence[_Piece], duration_s: float, *, smooth: bool, hills: Hills = FLAT
+    ) -> None:
         self.duration_s = duration_s
+        self.hills = hills
         self.smooth = smooth
         """Whether velocity and heading are continuous, as an inertial sensor needs."""
         self._start = np.array([p.start_s for p in pieces])
@@ -139,8 +166,11 @@ class Motion:
         )
 
     def body_at(self, time_s: npt.ArrayLike) -> BodyState:
-        """The same as a level body in space."""
-        return _level(self.at(time_s))
+        """The same as a body in space: level, or pointing along its hills."""
+        state = self.at(time_s)
+        if self.hills.amplitude_m == 0.0:
+            return _level(state)
+        return _on_hills(state, *self.hills.at(check_times(time_s, self.duration_s)))
 
 
 def _level(state: Kinematics) -> BodyState:
@@ -151,6 +181,21 @@ def _level(state: Kinematics) -> BodyState:
         velocity=np.hstack([state.velocity, zero[:, :1]]),
         rotation=Rotation.from_quat(quaternion_from_yaw(state.yaw)),
         angular_velocity=np.hstack([zero, state.yaw_rate[:, None]]),
+    )
+
+
+def _on_hills(state: Kinematics, height: Array, climb: Array, rate: Array) -> BodyState:
+    """A plane motion as that of a body that points up and down as it climbs."""
+    speed = np.hypot(*state.velocity.T)
+    gained = (state.velocity * state.acceleration).sum(axis=1) / speed
+    pitch = -np.arctan2(climb, speed)
+    pitch_rate = -(rate * speed - climb * gained) / (speed**2 + climb**2)
+    turning = [-state.yaw_rate * np.sin(pitch), pitch_rate, state.yaw_rate * np.cos(pitch)]
+    return BodyState(
+        position=np.column_stack([state.position, height]),
+        velocity=np.column_stack([state.velocity, climb]),
+        rotation=Rotation.from_euler("ZY", np.column_stack([state.yaw, pitch])),
+        angular_velocity=np.column_stack(turning),
     )
 
 
@@ -223,6 +268,7 @@ def follow(
     corner_radius_m: float = 0.0,
     acceleration_mps2: float | None = None,
     pauses_s: Sequence[float] = (),
+    hills: Hills = FLAT,
 ) -> Motion:
     """Motion along way-points at constant speed.
 
@@ -236,12 +282,15 @@ def follow(
         motion start or end at rest;
         without it the motion starts and ends at cruising speed. During a pause at a corner of
         radius 0 the body turns evenly.
+    hills : the road's height; it does not count in the speed, and it allows no pauses
 
     Raises
     ------
     ValueError  a leg is too short for its corners or ramps, a way-point repeats, a pause lies on
         an arc, a value is out of range
     """
+    if hills.amplitude_m > 0 and any(pauses_s):
+        raise ValueError("a road with hills allows no pauses; set their amplitude to 0")
     xy = np.asarray(points, dtype=np.float64)
     _check(xy, speed_mps, corner_radius_m, acceleration_mps2, pauses_s)
     pauses = list(pauses_s) or [0.0] * len(xy)
@@ -267,7 +316,7 @@ def follow(
             clock = _stand(pieces, clock, _end(segments[-1]), bends[b], pauses[b])
     sharp = any(abs(bends[i]) > _STRAIGHT_RAD and pauses[i] == 0 for i in range(len(xy)))
     abrupt = bool(stops) and acceleration_mps2 is None
-    return Motion(pieces, clock, smooth=not (sharp or abrupt))
+    return Motion(pieces, clock, smooth=not (sharp or abrupt), hills=hills)
 
 
 def _check(

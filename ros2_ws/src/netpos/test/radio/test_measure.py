@@ -89,3 +89,20 @@ def test_an_array_serves_its_field_of_view_only() -> None:
     places = [[math.cos(a), math.sin(a), 0.0] for a in np.radians([59.99, 60.01, 180.0])]
     seen = observe(np.array([1, 2, 3]), np.array(places), np.zeros(3), sites, sight, errors)
     assert seen.rsu[:, 0].tolist() == [0, 1, 1]
+
+
+def test_a_number_of_rsus_is_drawn_for_each_beacon() -> None:
+    """Evenly from fewest to nearest, always the nearest ones, and the same for the same stamp."""
+    places = np.array([[10.0 * i, 0.0] for i in range(1, 9)])
+    nearest = Sight(8, math.inf, np.zeros((0, 4)), ALWAYS_VISIBLE, 50.0, 1.5, 4)
+    n = 5000
+    stamps = np.arange(1, n + 1)
+    sites = _sites(places)
+    seen = observe(stamps, np.zeros((n, 3)), np.zeros(n), sites, nearest, FIXED)
+    counts = np.bincount(seen.heard_by, minlength=9)
+    assert counts[:4].sum() == 0
+    np.testing.assert_allclose(counts[4:] / n, 0.2, atol=4 * math.sqrt(0.16 / n))
+    for i in range(50):
+        assert seen.rsu[i].tolist() == [*range(seen.heard_by[i])] + [-1] * (8 - seen.heard_by[i])
+    again = observe(stamps[7:], np.zeros((n - 7, 3)), np.zeros(n - 7), sites, nearest, FIXED)
+    np.testing.assert_array_equal(again.heard_by, seen.heard_by[7:])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -15,8 +16,8 @@ import netpos
 from netpos.bags.errors import BagError
 from netpos.bags.types import codec
 from netpos.bags.writer import BagWriter
-from netpos.messages.topics import GROUND_TRUTH, RSU_INFO, RSU_MEASUREMENTS, of_vue
-from netpos.messages.values import Array, Odometry, RsuInfo, RsuMeasurement
+from netpos.messages.topics import GROUND_TRUTH, IMU, RSU_INFO, RSU_MEASUREMENTS, of_vue
+from netpos.messages.values import Array, ImuSample, Odometry, RsuInfo, RsuMeasurement
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +79,14 @@ def read_rows(file: Path, columns: int, *, header: bool) -> Iterator[Row]:
         raise BagError(f"{file} holds no data")
 
 
+def recordings(name: str) -> Path | None:
+    """Folder of a public recording below NETPOS_DATA, or else beside the project; None where it
+    is absent."""
+    root = Path(os.environ.get("NETPOS_ROOT") or Path(__file__).parents[6])
+    folder = Path(os.environ.get("NETPOS_DATA") or root.parent / "shared" / "data") / name
+    return folder if folder.is_dir() else None
+
+
 def yaw_quaternion(yaw_rad: float) -> Array:
     """(4,) x y z w of a turn about z."""
     return np.array([0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2)])
@@ -132,6 +141,7 @@ def write_recording(
     measurements: Sequence[RsuMeasurement],
     truth: Sequence[Odometry],
     metadata: Mapping[str, str],
+    imu: Sequence[ImuSample] = (),
 ) -> dict[str, int]:
     """Write one bag in stamp order, /rsu/info first; messages per topic.
 
@@ -142,11 +152,13 @@ def write_recording(
     messages = codec()
     measurements = number_beacons(measurements)
     stamps = [m.stamp_ns for m in measurements] + [t.stamp_ns for t in truth]
+    stamps += [s.stamp_ns for s in imu[:1]]
     start_ns = min(stamps)
     merged = [(m.stamp_ns, RSU_MEASUREMENTS, messages.measurement_to_msg(m)) for m in measurements]
     merged += [
         (t.stamp_ns, of_vue(t.vue_id, GROUND_TRUTH), messages.odometry_to_msg(t)) for t in truth
     ]
+    merged += [(s.stamp_ns, of_vue(s.vue_id, IMU), messages.imu_to_msg(s)) for s in imu]
     merged.sort(key=lambda item: item[0])
     with BagWriter(bag, metadata={**metadata, "netpos_version": netpos.__version__}) as writer:
         for info in infos:

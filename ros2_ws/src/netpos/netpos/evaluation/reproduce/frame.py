@@ -12,6 +12,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from copy import copy
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
@@ -21,8 +22,11 @@ from typing import Any, Self, TypeVar
 PAPERS = {
     "fokin2020": "netpos.evaluation.reproduce.fokin2020",
     "dvornikov2017": "netpos.evaluation.reproduce.dvornikov2017",
+    "deng2022": "netpos.evaluation.reproduce.deng2022",
 }
 """Module of each paper by its name."""
+
+DEFAULT_RUNS = 1000
 
 # Seeds per job. A constant, so that sums over a job do not depend on the number of workers.
 SEEDS_PER_JOB = 8
@@ -73,10 +77,11 @@ def required(name: str, unit: str, ours: float | None, ok: bool) -> Row:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
     """What a paper's reproduction gives: rows, and a function that draws into a folder and returns
-    the files it wrote."""
+    the files it wrote; ``notes`` say what could not be run."""
 
     rows: tuple[Row, ...]
     draw: Callable[[Path], list[Path]]
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,6 +153,12 @@ class Work:
             self._pool.shutdown(cancel_futures=True)
             self._pool = None
 
+    def with_runs(self, runs: int) -> Work:
+        """The same work and processes for another number of runs."""
+        other = copy(self)
+        other.runs = runs
+        return other
+
     def over_seeds(
         self, label: str, job: Callable[[Argument, range], Result], argument: Argument
     ) -> list[Result]:
@@ -178,12 +189,12 @@ class Work:
 def reproduce(
     paper: str,
     *,
-    runs: int = 1000,
+    runs: int | None = None,
     seed: int = 1,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Reproduction:
-    """Reproduce a paper's figures.
+    """Reproduce a paper's figures; ``runs`` None: as many as its module's ``RUNS`` says, or 1000.
 
     Raises
     ------
@@ -192,8 +203,9 @@ def reproduce(
     """
     if paper not in PAPERS:
         raise ValueError(f"no paper {paper!r}; known: {', '.join(sorted(PAPERS))}")
-    work = Work(runs, seed, workers, progress)
     module = import_module(PAPERS[paper])
+    runs = getattr(module, "RUNS", DEFAULT_RUNS) if runs is None else runs
+    work = Work(runs, seed, workers, progress)
     module.warm_up()
     start = time.perf_counter()
     with work:

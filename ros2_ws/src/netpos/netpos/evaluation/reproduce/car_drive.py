@@ -1,0 +1,177 @@
+"""deng2022 on a real drive: the IMU and the way are real, the stations are simulated along it; and
+what the IMU alone holds when the aiding, RTK, is taken away."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from netpos.bags.importers.car_imu_rtk import LEVER_ARM_M, CarDrive, imu_samples, load_car_drive
+from netpos.bags.importers.common import recordings
+from netpos.evaluation.metrics import NS
+from netpos.evaluation.reproduce.blocked_drive import (
+    LOOSE,
+    TIGHT,
+    VEHICLE,
+    Case,
+    loose_epochs,
+    ned,
+)
+from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
+from netpos.filters.error_state import UNCONSTRAINED
+from netpos.filters.measurement import LEVER
+from netpos.filters.space import place_rows
+from netpos.messages.values import Array
+from netpos.scenario.along_path import FIELDS
+from netpos.scenario.recorded_drive import VUE, station_drive
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.models import gate_thresholds
+from netpos.tracking.strapdown_engine import Drive, Epochs, Imu, Sensors, drive, fix_each
+from netpos.tracking.strapdown_models import sensors_of
+from netpos.tracking.strapdown_start import SampleBuffer, StrapdownStart
+
+RECORDING = "car_imu_rtk"
+SEEDS = 20
+"""Most seeds of the stations: the drive itself is one."""
+RTK_SD_M = (0.03, 0.03, 0.05)
+OUTAGE_S = 30.0
+OUTAGE_EVERY_S = 10.0
+SETTLE_S = 30.0
+_SKIP = 20  # epochs after the start that do not count, as in netpos evaluate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """The drive, what a tracker needs of it, and its state once RTK and IMU have told the heading:
+    stamp, nav, cov."""
+
+    drive: CarDrive
+    imu: Imu
+    config: TrackerConfig
+    sensors: Sensors
+    gate: Array
+    start: tuple[int, Array, Array]
+
+
+@lru_cache(maxsize=1)
+def recording() -> Recording | None:
+    """The recording, ready to run; None where it is absent."""
+    folder = recordings(RECORDING)
+    if folder is None:
+        return None
+    found = load_car_drive(Path(folder))
+    config = TrackerConfig.from_mapping(found.tracker)
+    return Recording(
+        drive=found,
+        imu=Imu(found.imu_ns, found.rates),
+        config=config,
+        sensors=sensors_of(config),
+        gate=gate_thresholds(config.gate_probability),
+        start=_aligned(found, config),
+    )
+
+
+def _aligned(found: CarDrive, config: TrackerConfig) -> tuple[int, Array, Array]:
+    """Coarse alignment from rest, by RTK."""
+    start, samples = StrapdownStart(config), SampleBuffer()
+    pending = iter(imu_samples(found, VUE))
+    cov, lever = np.diag(np.square(RTK_SD_M)), np.array(LEVER_ARM_M)
+    for stamp, position in zip(found.rtk_ns.tolist(), found.antenna, strict=True):
+        if stamp < found.imu_ns[0]:
+            continue
+        for sample in pending:
+            samples.add(sample)
+            if sample.stamp_ns >= stamp:
+                break
+        start.add_fix(stamp, position, cov, lever)
+        solution = start.solve(samples)
+        if solution is not None:
+            return solution
+    raise ValueError(f"{RECORDING}: no heading found; does the recording move?")
+
+
+def _variants(sensors: Sensors) -> dict[str, Sensors]:
+    return {TIGHT: sensors._replace(constraints=UNCONSTRAINED), VEHICLE: sensors}
+
+
+def station_errors(case: Case, seed: int) -> dict[str, Array]:
+    """(n, 3) north, east, down errors of the antenna against RTK, by coupling."""
+    known = recording()
+    assert known is not None
+    made = station_drive(known.drive, fewest=case.fewest, nearest=case.nearest, seed=seed)
+    templates = RowTemplates.of(made.stations, FIELDS)
+    heard, row_start, rows, _ = observation_rows(made.seen, templates, 0)
+    rows[:, LEVER : LEVER + 3] = LEVER_ARM_M
+    after = made.stamps_ns[heard] > known.start[0]
+    first = int(np.argmax(after))
+    epochs = Epochs(made.stamps_ns[heard][first:], row_start[first:], rows)
+    fixes = fix_each(epochs, float(made.antenna[0, 2]), 0.0)
+    free = _variants(known.sensors)[TIGHT]
+    runs = {LOOSE: _run(known, loose_epochs(epochs, fixes, LEVER_ARM_M), free)}
+    runs |= {name: _run(known, epochs, taken) for name, taken in _variants(known.sensors).items()}
+    truth = made.antenna[heard][first:]
+    return {name: ned(_antenna(done.nav) - truth)[_SKIP:] for name, done in runs.items()}
+
+
+def _run(known: Recording, epochs: Epochs, sensors: Sensors) -> Drive:
+    result: Drive = drive(*known.start, known.imu, epochs, sensors, known.gate)
+    return result
+
+
+def _antenna(nav: Array) -> Array:
+    """(n, 3) of states (n, NAV)."""
+    return np.asarray(nav[:, :3] + Rotation.from_quat(nav[:, 6:10]).apply(LEVER_ARM_M))
+
+
+def station_seeds(case: Case, seeds: range) -> dict[str, tuple[int, Array]]:
+    """Epochs and sums of squared north, east, down errors over some seeds, by coupling."""
+    total: dict[str, tuple[int, Array]] = {}
+    for seed in seeds:
+        for name, error in station_errors(case, seed).items():
+            n, square = total.get(name, (0, np.zeros(3)))
+            total[name] = n + len(error), square + (error**2).sum(axis=0)
+    return total
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outages:
+    """Horizontal errors [m] while nothing aids the IMU: error (outages, k) at time_s (k,) after
+    the last RTK solution."""
+
+    time_s: Array
+    error: Array
+
+    def at(self, seconds: float) -> Array:
+        """(outages,) errors after so long."""
+        return np.asarray(self.error[:, int(np.argmin(np.abs(self.time_s - seconds)))])
+
+
+def outages(variant: str) -> Outages:
+    """RTK aids the filter, and is withheld for 30 s, again and again, each time from the aided
+    state."""
+    known = recording()
+    assert known is not None
+    sensors = _variants(known.sensors)[variant]
+    used = (known.drive.rtk_ns > known.start[0]) & (known.drive.rtk_ns <= known.imu.stamps_ns[-1])
+    stamps, antenna = known.drive.rtk_ns[used], known.drive.antenna[used]
+    cov = np.tile(np.diag(np.square(RTK_SD_M)), (len(stamps), 1, 1))
+    rows = place_rows(antenna, cov, LEVER_ARM_M)
+    row_start = np.arange(len(stamps) + 1) * 3
+    aided = _run(known, Epochs(stamps, row_start, rows.reshape(-1, rows.shape[-1])), sensors)
+    elapsed = (stamps - stamps[0]) / NS
+    grid = np.arange(0.0, OUTAGE_S + 0.1, 0.25)
+    curves = []
+    for begin in np.arange(SETTLE_S, elapsed[-1] - OUTAGE_S, OUTAGE_EVERY_S):
+        k = int(np.searchsorted(elapsed, begin))
+        inside = (elapsed > elapsed[k]) & (elapsed <= elapsed[k] + OUTAGE_S + 0.3)
+        silent = Epochs(stamps[inside], np.zeros(inside.sum() + 1, dtype=np.int64), rows[0, :0])
+        coast = drive(
+            int(stamps[k]), aided.nav[k], aided.cov[k], known.imu, silent, sensors, known.gate
+        )
+        error = np.linalg.norm((_antenna(coast.nav) - antenna[inside])[:, :2], axis=1)
+        curves.append(np.interp(grid, elapsed[inside] - elapsed[k], error))
+    return Outages(grid, np.array(curves))

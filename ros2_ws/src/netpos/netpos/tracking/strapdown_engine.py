@@ -1,0 +1,135 @@
+"""Whole drives at once, compiled: what the strapdown track does epoch by epoch."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from netpos.filters.compile import kernel
+from netpos.filters.error_state import MEMORY, Constraints, advance, correct, doubt_standstill
+from netpos.filters.measurement import GROUP, KIND, ORIGIN, ROW_WIDTH, VALUE, VARIANCE
+from netpos.filters.position_fix import fix_position, start_of
+from netpos.filters.space import SpaceKind
+from netpos.inertial.strapdown import ERR, NAV, Earth, InertialNoise
+from netpos.messages.values import Array
+
+Ints = NDArray[np.int64]
+_PLACE = int(SpaceKind.PLACE)
+
+
+class Epochs(NamedTuple):
+    """stamps_ns (N,) of the epochs and the rows of each: rows[row_start[i] : row_start[i + 1]]."""
+
+    stamps_ns: Ints
+    row_start: Ints  # (N + 1,)
+    rows: Array  # (M, ROW_WIDTH)
+
+
+class Imu(NamedTuple):
+    """Samples in base_link: stamps_ns (n,), rates (n, 6) angular velocity and specific force."""
+
+    stamps_ns: Ints
+    rates: Array
+
+
+class Sensors(NamedTuple):
+    """What the filter takes to be true of IMU, earth and vehicle."""
+
+    noise: InertialNoise
+    earth: Earth
+    constraints: Constraints
+
+
+class Drive(NamedTuple):
+    """After each of N epochs: nav (N, NAV), cov (N, ERR, ERR), nis and the rows behind it (N,)."""
+
+    nav: Array
+    cov: Array
+    nis: Array
+    dof: Ints
+
+
+@kernel
+def drive(
+    start_ns: int,
+    nav: Array,
+    cov: Array,
+    imu: Imu,
+    epochs: Epochs,
+    sensors: Sensors,
+    gate_nis: Array,
+) -> Drive:
+    """Filter a drive from ``nav`` (NAV,) and ``cov`` (ERR, ERR) at ``start_ns``."""
+    n = epochs.stamps_ns.size
+    navs, covs = np.empty((n, NAV)), np.empty((n, ERR, ERR))
+    nis, dof = np.zeros(n), np.zeros(n, np.int64)
+    state, P, memory, now = nav.copy(), cov.copy(), np.zeros(MEMORY), start_ns
+    for i in range(n):
+        stamp = epochs.stamps_ns[i]
+        advance(
+            state,
+            P,
+            memory,
+            now,
+            stamp,
+            imu.stamps_ns,
+            imu.rates,
+            sensors.noise,
+            sensors.earth,
+            sensors.constraints,
+        )
+        now = stamp
+        rows = epochs.rows[epochs.row_start[i] : epochs.row_start[i + 1]]
+        if rows.shape[0] > 0:
+            accepted = np.zeros(int(rows[-1, GROUP]) + 1)
+            nis[i], dof[i] = correct(state, P, rows, gate_nis, accepted)
+            if dof[i] == 0:
+                doubt_standstill(memory)
+        navs[i], covs[i] = state, P
+    return Drive(navs, covs, nis, dof)
+
+
+class Fixes(NamedTuple):
+    """One fix per epoch: position (N, 3), cov (N, 3, 3), status (N,) of ``FixStatus``."""
+
+    position: Array
+    cov: Array
+    status: Ints
+
+
+@kernel
+def fix_each(epochs: Epochs, height_m: float, height_sd_m: float) -> Fixes:
+    """Least-squares fixes of all epochs, each on its own.
+
+    height_m : where they start, and what the antenna's height is known to be within
+        ``height_sd_m``; 0: it is not known
+    """
+    n = epochs.stamps_ns.size
+    position, cov, status = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n, np.int64)
+    for i in range(n):
+        measured = epochs.rows[epochs.row_start[i] : epochs.row_start[i + 1]]
+        rows = measured
+        if height_sd_m > 0.0:
+            rows = np.zeros((measured.shape[0] + 1, ROW_WIDTH))
+            rows[:-1] = measured
+            rows[-1, KIND], rows[-1, VALUE] = _PLACE, height_m
+            rows[-1, VARIANCE], rows[-1, ORIGIN + 2] = height_sd_m**2, 1.0
+        fix = fix_position(rows, start_of(measured, height_m))
+        position[i], cov[i], status[i] = fix.position, fix.cov, fix.status
+    return Fixes(position, cov, status)
+
+
+def compile_kernels(sensors: Sensors) -> None:
+    """Compile, or load, what a track calls epoch by epoch, before its first measurement."""
+    nav, cov, memory = np.zeros(NAV), np.eye(ERR), np.zeros(MEMORY)
+    nav[9] = 1.0
+    stamps, rates = np.array([10_000_000], dtype=np.int64), np.zeros((1, 6))
+    advance(nav, cov, memory, 0, 10_000_000, stamps, rates, *sensors)
+    rows = np.zeros((3, ROW_WIDTH))
+    rows[:, KIND], rows[:, VARIANCE] = _PLACE, 1.0
+    rows[:, ORIGIN : ORIGIN + 3] = np.eye(3)
+    correct(nav, cov, rows, np.full(4, np.inf), np.zeros(1))
+    doubt_standstill(memory)
+    fix_position(rows, start_of(rows, 0.0))

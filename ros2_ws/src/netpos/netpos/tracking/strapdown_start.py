@@ -1,0 +1,141 @@
+"""The first state of a strapdown track: fixes of the last seconds and the IMU between them."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from netpos.filters.position_fix import FixStatus, fix_position, start_of
+from netpos.inertial.alignment import fit_course, way_of
+from netpos.messages.values import Array, ImuSample
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.strapdown_models import nav_of, start_sd
+
+_KEEP_NS = 70_000_000_000
+_WINDOW_NS = 20_000_000_000
+_SPAN_MIN_NS = 3_000_000_000  # shorter, and one bad fix makes a heading the filter cannot mend
+_ATTEMPT_NS = 500_000_000
+_HEADING_SD_MAX = 0.1
+_MISFIT_MAX = 4.0
+_TILT_SD = 0.03
+_NS = 1e9
+
+
+class SampleBuffer:
+    """The samples of the last minute, as the strapdown kernels take them."""
+
+    def __init__(self) -> None:
+        self._stamps: list[int] = []
+        self._rates: list[tuple[float, ...]] = []
+
+    def add(self, sample: ImuSample) -> str | None:
+        """Take a sample; returns the reason when it is not newer than the last."""
+        stamp = sample.stamp_ns
+        if self._stamps and stamp <= self._stamps[-1]:
+            return "duplicate" if stamp == self._stamps[-1] else "late"
+        self._stamps.append(stamp)
+        rate, force = sample.angular_velocity, sample.specific_force
+        self._rates.append((*rate.tolist(), *force.tolist()))
+        if self._stamps[0] < stamp - 2 * _KEEP_NS:
+            keep = bisect_left(self._stamps, stamp - _KEEP_NS)
+            del self._stamps[:keep], self._rates[:keep]
+        return None
+
+    def between(self, from_ns: int, to_ns: int) -> tuple[NDArray[np.int64], Array]:
+        """Stamps (n,) and rates (n, 6) that cover an interval, with one sample before it."""
+        first = max(bisect_right(self._stamps, from_ns) - 1, 0)
+        last = min(bisect_left(self._stamps, to_ns) + 1, len(self._stamps))
+        stamps = np.array(self._stamps[first:last], dtype=np.int64)
+        return stamps, np.array(self._rates[first:last], dtype=np.float64).reshape(-1, 6)
+
+
+@dataclass(frozen=True, slots=True)
+class _Fix:
+    stamp_ns: int
+    position: Array
+    cov: Array
+    lever: Array
+
+
+@dataclass(slots=True)
+class StrapdownStart:
+    """Collects fixes until position, speed and heading follow from them."""
+
+    config: TrackerConfig
+    _fixes: deque[_Fix] = field(default_factory=deque)
+    _tried_ns: int = 0
+
+    def copy(self) -> StrapdownStart:
+        """An independent copy."""
+        return StrapdownStart(self.config, self._fixes.copy(), self._tried_ns)
+
+    def add_rows(self, stamp_ns: int, rows: Array, lever: Array) -> None:
+        """Take the fix of one epoch of RSU rows, where they give one."""
+        fix = fix_position(rows, start_of(rows, self.config.device_height_m))
+        if fix.status == FixStatus.CONVERGED:
+            self.add_fix(stamp_ns, fix.position, fix.cov, lever)
+
+    def add_fix(self, stamp_ns: int, position: Array, cov: Array, lever: Array) -> None:
+        """Take a position (3,) of the antenna at ``lever``."""
+        self._fixes.append(_Fix(stamp_ns, position, cov, lever))
+        while self._fixes[0].stamp_ns < stamp_ns - _WINDOW_NS:
+            self._fixes.popleft()
+
+    def solve(self, imu: SampleBuffer) -> tuple[int, Array, Array] | None:
+        """Stamp, navigation state (NAV,) and covariance (ERR, ERR) at the newest fix; None while
+        they are not known well enough."""
+        if len(self._fixes) < 3:
+            return None
+        fixes = list(self._fixes)
+        begin, end = fixes[0].stamp_ns, fixes[-1].stamp_ns
+        if end - begin < _SPAN_MIN_NS or end - self._tried_ns < _ATTEMPT_NS:
+            return None
+        self._tried_ns = end
+        stamps, rates = imu.between(begin, end)
+        if len(stamps) < 2 or stamps[0] - begin > _NS / 10 or end - stamps[-1] > _NS / 10:
+            return None
+        at = (np.array([fix.stamp_ns for fix in fixes]) - begin) / _NS
+        way = way_of((stamps - begin) / _NS, rates, at)
+        position = np.array([fix.position for fix in fixes])
+        cov = np.array([fix.cov for fix in fixes])
+        cov[:, :2, :2] += self._drift_var(at[-1] - at, position)[:, None, None] * np.eye(2)
+        course = fit_course(way, position[:, :2], cov[:, :2, :2])
+        if course is None or course.misfit > _MISFIT_MAX:
+            return None
+        heading_sd = math.sqrt(course.cov[2, 2])
+        position_sd = math.sqrt(max(course.cov[0, 0], course.cov[1, 1]))
+        if heading_sd > _HEADING_SD_MAX or position_sd > self.config.initial_position_sd_max_m:
+            return None
+        weight = 1.0 / cov[:, 2, 2]
+        height = float(position[:, 2] @ weight / weight.sum())
+        turn = Rotation.from_euler("ZYX", [course.heading, course.pitch, course.roll])
+        ahead = np.array([math.cos(course.heading), math.sin(course.heading), 0.0])
+        antenna = np.array([*course.position, height])
+        nav = nav_of(antenna - turn.apply(fixes[-1].lever), course.speed * ahead, turn.as_quat())
+        return end, nav, self._covariance(course.cov, course.speed, ahead, 1.0 / weight.sum())
+
+    def _drift_var(self, age_s: Array, position: Array) -> Array:
+        """(k,) variance [m^2] of where the biases of the IMU take a way in ``age_s`` (k,)."""
+        length = np.linalg.norm((position - position[-1])[:, :2], axis=1)
+        turned = self.config.gyro_bias_sd_radps * age_s * length / 2
+        return np.asarray((self.config.accel_bias_sd_mps2 * age_s**2 / 2) ** 2 + turned**2)
+
+    def _covariance(self, course: Array, speed: float, ahead: Array, height_var: float) -> Array:
+        """(ERR, ERR) of a start: course (4, 4) is that of east, north, heading and speed."""
+        cov = np.diag(start_sd(self.config, 1.0, 0.1, _TILT_SD, _TILT_SD) ** 2)
+        J = np.zeros((15, 4))
+        J[0, 0] = J[1, 1] = J[8, 2] = 1.0
+        J[3:5, 3] = ahead[:2]
+        J[3:5, 2] = speed * np.array([-ahead[1], ahead[0]])
+        known = [0, 1, 3, 4, 8]
+        cov[known, known] = 0.0
+        cov += J @ course @ J.T
+        cov[[0, 1, 3, 4, 8], [0, 1, 3, 4, 8]] += [0.01, 0.01, 0.25, 0.25, 1e-3]
+        cov[2, 2] = max(height_var, 0.25)
+        return cov

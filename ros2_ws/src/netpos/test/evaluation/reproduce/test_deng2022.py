@@ -1,0 +1,138 @@
+"""deng2022: the drives' bookkeeping by other routes, and every cell of both tables."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from netpos.evaluation.reproduce import blocked_drive as drives
+from netpos.evaluation.reproduce import car_drive, deng2022
+from netpos.evaluation.reproduce.blocked_drive import (
+    FIX,
+    FIX_HEIGHT,
+    LOOSE,
+    TIGHT,
+    VARIANTS,
+    VEHICLE,
+    Run,
+    Tally,
+    run,
+    tally_seeds,
+)
+from netpos.evaluation.reproduce.frame import Work
+from netpos.filters.position_fix import FixStatus
+from scipy.spatial.transform import Rotation
+
+SEED = 5001
+
+
+@pytest.fixture(scope="module")
+def blocked() -> Run:
+    return run(deng2022.BLOCKED, SEED)
+
+
+@pytest.fixture(scope="module")
+def tally() -> dict[str, Tally]:
+    return tally_seeds(deng2022.BLOCKED, range(SEED, SEED + 1))
+
+
+def test_figures_are_those_of_the_run(blocked: Run, tally: dict[str, Tally]) -> None:
+    """RMS by axis of the vehicle's drive, written out."""
+    error = blocked.drives[TIGHT].nav[:, :3] - blocked.position
+    north, east, down = tally[TIGHT].rms_m
+    assert north == pytest.approx(np.sqrt(np.mean(error[:, 1] ** 2)))
+    assert east == pytest.approx(np.sqrt(np.mean(error[:, 0] ** 2)))
+    assert down == pytest.approx(np.sqrt(np.mean(error[:, 2] ** 2)))
+    assert tally[TIGHT].n == len(error) == 604
+    values = [
+        e @ np.linalg.inv(P[:3, :3]) @ e
+        for e, P in zip(error, blocked.drives[TIGHT].cov, strict=True)
+    ]
+    assert tally[TIGHT].nees_test(3).mean == pytest.approx(np.mean(values))
+    fixes = blocked.fixes[FIX]
+    good = fixes.status == FixStatus.CONVERGED
+    assert tally[FIX].success_percent == pytest.approx(100 * good.mean())
+    misses = (fixes.position - blocked.antenna)[good]
+    assert tally[FIX].rms_m[1] == pytest.approx(np.sqrt(np.mean(misses[:, 0] ** 2)))
+
+
+def test_attitude_errors_are_small_rotations(blocked: Run) -> None:
+    error = drives.error_of(blocked, blocked.drives[VEHICLE])
+    estimate = Rotation.from_quat(blocked.drives[VEHICLE].nav[:, 6:10])
+    angle = (estimate * blocked.attitude.inv()).magnitude()
+    np.testing.assert_allclose(np.linalg.norm(error[:, 6:], axis=1), angle, atol=1e-9)
+    assert np.degrees(np.sqrt(np.mean(angle[100:] ** 2))) < 2.0
+
+
+def test_couplings_stand_in_their_order(tally: dict[str, Tally]) -> None:
+    """Single epochs, then the filter, then what vehicles do not do."""
+    plane = {name: np.hypot(*t.rms_m[:2]) for name, t in tally.items()}
+    assert set(tally) == set(VARIANTS)
+    assert plane[VEHICLE] < plane[TIGHT] < 0.5 * plane[FIX]
+    assert plane[LOOSE] < 0.5 * plane[FIX]
+    assert tally[FIX_HEIGHT].rms_m[2] < tally[FIX].rms_m[2]
+
+
+def test_tallies_add(tally: dict[str, Tally]) -> None:
+    twice = tally[TIGHT] + tally[TIGHT]
+    assert twice.n == 2 * tally[TIGHT].n
+    assert twice.rms_m == pytest.approx(tally[TIGHT].rms_m)
+    np.testing.assert_allclose(twice.nees, 2 * tally[TIGHT].nees)
+
+
+def test_outages_are_ten_silent_seconds() -> None:
+    done = run(deng2022.OUTAGES, SEED)
+    silent = ~done.heard
+    edges = np.flatnonzero(np.diff(silent.astype(int)))
+    lengths = np.diff(edges)[::2]
+    assert set(lengths.tolist()) == {drives.OUTAGE_S - 1}  # silent epochs between heard ones
+    result = tally_seeds(deng2022.OUTAGES, range(SEED, SEED + 1))[VEHICLE]
+    assert result.outages == len(lengths)
+    ends = edges[1::2]
+    error = (done.drives[VEHICLE].nav[:, :3] - done.position)[ends]
+    plane = np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1)))
+    assert result.outage_rms_m[0] == pytest.approx(plane)
+
+
+def test_every_cell_has_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All cells of Tables 1 and 2 with the paper's values; without the recording the real rows
+    are empty and say why."""
+    monkeypatch.setattr(car_drive, "recording", lambda: None)
+    with Work(1, SEED, 1) as work:
+        outcome = deng2022.reproduce(work)
+    assert len(outcome.notes) == 1
+    rows = {row.name: row for row in outcome.rows}
+    assert len(rows) == len(outcome.rows)
+    json.dumps([row.ours for row in outcome.rows], allow_nan=False)
+    for case, fix, ins in deng2022.TABLES:
+        for name, cells in ((FIX, fix), (f"SINS, {LOOSE}", ins), (f"SINS, {VEHICLE}", ins)):
+            label = f"{case.name}, {name}"
+            found = [rows[f"{label}: success"]]
+            found += [rows[f"{label}: RMS {axis}"] for axis in ("north", "east", "down")]
+            assert tuple(row.paper for row in found) == cells
+            assert all(row.ok is not None for row in found)
+    real = [row for row in outcome.rows if row.name.startswith("Real")]
+    assert len(real) == 22
+    assert all(row.ours is None for row in real)
+
+
+@pytest.mark.parametrize(("seconds", "limit"), [(10.0, 2.0)])
+def test_the_real_imu_holds_an_outage(seconds: float, limit: float) -> None:
+    if car_drive.recording() is None:
+        pytest.skip("no recording car_imu_rtk; set NETPOS_DATA")
+    coasts = car_drive.outages(VEHICLE)
+    assert len(coasts.error) >= 40
+    assert np.median(coasts.at(seconds)) < limit
+    assert coasts.at(0.0).max() < 0.5
+    assert np.median(coasts.at(30.0)) > np.median(coasts.at(5.0))
+
+
+def test_the_real_drive_among_stations() -> None:
+    if car_drive.recording() is None:
+        pytest.skip("no recording car_imu_rtk; set NETPOS_DATA")
+    few = replace(deng2022.BLOCKED, fewest=2)
+    errors = car_drive.station_errors(few, SEED)
+    rms = {name: float(np.sqrt((e[:, :2] ** 2).sum(axis=1).mean())) for name, e in errors.items()}
+    assert rms[VEHICLE] < rms[TIGHT] < 2.0

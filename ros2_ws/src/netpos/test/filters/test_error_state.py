@@ -1,0 +1,216 @@
+"""The error-state filter: updates against the information form, holes, constraints."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from netpos.filters.error_state import (
+    MEMORY,
+    UNCONSTRAINED,
+    Constraints,
+    advance,
+    correct,
+)
+from netpos.filters.measurement import VALUE, VARIANCE
+from netpos.filters.space import SpaceKind, direction_rows, innovation_at, place_rows
+from netpos.inertial.strapdown import (
+    ERR,
+    GYRO_BIAS,
+    NAV,
+    InertialNoise,
+    inject,
+    rotation_of,
+    still_earth,
+)
+from netpos.messages.values import Array
+from scipy.spatial.transform import Rotation
+
+G = 9.80665
+NOISE = InertialNoise(2e-3, 8.7e-4, 9.8e-3, 1.7e-4, 100.0)
+OPEN = np.array([0.0, np.inf, np.inf, np.inf, np.inf])
+LEVER_ARM = (0.5, 0.1, 1.0)
+
+
+def start(yaw: float = 0.4) -> Array:
+    nav = np.zeros(NAV)
+    nav[:6] = 5.0, -3.0, 1.0, 2.0, 1.0, 0.0
+    nav[6:10] = Rotation.from_euler("ZYX", [yaw, 0.02, -0.03]).as_quat()
+    return nav
+
+
+def spd(rng: np.random.Generator) -> Array:
+    A = rng.normal(size=(ERR, ERR)) * np.repeat([0.5, 0.2, 0.01, 0.01, 1e-3], 3)[:, None]
+    return A @ A.T
+
+
+def test_correct_is_the_information_form() -> None:
+    """All rows at once by another route; a fix is linear enough for one step."""
+    rng = np.random.default_rng(1)
+    nav, cov = start(), spd(rng)
+    rows = place_rows(np.array([5.3, -2.8, 2.1]), np.diag([0.4, 0.3, 0.2]), LEVER_ARM)
+    H, z, C = np.empty((3, ERR)), np.empty(3), np.empty((3, 3))
+    rotation_of(nav[6:10], C)
+    for i in range(3):
+        z[i] = innovation_at(rows[i], nav, C, H[i])
+    R = np.diag(rows[:, VARIANCE])
+    posterior = np.linalg.inv(np.linalg.inv(cov) + H.T @ np.linalg.inv(R) @ H)
+    error = posterior @ H.T @ np.linalg.inv(R) @ z
+    S = H @ cov @ H.T + R
+    expected = nav.copy()
+    inject(expected, error)
+    nis, used = correct(nav, cov, rows, OPEN, np.zeros(1))
+    assert used == 3
+    assert nis == pytest.approx(z @ np.linalg.solve(S, z), rel=1e-9)
+    np.testing.assert_allclose(nav, expected, atol=2e-4)
+    sd = np.sqrt(np.diag(posterior))
+    np.testing.assert_allclose(cov / np.outer(sd, sd), posterior / np.outer(sd, sd), atol=0.02)
+    np.testing.assert_array_equal(cov, cov.T)
+
+
+def test_a_row_outside_the_gate_changes_nothing() -> None:
+    rng = np.random.default_rng(2)
+    nav, cov = start(), spd(rng)
+    before, P = nav.copy(), cov.copy()
+    rows = place_rows(nav[:3] + 100.0, np.eye(3), LEVER_ARM)
+    accepted = np.ones(1)
+    gate = np.array([0.0, 10.0, 13.0, 16.0])
+    assert correct(nav, cov, rows, gate, accepted) == (0.0, 0)
+    assert accepted[0] == 0.0
+    np.testing.assert_array_equal(nav, before)
+    np.testing.assert_array_equal(cov, P)
+
+
+def test_groups_are_gated_apart() -> None:
+    rng = np.random.default_rng(3)
+    nav, cov = start(), spd(rng)
+    good, bad = (
+        place_rows(nav[:3] + shift, np.eye(3), (0.0, 0.0, 0.0), group)
+        for group, shift in enumerate((0.1, 50.0))
+    )
+    accepted = np.zeros(2)
+    _, used = correct(nav, cov, np.vstack([good, bad]), np.full(4, 16.0), accepted)
+    assert used == 3
+    assert accepted.tolist() == [1.0, 0.0]
+    assert np.abs(nav[:3] - start()[:3]).max() < 0.2
+
+
+def test_a_near_range_is_iterated_to_its_sphere() -> None:
+    """3 m from the station and 2 m uncertain one linearisation overshoots; the iterated update
+    ends where the cost is smallest."""
+    from scipy.optimize import minimize  # noqa: PLC0415
+
+    nav, cov = start(0.0), 1e-6 * np.eye(ERR)
+    nav[:3] = 3.0, 0.0, 0.0
+    cov[:3, :3] = np.diag([4.0, 4.0, 0.01])
+    row = np.zeros((1, 23))
+    row[0, 0], row[0, VALUE], row[0, VARIANCE], row[0, 3] = 3, 5.0, 0.01, 0.01
+    row[0, 7:10] = 0.0, 2.5, 0.0
+
+    def cost(p: Array, bend: float) -> float:
+        prior = (p - [3.0, 0.0, 0.0]) ** 2 / [4.0, 4.0, 0.01]
+        return float(prior.sum() + (5.0 - np.linalg.norm(p - row[0, 7:10])) ** 2 / (0.01 + bend))
+
+    from netpos.filters.space import bend_variance  # noqa: PLC0415
+
+    bend = bend_variance(row[0], nav, cov)
+    best = minimize(cost, [4.0, -1.0, 0.0], args=(bend,), method="Nelder-Mead",
+                    options={"xatol": 1e-6, "fatol": 1e-10}).x  # fmt: skip
+    correct(nav, cov, row, OPEN, np.zeros(1))
+    np.testing.assert_allclose(nav[:3], best, atol=0.02)
+
+
+def level(n: int, rate: float = 0.0) -> tuple[Array, Array]:
+    """Stamps and rates of a level vehicle at constant speed, 100 Hz."""
+    stamps = np.arange(1, n + 1, dtype=np.int64) * 10_000_000
+    return stamps, np.tile([0.0, 0.0, rate, 0.0, 0.0, G], (n, 1))
+
+
+def moving(speed: float) -> Array:
+    nav = np.zeros(NAV)
+    nav[3], nav[9] = speed, 1.0
+    return nav
+
+
+def test_advance_is_the_same_however_it_is_cut() -> None:
+    stamps, rates = level(300, 0.2)
+    rates[:, 3] = 0.5
+    ends = []
+    for cuts in ([3_000_000_000], [777_000_000, 1_500_000_000, 3_000_000_000]):
+        nav, cov, memory, now = moving(5.0), 1e-4 * np.eye(ERR), np.zeros(MEMORY), 0
+        for end in cuts:
+            args = (memory, now, end, stamps, rates, NOISE, still_earth(), UNCONSTRAINED)
+            assert advance(nav, cov, *args) == 0.0
+            now = end
+        ends.append((nav, cov))
+    np.testing.assert_allclose(ends[0][0], ends[1][0], atol=1e-9)
+    np.testing.assert_allclose(ends[0][1], ends[1][1], rtol=1e-2, atol=1e-10)
+
+
+@pytest.mark.parametrize("missing", ["middle", "end", "begin", "all"])
+def test_a_hole_of_the_imu_is_counted_and_opens_the_covariance(missing: str) -> None:
+    stamps, rates = level(300)
+    keep = {
+        "middle": (stamps <= 10**9) | (stamps > 2 * 10**9),
+        "end": stamps <= 2 * 10**9,
+        "begin": stamps > 10**9,
+        "all": stamps < 0,
+    }[missing]
+    sds = []
+    for mask in (np.ones(300, dtype=bool), keep):
+        nav, cov = moving(5.0), 1e-8 * np.eye(ERR)
+        blind = advance(
+            nav, cov, np.zeros(MEMORY), 0, 3 * 10**9, stamps[mask], rates[mask], NOISE,
+            still_earth(), UNCONSTRAINED,
+        )  # fmt: skip
+        np.testing.assert_allclose(nav[:6], [15.0, 0, 0, 5.0, 0, 0], atol=1e-6)
+        sds.append((blind, np.sqrt(cov[3, 3])))
+    (whole, sure), (blind, unsure) = sds
+    assert whole == 0.0
+    assert blind == pytest.approx(3.0 if missing == "all" else 1.0, abs=0.02)
+    assert unsure > 0.9 > 10 * sure
+
+
+def test_a_vehicle_does_not_slip() -> None:
+    """A wrong heading shows as sideways speed and is found, with the sideways velocity."""
+    stamps, rates = level(1000)
+    nav, cov = moving(10.0), np.diag([0.01] * 6 + [1e-4, 1e-4, 0.01] + [1e-6] * 6)
+    nav[6:10] = Rotation.from_euler("z", 0.1).as_quat()
+    held = Constraints(0.1, 0.1, 0.0, 0.0, 0.0)
+    advance(nav, cov, np.zeros(MEMORY), 0, 10**10, stamps, rates, NOISE, still_earth(), held)
+    C = Rotation.from_quat(nav[6:10])
+    assert abs(C.inv().apply(nav[3:6])[1]) < 0.02
+    assert abs(C.as_euler("ZYX")[0]) < 0.02
+
+
+@pytest.mark.parametrize(("quiet", "standing"), [(True, True), (False, False)])
+def test_standstill_shows_the_gyro_bias(quiet: bool, standing: bool) -> None:
+    """At rest with a biased gyro; an IMU that shakes is not at rest."""
+    rng = np.random.default_rng(6)
+    stamps, rates = level(1000)
+    rates[:, :3] += [0.002, -0.001, 0.003]
+    rates += (0.001 if quiet else 0.5) * rng.normal(size=rates.shape)
+    cov = np.diag([1.0] * 3 + [0.01] * 3 + [1e-6] * 2 + [0.01] + [1e-6] * 3 + [1e-4] * 3)
+    noise = NOISE._replace(gyro_bias_sd_radps=0.01)
+    rest = Constraints(0.0, 0.0, 0.02, 0.5, 0.1)
+    nav = moving(0.0)
+    advance(nav, cov, np.zeros(MEMORY), 0, 10**10, stamps, rates, noise, still_earth(), rest)
+    known = np.abs(nav[GYRO_BIAS:] - [0.002, -0.001, 0.003]).max() < 5e-4
+    assert known is np.bool_(standing)
+    assert (np.sqrt(cov[3, 3]) < 0.01) is np.bool_(standing)
+
+
+def test_a_quiet_cruise_is_no_standstill() -> None:
+    stamps, rates = level(500)
+    nav, cov = moving(15.0), 0.01 * np.eye(ERR)
+    rest = Constraints(0.0, 0.0, 0.02, 0.5, 0.1)
+    advance(nav, cov, np.zeros(MEMORY), 0, 5 * 10**9, stamps, rates, NOISE, still_earth(), rest)
+    assert nav[3] == pytest.approx(15.0, abs=1e-6)
+
+
+def test_constraint_rows_follow_their_covariance() -> None:
+    """Velocity rows on a velocity of variance P and R: the posterior of a scalar."""
+    nav, cov = moving(0.0), np.diag([1.0] * 3 + [4.0] * 3 + [1e-9] * 9)
+    rows = direction_rows(SpaceKind.BODY_VELOCITY, np.eye(3), np.ones(3), np.ones(3), 0)
+    correct(nav, cov, rows, OPEN, np.zeros(1))
+    np.testing.assert_allclose(nav[3:6], 4.0 / 5.0, rtol=1e-6)
+    np.testing.assert_allclose(np.diag(cov)[3:6], 4.0 / 5.0, rtol=1e-6)

@@ -1,0 +1,168 @@
+"""Rows in space against SciPy geometry and central differences of the error state."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from netpos.filters.measurement import KIND, LEVER, ORIGIN, VALUE, Kind, rsu_axes, rsu_rows
+from netpos.filters.space import (
+    SpaceKind,
+    bend_variance,
+    direction_rows,
+    innovation_at,
+    place_rows,
+    value_at,
+)
+from netpos.inertial.strapdown import ERR, GYRO_BIAS, NAV, inject, rotation_of
+from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
+from scipy.spatial.transform import Rotation
+
+LEVER_ARM = (0.4, -0.3, 1.2)
+
+
+def state(rng: np.random.Generator) -> Array:
+    nav = np.zeros(NAV)
+    nav[:6] = 10.0 * rng.normal(size=6)
+    nav[6:10] = Rotation.random(rng=rng).as_quat()
+    nav[10:] = 0.1 * rng.normal(size=6)
+    return nav
+
+
+def all_rows(rng: np.random.Generator) -> Array:
+    """Rows of every kind: both angle conventions of a tilted RSU, ranges, places, constraints."""
+    blocks = []
+    for convention in AngleConvention:
+        info = RsuInfo(
+            rsu_id="a",
+            position=np.array([30.0, -20.0, 8.0]),
+            quaternion=Rotation.random(rng=rng).as_quat(),
+            angle_convention=convention,
+        )
+        m = RsuMeasurement(
+            stamp_ns=1,
+            rsu_id="a",
+            vue_id="v",
+            fields=Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE,
+            azimuth_rad=3.0,
+            azimuth_var=0.01,
+            elevation_rad=0.3,
+            elevation_var=0.01,
+            toa_s=1e-7,
+            toa_var=1e-18,
+            range_m=30.0,
+            range_var=1.0,
+            lever_arm=LEVER_ARM,
+        )
+        blocks.append(rsu_rows(m, info, rsu_axes(info), 0))
+    A = rng.normal(size=(3, 3))
+    blocks.append(place_rows(np.array([1.0, 2.0, 3.0]), A @ A.T + np.eye(3), LEVER_ARM))
+    blocks += [
+        direction_rows(kind, rng.normal(size=(2, 3)), np.zeros(2), np.ones(2), 0)
+        for kind in (SpaceKind.BODY_VELOCITY, SpaceKind.BODY_RATE)
+    ]
+    return np.vstack(blocks)
+
+
+def innovation(row: Array, nav: Array) -> tuple[float, Array]:
+    C, h = np.empty((3, 3)), np.empty(ERR)
+    rotation_of(nav[6:10], C)
+    return innovation_at(row, nav, C, h), h
+
+
+def test_jacobians_are_central_differences() -> None:
+    rng = np.random.default_rng(2)
+    kinds = set()
+    for _ in range(5):
+        nav = state(rng)
+        for row in all_rows(rng):
+            _, h = innovation(row, nav)
+            for j in range(ERR):
+                values = []
+                for sign in (1.0, -1.0):
+                    moved = nav.copy()
+                    inject(moved, sign * 1e-5 * np.eye(ERR)[j])
+                    values.append(innovation(row, moved)[0])
+                slope = -math.remainder(values[0] - values[1], math.tau) / 2e-5
+                assert h[j] == pytest.approx(slope, abs=2e-6), (row[KIND], j)
+            kinds.add(int(row[KIND]))
+    assert kinds == {0, 1, 2, 3, 6, 7, 8, 9, 10}
+
+
+def test_values_are_those_of_the_geometry() -> None:
+    rng = np.random.default_rng(5)
+    nav = state(rng)
+    antenna = nav[:3] + Rotation.from_quat(nav[6:10]).apply(LEVER_ARM)
+    for row in all_rows(rng):
+        kind, predicted = int(row[KIND]), row[VALUE] - innovation(row, nav)[0]
+        u = row[10:19].reshape(3, 3) @ (antenna - row[ORIGIN : ORIGIN + 3])
+        body = Rotation.from_quat(nav[6:10]).inv().apply(nav[3:6])
+        expected = {
+            Kind.AZIMUTH: math.atan2(u[1], u[0]),
+            Kind.ELEVATION: math.asin(u[2] / np.linalg.norm(u)),
+            Kind.RANGE: np.linalg.norm(u),
+            Kind.TOA: np.linalg.norm(u),
+            Kind.COSINE_Y: u[1] / np.linalg.norm(u),
+            Kind.COSINE_Z: u[2] / np.linalg.norm(u),
+            SpaceKind.PLACE: row[ORIGIN : ORIGIN + 3] @ antenna,
+            SpaceKind.BODY_VELOCITY: row[ORIGIN : ORIGIN + 3] @ body,
+            SpaceKind.BODY_RATE: row[ORIGIN : ORIGIN + 3] @ nav[GYRO_BIAS:],
+        }[kind]
+        if kind not in (Kind.AZIMUTH, Kind.ELEVATION):
+            assert predicted == pytest.approx(expected, abs=1e-9)
+        else:
+            assert math.remainder(predicted - expected, math.tau) == pytest.approx(0, abs=1e-9)
+
+
+def test_an_angle_across_the_back_is_a_small_residual() -> None:
+    """Device just south of west, reading just north of west."""
+    info = RsuInfo(rsu_id="a", position=np.zeros(3))
+    m = RsuMeasurement(
+        stamp_ns=1, rsu_id="a", vue_id="v", fields=Field.AZIMUTH, azimuth_rad=math.pi - 0.01,
+        azimuth_var=1.0,
+    )  # fmt: skip
+    nav = np.zeros(NAV)
+    nav[:2], nav[9] = (-10.0, -0.1), 1.0
+    value, _ = innovation(rsu_rows(m, info, rsu_axes(info), 0)[0], nav)
+    assert value == pytest.approx(-0.02, abs=1e-4)
+
+
+def test_place_rows_hold_the_whole_covariance() -> None:
+    """The squared norm of their residuals is the Mahalanobis distance of the fix."""
+    rng = np.random.default_rng(8)
+    A = rng.normal(size=(4, 3, 3))
+    cov, fix, at = A @ A.transpose(0, 2, 1), rng.normal(size=(4, 3)), rng.normal(size=3)
+    rows = place_rows(fix, cov, (0.0, 0.0, 0.0))
+    assert rows.shape[:2] == (4, 3)
+    for i in range(4):
+        residuals = [row[VALUE] - value_at(row, *at)[0] for row in rows[i]]
+        expected = (fix[i] - at) @ np.linalg.solve(cov[i], fix[i] - at)
+        assert np.sum(np.square(residuals)) == pytest.approx(expected, rel=1e-9)
+        assert rows[i, 0, LEVER : LEVER + 3].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_flat_covariance_is_refused() -> None:
+    with pytest.raises(np.linalg.LinAlgError):
+        place_rows(np.zeros(3), np.diag([1.0, 1.0, 0.0]), (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("kind", [Kind.RANGE, Kind.AZIMUTH, Kind.ELEVATION])
+def test_bend_variance_covers_what_linearising_leaves_out(kind: Kind) -> None:
+    """Monte Carlo: no smaller than the variance of the remainder, and no ten times larger."""
+    rng = np.random.default_rng(9)
+    row = np.zeros(23)
+    row[KIND], row[19] = kind, -1
+    row[10:19] = np.eye(3).ravel()
+    nav = np.zeros(NAV)
+    nav[:3], nav[9] = (12.0, 9.0, -6.0), 1.0
+    A = rng.normal(size=(3, 3))
+    cov = np.zeros((ERR, ERR))
+    cov[:3, :3] = 0.3 * (A @ A.T)
+    value, *g = value_at(row, *nav[:3])
+    offsets = rng.multivariate_normal(np.zeros(3), cov[:3, :3], 20000)
+    exact = np.array([value_at(row, *(nav[:3] + d))[0] for d in offsets])
+    remainder = exact - value - offsets @ np.array(g)
+    claimed = bend_variance(row, nav, cov)
+    assert np.mean(remainder**2) < 3.0 * claimed
+    assert claimed < 10.0 * np.mean(remainder**2)

@@ -1,0 +1,51 @@
+"""The drive in space as a live graph: three-dimensional measurements, IMU, strapdown tracker."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from netpos.bags import codec
+from runs import (
+    INFOS,
+    MEASUREMENTS,
+    ODOMETRY,
+    TRACK_STATUS,
+    TRUTH,
+    changed_scenario,
+    finish,
+    graphs,
+    messages,
+    netpos,
+    payloads,
+    script,
+)
+
+SEED = "3"
+
+
+def test_a_drive_in_space_is_the_same_live_and_offline(tmp_path: Path) -> None:
+    """Every message alike, bit by bit; position, height and attitude are those of the truth."""
+    drive = changed_scenario(tmp_path / "drive.yaml", "blocked_5g_drive", max_duration_s=40.0)
+    live, offline = tmp_path / "live", tmp_path / "offline"
+    with graphs(tmp_path) as (graph,):
+        started = script(graph, "run_graph", drive, live, "4", SEED)
+        netpos("run", drive, "--offline", "--seed", SEED, "--bag", offline)
+        finish(started)
+    topics = (INFOS, MEASUREMENTS, ODOMETRY, TRACK_STATUS, TRUTH, "/vue_1/imu", "/vue_1/beacon")
+    mine, theirs = payloads(live, topics), payloads(offline, topics)
+    for topic in topics:
+        assert theirs[topic], topic
+        assert len(mine[topic]) == len(theirs[topic]), topic
+        assert mine[topic] == theirs[topic], topic
+    again = tmp_path / "again"
+    netpos("replay", live, "--out", again)
+    assert payloads(again, (ODOMETRY,))[ODOMETRY] == mine[ODOMETRY]
+    truth = {o.stamp_ns: o for o in map(codec().odometry_from_msg, messages(live, TRUTH))}
+    found = [codec().odometry_from_msg(m) for m in messages(live, ODOMETRY)]
+    assert len(found) >= 20
+    errors = np.array([o.position - truth[o.stamp_ns].position for o in found[-10:]])
+    assert np.linalg.norm(errors[:, :2], axis=1).max() < 5.0
+    assert np.abs(errors[:, 2]).max() < 3.0
+    facing = [abs(o.quaternion @ truth[o.stamp_ns].quaternion) for o in found[-10:]]
+    assert min(facing) > np.cos(0.1)  # half of 0.2 rad
