@@ -104,8 +104,8 @@ MANOEUVRE = tuple(
 )
 
 _CROSSING = Crossing(
-    setting=replace(COMMON_NOISE, name="crossing", duration_s=40.0),
-    meeting_s=20.0,
+    setting=replace(COMMON_NOISE, name="crossing", duration_s=30.0),
+    meeting_s=15.0,
     fan_deg=180.0,
     speed_mps=(8.0, 20.0),
     fusion=FusionConfig(jerk_density=JERK),
