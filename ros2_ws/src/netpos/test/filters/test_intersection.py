@@ -121,6 +121,17 @@ def test_ici_is_honest_about_an_estimate_both_have_fused(seed: int, random_cov: 
     assert np.linalg.slogdet(pair.cov)[1] <= np.linalg.slogdet(plain.cov)[1] + 1e-9
 
 
+def test_ici_gains_of_the_paper(random_cov: Maker) -> None:
+    """Noack 2017, eq. 11 and 12: K = P (A^-1 - w G^-1), L = P (B^-1 - (1 - w) G^-1)."""
+    rng = np.random.default_rng(11)
+    a, b, zero = random_cov(rng, N), 2.0 * random_cov(rng, N), np.zeros((N, N))
+    pair = fuse_pair(a, zero, b, zero, "ici")
+    G = pair.weight * a + (1.0 - pair.weight) * b
+    assert abs(pair.weight - 0.5) > 0.05
+    K = np.linalg.solve(np.linalg.inv(pair.cov), np.linalg.inv(a) - pair.weight * np.linalg.inv(G))
+    np.testing.assert_allclose(pair.gain_a, K, rtol=1e-6, atol=1e-9)
+
+
 def test_a_worse_copy_adds_nothing_to_ci() -> None:
     a, zero = np.diag([1.0, 4.0, 9.0, 1.0]), np.zeros((N, N))
     pair = fuse_pair(a, zero, 10.0 * a, zero, "ci")

@@ -33,6 +33,9 @@ def test_stretches_join_and_derivatives_agree() -> None:
     away = np.abs(t[:, None] - [4.0, 6.0]).min(axis=1) > 2 * step
     np.testing.assert_allclose(now.yaw_rate[away], turn[away], atol=1e-4)
     np.testing.assert_allclose(now.yaw, np.arctan2(now.velocity[:, 1], now.velocity[:, 0]))
+    left, right = motion.at([4.0 - 1e-9, 6.0 - 1e-9]), motion.at([4.0, 6.0])
+    np.testing.assert_allclose(left.position, right.position, atol=1e-7)
+    np.testing.assert_allclose(left.velocity, right.velocity, atol=1e-7)
     assert motion.at([4.0]).acceleration.tolist() == [[0.0, 0.0]]
 
 

@@ -117,6 +117,17 @@ def test_a_wrong_pair_is_given_up_once_the_rival_is_clearly_better() -> None:
     assert after[-1] == [[0, 3], [1, 2]]
 
 
+def test_a_pair_that_stands_is_kept_against_a_rival_within_the_margin() -> None:
+    """A whole swap has to be better by twice the margin, one for each pair it ends."""
+    for excess, kept in ((1.9, True), (2.1, False)):
+        made = association(gate_probability=1.0, memory_s=0.1, decision_margin=4.0)
+        assert look(made, 0.0, [0.0, 10.0, 0.0, 10.0]) == [[0, 2], [1, 3]]
+        # swapped costs 0, as it stands 2 * gap^2 / 2 = gap^2: equal to 4 * excess
+        gap = 2.0 * np.sqrt(excess)
+        now = look(made, 10.0, [0.0, gap, gap, 0.0])
+        assert now == ([[0, 2], [1, 3]] if kept else [[0, 3], [1, 2]])
+
+
 def test_forgotten_tracks_leave_no_trace() -> None:
     made = association()
     look(made, 0.0, [0.0, 50.0, 0.1, 50.1])

@@ -73,6 +73,23 @@ def test_order_of_arrival_does_not_matter(track: Maker) -> None:
             np.testing.assert_array_equal(a.pose_cov, b.pose_cov)
 
 
+def test_a_network_not_heard_yet_is_waited_for(track: Maker) -> None:
+    made = fusion(hold_s=1.0, stale_s=5.0)
+    assert feed(made, track("wifi", 0.0), track("wifi", 0.9)) == []
+    (first,) = feed(made, track("wifi", 1.0))
+    assert first.odometry is not None
+    assert first.odometry.stamp_ns == track("wifi", 0.0).stamp_ns
+
+
+def test_once_all_are_heard_nothing_is_waited_for(track: Maker) -> None:
+    made = fusion(hold_s=1.0, stale_s=5.0)
+    feed(made, track("wifi", 0.0))
+    stamps = [o.status.stamp_ns for o in feed(made, track("wimax", 0.0))]
+    assert stamps[-1] == track("wimax", 0.0).stamp_ns
+    outputs = feed(made, track("wifi", 0.5), track("wimax", 0.5))
+    assert [o.status.stamp_ns for o in outputs] == [track("wifi", 0.5).stamp_ns]
+
+
 def test_a_stale_network_is_left_out_and_said_so(track: Maker) -> None:
     made = fusion(stale_s=1.0)
     feed(made, track("wifi", 0.0))
@@ -122,7 +139,8 @@ def test_a_new_segment_is_a_new_acquaintance(track: Maker) -> None:
 
 
 def test_three_networks(track: Maker) -> None:
-    made = fusion("a", "b", "c", method="independent", jerk_density=0.0)
+    """All noise is their own, so split intersection of the third counts it once."""
+    made = fusion("a", "b", "c", jerk_density=0.0)
     tracks = [track(name, 0.0, x, var=3.0) for name, x in (("a", 0.0), ("b", 3.0), ("c", 6.0))]
     output = feed(made, *tracks)[-1]
     assert output.odometry is not None
