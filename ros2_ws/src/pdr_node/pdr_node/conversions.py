@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from netpos.inertial.pdr import PdrOutput
+from netpos.inertial.pdr_output import PdrOutput
 from netpos.inertial.pdr_values import values_of
 from netpos.messages.values import Step
 from netpos_node import CODEC

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
 import pytest
 import rclpy
-from netpos.inertial.pdr import PdrConfig, StepEvent, StepVelocity
+from netpos.inertial.pdr_config import PdrConfig
+from netpos.inertial.pdr_output import StepEvent, StepVelocity
+from netpos.inertial.pdr_values import frame_of, step_value, velocity_value
+from netpos.inertial.steps import StepConfig
 from netpos.messages.values import ImuSample, MagneticSample
 from netpos_node import CODEC
-from pdr_node.conversions import frame_of, step_value, velocity_value
 from pdr_node.node import PdrNode
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
@@ -129,22 +130,44 @@ def test_topics_types_and_qos(make: Any) -> None:
         assert end.qos_profile.durability == DurabilityPolicy.VOLATILE
 
 
-def test_every_number_of_the_config_is_a_read_only_parameter(make: Any) -> None:
-    node, plain = make(), PdrConfig()
-    for entry in fields(PdrConfig):
-        value = getattr(plain, entry.name)
-        if isinstance(value, float):
-            assert node.get_parameter(entry.name).value == value
-            assert node.describe_parameter(entry.name).read_only
+def test_every_entry_of_the_config_is_a_read_only_parameter(make: Any) -> None:
+    node, plain = make(), PdrConfig().flat()
+    assert {"height_m", "attitude.declination_rad", "steps.signal"} < set(plain)
+    for name, value in plain.items():
+        assert node.get_parameter(name).value == value
+        assert node.describe_parameter(name).read_only
     assert node.get_parameter("vue").value == "vue_1"
-    assert make(weinberg_k=0.5)._core.config.weinberg_k == 0.5
+    assert make(**{"weinberg_k": 0.5, "steps.bout_steps": 4})._core.config == PdrConfig(
+        weinberg_k=0.5, steps=StepConfig(bout_steps=4)
+    )
 
 
-def test_bad_parameter_is_one_clear_error(make: Any) -> None:
-    with pytest.raises(ValueError, match="vue: 'a b' is no device name"):
-        make(vue="a b")
-    with pytest.raises(ValueError, match=r"pdr.weinberg_k must be finite and > 0, got -1.0"):
-        make(weinberg_k=-1.0)
+def test_placement_and_scenario_choose_defaults_that_explicit_values_override(make: Any) -> None:
+    assert make(placement="waist")._core.config == PdrConfig.of("waist")
+    core = make(scenario="pedestrian_walk", height_m=1.9)._core
+    declination = math.radians(11.0)  # of the scenario's magnetometer
+    assert core.config == PdrConfig.from_mapping(
+        {"placement": "waist", "attitude.declination_rad": declination, "height_m": 1.9}
+    )
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"vue": "a b"}, "vue: 'a b' is no device name"),
+        ({"weinberg_k": -1.0}, r"pdr.weinberg_k must be finite and > 0, got -1.0"),
+        ({"placement": "ankle"}, "placement must be carried or waist, got 'ankle'"),
+        ({"length_model": "guess"}, "length_model must be frequency or weinberg"),
+        ({"steps.smooth_sd_s": -1.0}, "steps.smooth_sd_s must be finite and > 0"),
+        ({"scenario": "absent"}, "no scenario 'absent'"),
+        ({"scenario": "pedestrian_walk", "vue": "vue_7"}, "has vue_1, not vue_7"),
+    ],
+)
+def test_bad_parameter_is_one_clear_error(
+    make: Any, parameters: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(**parameters)
 
 
 def test_a_walk_with_magnetometer_gives_velocities_in_map(make: Any) -> None:
@@ -172,7 +195,9 @@ def test_a_walk_without_magnetometer_is_not_called_map(make: Any) -> None:
     assert {m.header.frame_id for m in (*steps, *velocities)} == {"vue_1/pdr_start"}
 
 
-def test_broken_samples_publish_nothing_and_are_reported_once(make: Any) -> None:
+def test_broken_samples_publish_nothing_and_are_told_once(
+    make: Any, capfd: pytest.CaptureFixture[str]
+) -> None:
     node = make()
     node._step_pub, node._velocity_pub = Kept(), Kept()
     bad = ImuSample(
@@ -184,6 +209,10 @@ def test_broken_samples_publish_nothing_and_are_reported_once(make: Any) -> None
     for _ in range(5):
         node._on_imu(CODEC.imu_to_msg(bad))
     assert node._step_pub.messages == node._velocity_pub.messages == []
-    assert sum(node._core.counters.values()) == 5
-    node._report_refusals()
-    assert node._counted == node._core.counters
+    assert node._core.counters == {"not_finite": 5}
+    assert capfd.readouterr().err.count("not_finite: IMU samples without three finite values") == 1
+
+
+def test_a_missing_magnetometer_is_told_once(make: Any, capfd: pytest.CaptureFixture[str]) -> None:
+    walk(make(), magnetic=False)
+    assert capfd.readouterr().err.count("no magnetic field is heard") == 1

@@ -10,7 +10,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from netpos.inertial.loaders import ImuRecord, WalkingBout, WaypointRecord
-from netpos.inertial.pdr import PedestrianDeadReckoning, StepEvent
+from netpos.inertial.pdr import PedestrianDeadReckoning
+from netpos.inertial.pdr_output import StepEvent
 
 Array = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]

@@ -229,15 +229,19 @@ class AttitudeFilter:
         self._q = _normalised(multiply(self._q, _exponential(step)))
         return True
 
-    def add_magnetic_field(self, stamp_ns: int, field_tesla: Vector) -> MagneticResult:
-        """Correct heading with one finite field sample in the body frame (A2).
+    def add_magnetic_field(
+        self, stamp_ns: int, field_tesla: Vector, quaternion: Quaternion | None = None
+    ) -> MagneticResult:
+        """Correct heading with one finite field sample in the body frame (A2). ``quaternion`` is
+        the attitude it was taken at, where that is not the present one.
 
         The first accepted sample sets the heading. A sample whose norm or dip differs from
         the running field by more than the tolerances is ``"disturbed"`` and not used.
         """
         if self._q is None:
             return "not_aligned"
-        mx, my, mz = rotate(self._q, field_tesla)
+        taken_at = quaternion if quaternion is not None else self._q
+        mx, my, mz = rotate(taken_at, field_tesla)
         horizontal = math.hypot(mx, my)
         norm = math.hypot(horizontal, mz)
         if horizontal <= 0.05 * norm:

@@ -1,13 +1,5 @@
 """Pedestrian dead reckoning: IMU samples in, steps and the mean velocity of the last step out.
 
-Petukhov et al. (``petukhov``): the velocity of a step of length L, duration T and heading psi
-(eq. 6, here with psi counter-clockwise from east) and its propagated covariance (eqs. 7-8,
-completed by the off-diagonal term they leave out):
-
-    v = (L / T) (cos psi, sin psi)                                              (petukhov:6)
-    J = [[cos psi / T, -|v| sin psi], [sin psi / T, |v| cos psi]]
-    C = J diag(sd_L^2, sd_psi^2) J^T                                            (petukhov:7-8)
-
 Without a step the pseudo-measurement is zero velocity; it is stated tightly only when the
 accelerometer and gyro are quiet, less so when the body turns on the spot. In between (start of a
 walk, handling, a single step) the velocity is unknown: zero with ``undecided_speed_sd_mps`` and
@@ -23,92 +15,24 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from netpos.inertial.attitude import AttitudeFilter, HeadingReference, wrap_angle
+from netpos.inertial.attitude import (
+    AttitudeFilter,
+    Quaternion,
+    wrap_angle,
+)
 from netpos.inertial.length import LengthScale, frequency_length, weinberg_length
 from netpos.inertial.pdr_config import PdrConfig
+from netpos.inertial.pdr_output import PdrOutput, StepEvent, StepVelocity, step_velocity
 from netpos.inertial.steps import LONGEST_STEP, Step, StepDetector
 from netpos.inertial.watch import Conditions, StreamWatch
 
 Array = npt.NDArray[np.float64]
 Vector = tuple[float, float, float]
 VectorLike = npt.NDArray[np.floating] | Sequence[float]
-
-
-@dataclass(frozen=True, slots=True)
-class StepEvent:
-    """A step between the initial contacts ``start_ns`` and ``end_ns``.
-
-    stamp_ns : the IMU sample that revealed it; the steps that open a bout share one
-    count : 1 for the first step since construction
-    heading_rad : walking direction, counter-clockwise from map x, [-pi, pi)
-    heading_reference : "map" (x is east) or "relative" (x is the first body heading)
-    """
-
-    stamp_ns: int
-    start_ns: int
-    end_ns: int
-    count: int
-    length_m: float
-    heading_rad: float
-    heading_sd_rad: float
-    length_sd_m: float
-    cadence_hz: float
-    heading_reference: HeadingReference
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StepVelocity:
-    """Horizontal velocity at ``stamp_ns``, the stamp of the IMU sample that produced it.
-
-    velocity : (2,) m/s along map x, y: east and north when ``heading_reference`` is "map"
-    covariance : (2, 2) m^2/s^2, symmetric positive definite
-    moving : False only for the tight zero of stillness; True with zero velocity and a wide
-        covariance while the state is undecided
-    """
-
-    stamp_ns: int
-    velocity: Array
-    covariance: Array
-    moving: bool
-    heading_reference: HeadingReference
-
-
-@dataclass(frozen=True, slots=True)
-class PdrOutput:
-    """What one IMU sample produced: the steps it revealed and, at a tick, the velocity."""
-
-    steps: tuple[StepEvent, ...]
-    velocity: StepVelocity | None
-
-
-def step_velocity(
-    length_m: float,
-    duration_s: float,
-    heading_rad: float,
-    length_sd_m: float,
-    heading_sd_rad: float,
-) -> tuple[Array, Array]:
-    """Mean velocity of a step and its covariance (petukhov:6-8).
-
-    Returns
-    -------
-    velocity (2,) m/s, covariance (2, 2) m^2/s^2; the duration counts as exact
-
-    Raises
-    ------
-    ValueError  the duration is not positive
-    """
-    if not duration_s > 0:
-        raise ValueError(f"step duration must be > 0 s, got {duration_s}")
-    speed, c, s = length_m / duration_s, math.cos(heading_rad), math.sin(heading_rad)
-    jacobian = np.array([[c / duration_s, -speed * s], [s / duration_s, speed * c]])
-    cov = jacobian @ np.diag([length_sd_m**2, heading_sd_rad**2]) @ jacobian.T
-    return np.array([speed * c, speed * s]), (cov + cov.T) / 2
 
 
 def _vector(value: VectorLike) -> Vector | str:
@@ -124,7 +48,8 @@ class PedestrianDeadReckoning:
     """Streaming core; see the module docstring for the model.
 
     ``counters`` keys: ``malformed``, ``not_finite``, ``stamp_duplicate``, ``stamp_backwards``,
-    ``accelerometer_saturated``, ``gyro_saturated`` (sample refused); ``gap``, ``clock_reset``
+    ``accelerometer_saturated`` (used for steps, not for tilt), ``gyro_saturated`` (used, the
+    heading less sure; either refused when beyond the range); ``gap``, ``clock_reset``
     (restart); ``rate_out_of_range`` (per second of stream); ``gravity_implausible`` (an
     alignment window without 1 g: wrong unit?); ``magnetic_*`` (field sample not used).
     ``conditions``: ``rate``, ``axes``, ``gravity``, ``no_magnetic_field``, ``magnetic_disturbed``.
@@ -168,6 +93,9 @@ class PedestrianDeadReckoning:
         self._heading_fix_ns = 0
         self._gap_sd_rad = 0.0
         self._last_field_ns: int | None = None
+        self._fields: deque[tuple[int, Vector]] = deque()
+        self._attitudes: deque[tuple[int, Quaternion]] = deque(maxlen=1000)
+        self._field_refused = False
         self._aligned_ns: int | None = None
         self._mounted = True
         self._restart_detector()
@@ -198,17 +126,25 @@ class PedestrianDeadReckoning:
         if isinstance(rate, str) or isinstance(force, str):
             self._refuse(rate if isinstance(rate, str) else str(force))
             return None
-        reason = self._sample_fault(stamp_ns, rate, force)
-        if reason is not None:
-            self._counters[reason] += 1
+        if not self._in_order(stamp_ns):
+            return None
+        saturated = self._watch.saturated(rate, force)
+        if saturated is not None and (saturated[1] or not self._attitude.aligned):
             return None
         dt_s = (stamp_ns - self._last_ns) * 1e-9 if self._last_ns is not None else 0.0
         if dt_s > self.config.max_gap_s:
             self._on_gap(dt_s)
         self._last_ns = stamp_ns
+        self._use_fields(stamp_ns)
         self._watch.rate(stamp_ns)
         self._mounted = self._watch.mounted(dt_s, force)
-        if not self._update_attitude(stamp_ns, dt_s, rate, force):
+        level = force
+        if saturated is not None and saturated[0] == "accelerometer_saturated":
+            level = (0.0, 0.0, 0.0)  # which way is up is not known
+        elif saturated is not None:
+            self._lose_heading(dt_s)
+        if not self._update_attitude(stamp_ns, dt_s, rate, level):
+            self._detector.add(stamp_ns, force)
             return None
         steps = [self._event(stamp_ns, s) for s in self._detector.add(stamp_ns, force)]
         if steps:
@@ -236,24 +172,41 @@ class PedestrianDeadReckoning:
             self._counters["magnetic_far_from_imu"] += 1
             return
         self._last_field_ns = stamp_ns
-        was_relative = self._attitude.reference == "relative"
-        result = self._attitude.add_magnetic_field(stamp_ns, value)
-        if result != "used":
-            self._counters[f"magnetic_{result}"] += 1
-            return
-        self._heading_fix_ns, self._gap_sd_rad = stamp_ns, 0.0
-        if was_relative:  # the frame has just turned to east/north
-            self._forward.clear()
-            self._step = None
+        self._fields.append((stamp_ns, value))
 
-    def _sample_fault(self, stamp_ns: int, rate: Vector, force: Vector) -> str | None:
+    def _use_fields(self, now_ns: int) -> None:
+        """Use the field samples that are old enough, each with the attitude of its stamp."""
+        hold_ns = round(self.config.field_hold_s * 1e9)
+        while self._fields and self._fields[0][0] + hold_ns <= now_ns:
+            stamp_ns, value = self._fields.popleft()
+            while len(self._attitudes) > 1 and self._attitudes[1][0] <= stamp_ns:
+                self._attitudes.popleft()
+            if not self._attitudes or self._attitudes[0][0] > stamp_ns:
+                self._counters["magnetic_not_aligned"] += 1
+                continue
+            was_relative = self._attitude.reference == "relative"
+            taken_at = self._attitudes[0][1]
+            result = self._attitude.add_magnetic_field(stamp_ns, value, taken_at)
+            self._field_refused = result != "used"
+            if self._field_refused:
+                self._counters[f"magnetic_{result}"] += 1
+                continue
+            self._heading_fix_ns, self._gap_sd_rad = stamp_ns, 0.0
+            if was_relative:  # the frame has just turned to east/north
+                self._attitudes.clear()
+                self._forward.clear()
+                self._step = None
+
+    def _in_order(self, stamp_ns: int) -> bool:
         last = self._last_ns
-        if last is not None and stamp_ns <= last:
-            if (last - stamp_ns) * 1e-9 < self.config.clock_reset_s:
-                return "stamp_duplicate" if stamp_ns == last else "stamp_backwards"
-            self._counters["clock_reset"] += 1
-            self._restart()
-        return self._watch.saturated(rate, force)
+        if last is None or stamp_ns > last:
+            return True
+        if (last - stamp_ns) * 1e-9 < self.config.clock_reset_s:
+            self._counters["stamp_duplicate" if stamp_ns == last else "stamp_backwards"] += 1
+            return False
+        self._counters["clock_reset"] += 1
+        self._restart()
+        return True
 
     def _refuse(self, reason: str) -> None:
         """Count a sample that cannot be read; the first of a kind is told."""
@@ -271,10 +224,15 @@ class PedestrianDeadReckoning:
                 "anew; further gaps are only counted"
             )
         self._counters["gap"] += 1
-        unseen = self.config.gap_rate_sd_radps * dt_s
-        self._gap_sd_rad = min(math.hypot(self._gap_sd_rad, unseen), math.pi)
+        self._lose_heading(dt_s)
         self._attitude.reset(keep_heading=True)
+        self._attitudes.clear()
         self._restart_detector()
+
+    def _lose_heading(self, unseen_s: float) -> None:
+        """Widen the heading's sd by what the device may have turned unseen."""
+        unseen = self.config.gap_rate_sd_radps * unseen_s
+        self._gap_sd_rad = min(math.hypot(self._gap_sd_rad, unseen), math.pi)
 
     def _update_attitude(self, stamp_ns: int, dt_s: float, rate: Vector, force: Vector) -> bool:
         was_aligned = self._attitude.aligned
@@ -282,7 +240,6 @@ class PedestrianDeadReckoning:
             if self._attitude.alignment_failed:
                 self._counters["gravity_implausible"] += 1
                 self._tell_gravity(True)
-            self._detector.add(stamp_ns, force)
             return False
         if not was_aligned:
             self._tell_gravity(False)
@@ -290,6 +247,7 @@ class PedestrianDeadReckoning:
             if self._heading_fix_ns == 0:
                 self._heading_fix_ns = stamp_ns
         self._watch_field(stamp_ns)
+        self._attitudes.append((stamp_ns, self._attitude.quaternion))
         bias = self._attitude.bias_radps
         norm = math.sqrt(sum((r - b) ** 2 for r, b in zip(rate, bias, strict=True)))
         a = min(dt_s / 0.5, 1.0) if self._turn_rate < math.inf else 1.0
@@ -328,7 +286,7 @@ class PedestrianDeadReckoning:
         )
         self._conditions.set(
             "magnetic_disturbed",
-            late and heard,
+            late and heard and self._field_refused,
             f"the magnetic field is disturbed: the heading comes from the gyro alone, {drift}",
             "the magnetic field gives the heading again",
         )

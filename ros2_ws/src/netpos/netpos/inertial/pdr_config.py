@@ -34,7 +34,7 @@ _POSITIVE = (
     "field_patience_s",
     "clock_reset_s",
 )
-_NOT_NEGATIVE = ("heading_drift_radps", "gap_rate_sd_radps", "speed_drift_mps2")
+_NOT_NEGATIVE = ("heading_drift_radps", "gap_rate_sd_radps", "speed_drift_mps2", "field_hold_s")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +52,8 @@ class PdrConfig:
     mount_heading_rad : walking direction minus the body x axis, counter-clockwise
     max_mount_tilt_rad : a mean specific force further from the body z axis than this means
         swapped axes: the heading is then unknown; pi for a device carried anyhow
+    field_hold_s : a field sample is used this long after its stamp, so that it does not matter
+        whether it or the IMU sample of the same time arrives first
     field_patience_s : how long the heading may do without magnetic samples before it is said
     turning_speed_sd_mps : of the zero velocity of a body that only turns
     speed_drift_mps2 : growth of the velocity sd with the age of the last step: people stop within
@@ -71,6 +73,7 @@ class PdrConfig:
     heading_drift_radps: float = 0.001
     mount_heading_rad: float = 0.0
     max_mount_tilt_rad: float = math.pi
+    field_hold_s: float = 0.1
     field_patience_s: float = 3.0
     still_speed_sd_mps: float = 0.05
     turning_speed_sd_mps: float = 0.3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from netpos.inertial.pdr import PdrOutput, StepEvent, StepVelocity
+from netpos.inertial.pdr_output import PdrOutput, StepEvent, StepVelocity
 from netpos.messages.values import Step, Velocity
 
 

@@ -16,6 +16,7 @@ Vector = tuple[float, float, float]
 # So many samples of exactly the same, largest reading: the end of a range narrower than declared.
 _PLATEAU_SAMPLES = 4
 _PLATEAU_MPS2 = 14.7  # 1.5 g; a sensor at rest may well repeat itself
+_EDGE = 1.001  # a reading further beyond the range is none
 _GRAVITY_MEMORY_S = 5.0
 
 
@@ -23,7 +24,7 @@ class Conditions:
     """Which conditions hold, and the sentences that are still to be told."""
 
     def __init__(self) -> None:
-        self._active: dict[str, str] = {}
+        self._active: list[str] = []
         self._told: deque[str] = deque(maxlen=100)
 
     @property
@@ -34,10 +35,11 @@ class Conditions:
     def set(self, name: str, holds: bool, begins: str, ends: str) -> None:
         """Note whether a condition holds; the first time either way is told."""
         if holds and name not in self._active:
-            self._active[name] = ends
+            self._active.append(name)
             self._told.append(begins)
         elif not holds and name in self._active:
-            self._told.append(self._active.pop(name))
+            self._active.remove(name)
+            self._told.append(ends)
 
     def tell(self, sentence: str) -> None:
         """Tell of something that does not last."""
@@ -68,25 +70,28 @@ class StreamWatch:
         self._gravity: Vector | None = None
         self._settled_s = 0.0
 
-    def saturated(self, rate: Vector, force: Vector) -> str | None:
-        """The reason to refuse a sample at the end of a sensor's range, told once."""
+    def saturated(self, rate: Vector, force: Vector) -> tuple[str, bool] | None:
+        """Reason when a sample is at the end of a sensor's range, and whether it lies beyond it
+        and cannot be a reading at all; told once."""
         cfg = self._cfg
-        if max(map(abs, rate)) >= cfg.gyro_range_radps:
+        turn, push = max(map(abs, rate)), max(map(abs, force))
+        if turn >= cfg.gyro_range_radps:
             reason, what = "gyro_saturated", f"gyro_range_radps {cfg.gyro_range_radps:g}"
-        elif max(map(abs, force)) >= cfg.accelerometer_range_mps2:
+        elif push >= cfg.accelerometer_range_mps2:
             reason = "accelerometer_saturated"
             what = f"accelerometer_range_mps2 {cfg.accelerometer_range_mps2:g}"
         elif self._plateau(force):
-            reason = "accelerometer_saturated"
-            what = f"{max(map(abs, force)):.1f} m/s^2, read several times in a row"
+            reason, what = "accelerometer_saturated", f"{push:.1f} m/s^2, read again and again"
         else:
             return None
         if not self._counters[reason]:
             self._conditions.tell(
-                f"{reason}: a reading at the end of the range ({what}); such samples are left "
-                "out, steps may be missed. Use a wider range"
+                f"{reason}: readings at the end of the range ({what}); tilt, heading and step "
+                "length suffer, steps may be missed. Use a wider range"
             )
-        return reason
+        self._counters[reason] += 1
+        beyond = turn > _EDGE * cfg.gyro_range_radps or push > _EDGE * cfg.accelerometer_range_mps2
+        return reason, beyond
 
     def _plateau(self, force: Vector) -> bool:
         for i in range(3):

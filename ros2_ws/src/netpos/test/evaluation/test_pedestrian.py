@@ -13,7 +13,7 @@ from netpos.evaluation.pedestrian import (
     score_walk,
 )
 from netpos.inertial.loaders import ImuRecord, WalkingBout, WaypointRecord
-from netpos.inertial.pdr import StepEvent
+from netpos.inertial.pdr_output import StepEvent
 from scipy.spatial.transform import Rotation
 
 MS = 1_000_000

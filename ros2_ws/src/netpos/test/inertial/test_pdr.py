@@ -19,13 +19,9 @@ from netpos.inertial.imu import (
     simulate_imu,
     simulate_magnetometer,
 )
-from netpos.inertial.pdr import (
-    PedestrianDeadReckoning,
-    StepEvent,
-    StepVelocity,
-    step_velocity,
-)
+from netpos.inertial.pdr import PedestrianDeadReckoning
 from netpos.inertial.pdr_config import PdrConfig
+from netpos.inertial.pdr_output import StepEvent, StepVelocity, step_velocity
 from netpos.inertial.steps import StepConfig
 from netpos.world.routes import rectangle
 from scipy.spatial.transform import Rotation
@@ -519,3 +515,26 @@ def test_a_disturbed_field_leaves_the_heading_to_the_gyro() -> None:
     _, events, _, core = simulated(gait, 3, disturbances=(iron,))
     assert core.counters["magnetic_disturbed"] > 50
     assert max(heading_error(e, 0.0) for e in events[1:]) < math.radians(12)
+
+
+@pytest.mark.parametrize("late_ns", [0, 40_000_000, 90_000_000])
+def test_the_order_of_arrival_of_imu_and_field_does_not_matter(late_ns: int) -> None:
+    """Field samples less than ``field_hold_s`` late give the same output to the last bit."""
+    w = walk(40.0, turn_deg=60.0)
+
+    def through(field_first: bool) -> list[tuple[float, ...]]:
+        core, out, waiting = PedestrianDeadReckoning(), [], []
+        for i, stamp in enumerate(w.stamps.tolist()):
+            waiting.append((stamp, w.field[i]))
+            while waiting and field_first:
+                core.add_magnetic_field(*waiting.pop(0))
+            got = core.add_imu(stamp, w.rate[i], w.force[i])
+            while waiting and waiting[0][0] + late_ns <= stamp:
+                core.add_magnetic_field(*waiting.pop(0))
+            if got is not None and got.velocity is not None:
+                out.append((got.velocity.stamp_ns, *got.velocity.velocity))
+        return out
+
+    expected, got = through(True), through(False)
+    assert expected[50:] == got[50:]
+    assert len(got) > 200
