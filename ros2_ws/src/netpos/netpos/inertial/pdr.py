@@ -93,7 +93,7 @@ class PedestrianDeadReckoning:
         self._heading_fix_ns = 0
         self._gap_sd_rad = 0.0
         self._last_field_ns: int | None = None
-        self._fields: deque[tuple[int, Vector]] = deque()
+        self._fields: deque[tuple[int, Vector]] = deque(maxlen=1000)
         self._attitudes: deque[tuple[int, Quaternion]] = deque(maxlen=1000)
         self._field_refused = False
         self._aligned_ns: int | None = None
@@ -155,8 +155,9 @@ class PedestrianDeadReckoning:
     def add_magnetic_field(self, stamp_ns: int, field_tesla: VectorLike) -> None:
         """Add one calibrated magnetometer sample (3,) in tesla, body frame.
 
-        A sample without 1-1000 microtesla (wrong unit), out of order or more than
-        ``max_gap_s`` from the IMU stream is counted and not used.
+        A sample without 1-1000 microtesla (wrong unit), out of order, or of a time without
+        attitude is counted and not used. It may arrive before the IMU samples of its time, and up
+        to ``field_hold_s`` after them.
         """
         value = _vector(field_tesla)
         if isinstance(value, str):
@@ -167,9 +168,6 @@ class PedestrianDeadReckoning:
             return
         if self._last_field_ns is not None and stamp_ns <= self._last_field_ns:
             self._counters["magnetic_stamp_backwards"] += 1
-            return
-        if self._last_ns is None or abs(stamp_ns - self._last_ns) > self.config.max_gap_s * 1e9:
-            self._counters["magnetic_far_from_imu"] += 1
             return
         self._last_field_ns = stamp_ns
         self._fields.append((stamp_ns, value))
