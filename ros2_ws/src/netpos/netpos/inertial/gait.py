@@ -37,8 +37,9 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from scipy.spatial.transform import Rotation
 
+from netpos.world.body import BodyState, check_times
 from netpos.world.frames import wrap_angle
-from netpos.world.motion import BodyState, Motion, check_times, follow
+from netpos.world.motion import Motion, follow
 
 Array = npt.NDArray[np.float64]
 

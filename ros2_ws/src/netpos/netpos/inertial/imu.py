@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from netpos.inertial.attitude import GRAVITY_MPS2
 from netpos.radio.noise import generator, normals, stream_key
-from netpos.world.motion import BodyMotion
+from netpos.world.body import BodyMotion
 
 Array = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]

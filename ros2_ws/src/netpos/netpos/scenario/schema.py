@@ -17,9 +17,12 @@ from netpos.radio.clocks import ClockModel, NetworkClockModel
 from netpos.radio.noise import generator
 from netpos.radio.propagation import UMA_HIGHEST_DEVICE_M, LosModel, PathLoss
 from netpos.radio.waveform import Waveform
+from netpos.world.body import BodyMotion, Hills
 from netpos.world.maps import METIS_MADRID
-from netpos.world.motion import BodyMotion, Hills, QuadraticMotion, follow
+from netpos.world.motion import follow
+from netpos.world.quadratic import QuadraticMotion
 from netpos.world.routes import random_route, rectangle
+from netpos.world.wander import Wander
 
 Array = npt.NDArray[np.float64]
 
@@ -288,11 +291,13 @@ class Device(Section):
     ``pdr`` holds parameters of its dead reckoning (``PdrConfig``); with a gait it is worn at the
     waist unless ``placement`` says otherwise. ``antenna_height_m`` is the height of base_link
     where the road is flat, the antenna stands at ``lever_arm_m`` in base_link; the road rises and
-    falls as a sine in time."""
+    falls as a sine in time. ``wander_density_mps2_sqrthz`` adds the integral of white acceleration
+    to the drive."""
 
     count: int = Field(default=1, ge=1)
     route: Route
     speed_mps: Positive | None = None
+    wander_density_mps2_sqrthz: Positive | None = None
     gait: GaitModel | None = None
     acceleration_mps2: Positive | None = None
     antenna_height_m: Finite = 0.0
@@ -339,7 +344,7 @@ class Device(Section):
                 pauses_s=self.route.pauses_s,
             )
         assert self.speed_mps is not None
-        return follow(
+        drive = follow(
             points,
             self.speed_mps,
             corner_radius_m=self.route.corner_radius_m,
@@ -347,6 +352,10 @@ class Device(Section):
             pauses_s=self.route.pauses_s,
             hills=Hills(amplitude_m=self.hill_amplitude_m, period_s=self.hill_period_s),
         )
+        if self.wander_density_mps2_sqrthz is None:
+            return drive
+        rng = generator(seed, f"{vue_id}/wander")
+        return Wander(drive, self.wander_density_mps2_sqrthz, self.beacon_interval_s, rng)
 
     @model_validator(mode="after")
     def _drivable(self) -> Self:
@@ -356,6 +365,10 @@ class Device(Section):
         if not own_velocity and (self.gait is None) == (self.speed_mps is None):
             raise ValueError(
                 "a device needs either speed_mps (it drives) or gait (a person walks with it)"
+            )
+        if self.wander_density_mps2_sqrthz is not None and (self.imu or self.speed_mps is None):
+            raise ValueError(
+                "wander_density_mps2_sqrthz is for a device that drives without an imu"
             )
         if self.gait is not None and self.acceleration_mps2 is not None:
             raise ValueError("a gait starts and stops by itself; remove acceleration_mps2")

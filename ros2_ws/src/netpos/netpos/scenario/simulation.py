@@ -48,7 +48,7 @@ from netpos.scenario.build import (
 )
 from netpos.scenario.networks import Answering, answering_of
 from netpos.scenario.schema import Device, Scenario
-from netpos.world.motion import BodyState
+from netpos.world.body import BodyState
 
 Array = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]

@@ -10,84 +10,23 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
-from netpos.world.frames import quaternion_from_yaw
+from netpos.world.body import (
+    FLAT,
+    BodyState,
+    Hills,
+    Kinematics,
+    check_times,
+    level,
+    on_hills,
+)
 
 Array = npt.NDArray[np.float64]
 
 _STRAIGHT_RAD = 1e-9  # a bend below this is no corner
-_TIME_TOLERANCE_S = 1e-9  # stamps are whole nanoseconds
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Kinematics:
-    """State of motion at n instants: position, velocity, acceleration (n, 2) in map; yaw, yaw_rate
-    (n,) rad, rad/s."""
-
-    position: Array
-    velocity: Array
-    acceleration: Array
-    yaw: Array
-    yaw_rate: Array
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BodyState:
-    """Motion of a body in space at n instants: position, velocity (n, 3) in map; ``rotation`` n
-    rotations body -> map; angular_velocity (n, 3) rad/s in body axes."""
-
-    position: Array
-    velocity: Array
-    rotation: Rotation
-    angular_velocity: Array
-
-
-class BodyMotion(Protocol):
-    """What carries a device: a vehicle's ``Motion`` or a person's gait."""
-
-    duration_s: float
-    smooth: bool
-
-    def body_at(self, time_s: npt.ArrayLike) -> BodyState:
-        """State at times (n,) since the start [s]; z is the height over the route."""
-        ...
-
-
-def check_times(time_s: npt.ArrayLike, duration_s: float) -> Array:
-    """(n,) times; ``ValueError`` where one is not finite or outside [0, duration_s]."""
-    t = np.atleast_1d(np.asarray(time_s, dtype=np.float64))
-    if not ((t >= 0) & (t <= duration_s + _TIME_TOLERANCE_S)).all():
-        raise ValueError(f"time must be in [0, {duration_s}] s, got {t.min()} to {t.max()}")
-    return t
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Hills:
-    """Height of a road: a sine in time, along which a body on it points; amplitude 0: flat."""
-
-    amplitude_m: float = 0.0
-    period_s: float = 180.0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.amplitude_m < math.inf:
-            raise ValueError(f"amplitude_m must be finite and >= 0, got {self.amplitude_m}")
-        if not 0 < self.period_s < math.inf:
-            raise ValueError(f"period_s must be finite and > 0, got {self.period_s}")
-
-    def at(self, time_s: Array) -> tuple[Array, Array, Array]:
-        """Height [m], climb [m/s] and its rate [m/s^2] at times (n,) [s]."""
-        rate = 2 * math.pi / self.period_s
-        sine, cosine = np.sin(rate * time_s), np.cos(rate * time_s)
-        a = self.amplitude_m
-        return a * sine, a * rate * cosine, -a * rate**2 * sine
-
-
-FLAT = Hills()
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,96 +108,8 @@ class Motion:
         """The same as a body in space: level, or pointing along its hills."""
         state = self.at(time_s)
         if self.hills.amplitude_m == 0.0:
-            return _level(state)
-        return _on_hills(state, *self.hills.at(check_times(time_s, self.duration_s)))
-
-
-def _level(state: Kinematics) -> BodyState:
-    """A plane motion as that of a level body in space."""
-    zero = np.zeros((len(state.yaw), 2))
-    return BodyState(
-        position=np.hstack([state.position, zero[:, :1]]),
-        velocity=np.hstack([state.velocity, zero[:, :1]]),
-        rotation=Rotation.from_quat(quaternion_from_yaw(state.yaw)),
-        angular_velocity=np.hstack([zero, state.yaw_rate[:, None]]),
-    )
-
-
-def _on_hills(state: Kinematics, height: Array, climb: Array, rate: Array) -> BodyState:
-    """A plane motion as that of a body that points up and down as it climbs."""
-    speed = np.hypot(*state.velocity.T)
-    gained = (state.velocity * state.acceleration).sum(axis=1) / speed
-    pitch = -np.arctan2(climb, speed)
-    pitch_rate = -(rate * speed - climb * gained) / (speed**2 + climb**2)
-    turning = [-state.yaw_rate * np.sin(pitch), pitch_rate, state.yaw_rate * np.cos(pitch)]
-    return BodyState(
-        position=np.column_stack([state.position, height]),
-        velocity=np.column_stack([state.velocity, climb]),
-        rotation=Rotation.from_euler("ZY", np.column_stack([state.yaw, pitch])),
-        angular_velocity=np.column_stack(turning),
-    )
-
-
-class QuadraticMotion:
-    """Per axis a polynomial of degree 2 at a time: stretches of constant acceleration, the
-    position and the velocity continuous (dvornikov2017: curves of the second order)."""
-
-    def __init__(
-        self,
-        start_m: npt.ArrayLike,
-        velocity_mps: npt.ArrayLike,
-        durations_s: Sequence[float],
-        accelerations_mps2: npt.ArrayLike,
-    ) -> None:
-        """From ``start_m`` (2,) with ``velocity_mps`` (2,), then accelerations (k, 2) for
-        durations (k,).
-
-        Raises ``ValueError`` where durations are not > 0 or something is not finite.
-        """
-        a = np.asarray(accelerations_mps2, dtype=np.float64).reshape(-1, 2)
-        durations = np.asarray(durations_s, dtype=np.float64)
-        if len(a) != durations.size or not durations.size:
-            raise ValueError(
-                f"{durations.size} durations need as many accelerations, got {len(a)}"
-            )
-        if not ((durations > 0) & (durations < math.inf)).all():
-            raise ValueError(f"durations must be finite and > 0 s, got {durations.tolist()}")
-        position = [np.asarray(start_m, dtype=np.float64)]
-        velocity = [np.asarray(velocity_mps, dtype=np.float64)]
-        if not np.isfinite([position[0], velocity[0], *a]).all():
-            raise ValueError("start, velocity and accelerations must be finite")
-        for dt, acceleration in zip(durations[:-1], a[:-1], strict=True):
-            position.append(position[-1] + dt * velocity[-1] + dt * dt / 2 * acceleration)
-            velocity.append(velocity[-1] + dt * acceleration)
-        self.duration_s = float(durations.sum())
-        self.smooth = True
-        self._start = np.concatenate([[0.0], np.cumsum(durations)[:-1]])
-        self._stretches = np.hstack([position, velocity, a])
-
-    def at(self, time_s: npt.ArrayLike) -> Kinematics:
-        """State at times (n,) since the start [s]; at a jump of the acceleration, the state after
-        it. The heading is the direction of the velocity.
-
-        Raises ``ValueError`` as ``Motion.at``.
-        """
-        t = check_times(time_s, self.duration_s)
-        k = np.maximum(np.searchsorted(self._start, t, side="right") - 1, 0)
-        tau = (t - self._start[k])[:, None]
-        p, v, a = np.hsplit(self._stretches[k], 3)
-        now = v + tau * a
-        across = now[:, 0] * a[:, 1] - now[:, 1] * a[:, 0]
-        speed2 = (now**2).sum(axis=1)
-        return Kinematics(
-            position=p + tau * v + tau * tau / 2 * a,
-            velocity=now,
-            acceleration=a,
-            yaw=np.arctan2(now[:, 1], now[:, 0]),
-            yaw_rate=np.divide(across, speed2, out=np.zeros_like(speed2), where=speed2 > 0),
-        )
-
-    def body_at(self, time_s: npt.ArrayLike) -> BodyState:
-        """The same as a level body in space."""
-        return _level(self.at(time_s))
+            return level(state)
+        return on_hills(state, *self.hills.at(check_times(time_s, self.duration_s)))
 
 
 def follow(

@@ -307,3 +307,20 @@ def test_a_bad_beacon_is_refused(change: dict[str, object], message: str) -> Non
     assert isinstance(simulation.measure(good)[0], RsuMeasurement)
     with pytest.raises(ValueError, match=message):
         simulation.measure(replace(good, **change))  # type: ignore[arg-type]
+
+
+def test_a_wandering_drive_leaves_the_straight_line_with_the_seed() -> None:
+    changes = {"devices.0.wander_density_mps2_sqrthz": 0.5}
+    straight = Simulation(load_scenario("fast_pass")).beacons("vue_1").position
+    first, second = (
+        Simulation(load_scenario("fast_pass", seed, changes)).beacons("vue_1").position
+        for seed in (1, 2)
+    )
+    assert 0.01 < np.abs(first - straight).max() < 20.0
+    assert not np.array_equal(first, second)
+
+
+def test_wandering_needs_a_drive_without_imu() -> None:
+    changes = {"devices.0.wander_density_mps2_sqrthz": 0.5}
+    with pytest.raises(ValueError, match="wander_density_mps2_sqrthz is for a device that drives"):
+        load_scenario("intersection_turn", changes=changes)

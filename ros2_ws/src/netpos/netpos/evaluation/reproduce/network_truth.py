@@ -12,7 +12,7 @@ from netpos.messages.values import Array
 from netpos.radio.noise import generator, normals, stream_key
 from netpos.scenario.schema import NS
 from netpos.tracking.networks.common_instant import step_matrices
-from netpos.world.motion import QuadraticMotion
+from netpos.world.quadratic import QuadraticMotion
 
 Ints = npt.NDArray[np.int64]
 Place = tuple[float, float]

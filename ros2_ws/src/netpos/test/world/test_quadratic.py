@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.world.motion import QuadraticMotion
+from netpos.world.quadratic import QuadraticMotion
 
 
 def test_one_stretch_is_the_polynomial_of_the_paper() -> None:
