@@ -13,7 +13,8 @@ from netpos.radio.clocks import clock_tones
 from netpos.radio.measure import Errors, Sight, Sites, los_model_number
 from netpos.radio.noise import generator, stream_key
 from netpos.radio.propagation import SPEED_OF_LIGHT_MPS
-from netpos.scenario.schema import Device, FixedErrors, Grid, Scenario
+from netpos.scenario.places import Grid
+from netpos.scenario.schema import Device, FixedErrors, Scenario
 from netpos.world.frames import quaternion_from_yaw, yaw_from_quaternion
 from netpos.world.maps import METIS_KERB_OFFSET_M, METIS_MADRID, METIS_RSU_SPACING_M
 

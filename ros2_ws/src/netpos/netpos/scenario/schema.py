@@ -7,16 +7,26 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from netpos.inertial.gait import GaitModel, walk
 from netpos.inertial.imu import ImuModel, MagnetometerModel, interval_ns
 from netpos.inertial.pdr_config import PdrConfig
 from netpos.radio.arrays import AntennaArray
-from netpos.radio.clocks import ClockModel, NetworkClockModel
+from netpos.radio.clocks import ClockModel
 from netpos.radio.noise import generator
 from netpos.radio.propagation import UMA_HIGHEST_DEVICE_M, LosModel, PathLoss
 from netpos.radio.waveform import Waveform
+from netpos.scenario.places import Rsus, World
+from netpos.scenario.section import (
+    Finite,
+    Name,
+    NotNegative,
+    Place,
+    Positive,
+    Quantity,
+    Section,
+)
 from netpos.world.body import BodyMotion, Hills
 from netpos.world.maps import METIS_MADRID
 from netpos.world.motion import follow
@@ -26,94 +36,7 @@ from netpos.world.wander import Wander
 
 Array = npt.NDArray[np.float64]
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Place = tuple[Finite, Finite]
-Quantity = Literal["azimuth", "elevation", "toa", "range", "position"]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
-
 NS = 1_000_000_000
-
-
-class Section(BaseModel):
-    """A part of a scenario: frozen, no unknown keys."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Building(Section):
-    """A rectangle that blocks the line of sight."""
-
-    x_min: Finite
-    y_min: Finite
-    x_max: Finite
-    y_max: Finite
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if not (self.x_min < self.x_max and self.y_min < self.y_max):
-            raise ValueError("a building needs x_min < x_max and y_min < y_max")
-        return self
-
-
-class World(Section):
-    """``metis_madrid``: the 4 x 4 grid of fokin2020. ``open``: only the buildings listed."""
-
-    map: Literal["metis_madrid", "open"] = "open"
-    buildings: tuple[Building, ...] = ()
-
-
-class RsuUnit(Section):
-    """One RSU; ``yaw_deg`` turns its boresight (x axis) counter-clockwise from east."""
-
-    id: Name
-    position: tuple[Finite, Finite, Finite]
-    yaw_deg: Finite = 0.0
-    network: str = ""
-
-
-class Grid(Section):
-    """RSUs on a square grid from its south-west corner, their heights drawn evenly per seed."""
-
-    spacing_m: Positive
-    columns: int = Field(ge=1)
-    rows: int = Field(ge=1)
-    x_min: Finite = 0.0
-    y_min: Finite = 0.0
-    height_min_m: Finite = 0.0
-    height_max_m: Finite = 0.0
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.height_min_m > self.height_max_m:
-            raise ValueError("a grid needs height_min_m <= height_max_m")
-        return self
-
-
-class Rsus(Section):
-    """``metis_madrid``: every 60 m along the streets (maps.StreetGrid.lamp_posts). ``list``: the
-    units listed. ``grid``: on a square grid."""
-
-    layout: Literal["metis_madrid", "list", "grid"] = "list"
-    units: tuple[RsuUnit, ...] = ()
-    height_m: Finite = 0.0
-    clock: NetworkClockModel | None = None
-    grid: Grid | None = None
-
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        if self.layout == "list" and not self.units:
-            raise ValueError("layout 'list' needs at least one entry in units")
-        if self.layout != "list" and self.units:
-            raise ValueError(f"layout {self.layout!r} places the RSUs itself; remove units")
-        if (self.layout == "grid") != (self.grid is not None):
-            raise ValueError("layout 'grid' and the section grid need each other")
-        ids = [unit.id for unit in self.units]
-        twice = sorted({i for i in ids if ids.count(i) > 1})
-        if twice:
-            raise ValueError(f"RSU ids must be unique, used more than once: {', '.join(twice)}")
-        return self
 
 
 class LineOfSight(Section):
@@ -309,7 +232,7 @@ class Device(Section):
     clock: ClockModel = ClockModel()
     imu: ImuModel | None = None
     magnetometer: MagnetometerModel | None = None
-    pdr: dict[str, Any] = {}
+    pdr: dict[str, Any] = Field(default_factory=dict)
     initial_pose_sd_m: Positive | None = None
 
     @property
@@ -411,8 +334,8 @@ class Scenario(Section):
     measurement: Measurement
     devices: tuple[Device, ...] = Field(min_length=1)
     networks: tuple[Network, ...] = ()
-    tracker: dict[str, Any] = {}
-    fusion: dict[str, Any] = {}
+    tracker: dict[str, Any] = Field(default_factory=dict)
+    fusion: dict[str, Any] = Field(default_factory=dict)
 
     @property
     def start_ns(self) -> int:

@@ -1,0 +1,20 @@
+"""The base of a scenario's sections, and the kinds of values in them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Place = tuple[Finite, Finite]
+Quantity = Literal["azimuth", "elevation", "toa", "range", "position"]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+
+
+class Section(BaseModel):
+    """A part of a scenario: frozen, no unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
