@@ -27,7 +27,8 @@ from netpos.scenario.section import (
     Quantity,
     Section,
 )
-from netpos.world.body import BodyMotion, Hills
+from netpos.world.body import BodyMotion
+from netpos.world.hills import Hills
 from netpos.world.maps import METIS_MADRID
 from netpos.world.motion import follow
 from netpos.world.quadratic import QuadraticMotion

@@ -14,15 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from netpos.world.body import (
-    FLAT,
-    BodyState,
-    Hills,
-    Kinematics,
-    check_times,
-    level,
-    on_hills,
-)
+from netpos.world.body import BodyState, Kinematics, check_times, level, on_hills
+from netpos.world.hills import FLAT, Hills
 
 Array = npt.NDArray[np.float64]
 

@@ -80,15 +80,14 @@ class Run:
 class Tally:
     """Sums over the epochs of some runs, of one variant. square: north, east, down error^2 [m^2];
     solved of n epochs; nees: its sums for position (3) and position, velocity, attitude (9);
-    outage2: squared horizontal and 3-D errors at the end of an outage."""
+    outage_m: (k, 2) horizontal and 3-D errors at the end of the outages."""
 
     n: int
     solved: int
     square: Array
     nees: Array
     n_eff: Array
-    outages: int
-    outage2: Array
+    outage_m: Array
 
     def __add__(self, other: Tally) -> Tally:
         return Tally(
@@ -97,8 +96,7 @@ class Tally:
             square=self.square + other.square,
             nees=self.nees + other.nees,
             n_eff=self.n_eff + other.n_eff,
-            outages=self.outages + other.outages,
-            outage2=self.outage2 + other.outage2,
+            outage_m=np.vstack([self.outage_m, other.outage_m]),
         )
 
     @property
@@ -121,12 +119,6 @@ class Tally:
             bounds=chi2_mean_bounds(states, n_eff),
             n_eff=n_eff,
         )
-
-    @property
-    def outage_rms_m(self) -> tuple[float, float]:
-        """Horizontal and 3-D error at the end of the outages."""
-        plane, space = np.sqrt(self.outage2 / self.outages).tolist()
-        return plane, space
 
 
 @lru_cache(maxsize=8)
@@ -225,8 +217,7 @@ def _tally_fixes(done: Run, fixes: Fixes) -> Tally:
         square=(error**2).sum(axis=0),
         nees=np.zeros(2),
         n_eff=np.zeros(2),
-        outages=0,
-        outage2=np.zeros(2),
+        outage_m=np.zeros((0, 2)),
     )
 
 
@@ -248,15 +239,14 @@ def _tally_drive(done: Run, result: Drive) -> Tally:
     silent = ~done.heard
     ends = np.flatnonzero(silent[:-1] & done.heard[1:])
     ends = ends[ends >= OUTAGE_S]  # of whole outages
-    plane, space = error[ends, :2], error[ends, :3]
+    at_end = [np.linalg.norm(error[ends, :k], axis=1) for k in (2, 3)]
     return Tally(
         n=len(error),
         solved=int(np.isfinite(error).all(axis=1).sum()),
         square=(ned(error[:, :3]) ** 2).sum(axis=0),
         nees=np.array([v.sum() for v in values]),
         n_eff=np.array([effective_size(v) for v in values]),
-        outages=ends.size,
-        outage2=np.array([(plane**2).sum(), (space**2).sum()]),
+        outage_m=np.column_stack(at_end),
     )
 
 

@@ -89,11 +89,11 @@ def test_outages_are_ten_silent_seconds() -> None:
     lengths = np.diff(edges)[::2]
     assert set(lengths.tolist()) == {drives.OUTAGE_S - 1}  # silent epochs between heard ones
     result = tally_seeds(deng2022.OUTAGES, range(SEED, SEED + 1))[VEHICLE]
-    assert result.outages == len(lengths)
+    assert result.outage_m.shape == (len(lengths), 2)
     ends = edges[1::2]
     error = (done.drives[VEHICLE].nav[:, :3] - done.position)[ends]
-    plane = np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1)))
-    assert result.outage_rms_m[0] == pytest.approx(plane)
+    np.testing.assert_allclose(result.outage_m[:, 0], np.hypot(error[:, 0], error[:, 1]))
+    np.testing.assert_allclose(result.outage_m[:, 1], np.linalg.norm(error, axis=1))
 
 
 def test_every_cell_has_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
