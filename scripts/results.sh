@@ -10,7 +10,7 @@ mkdir -p "$1"
 out=$(cd "$1" && pwd)
 data=${NETPOS_DATA:-$NETPOS_ROOT/../shared/data}
 
-for scenario in metis_madrid fast_pass fast_pass_100hz intersection_turn intersection_turn_30m; do
+for scenario in metis_madrid fast_pass fast_pass_100hz intersection_turn intersection_turn_30m blocked_5g_drive; do
   netpos run "$scenario" --offline --bag "$out/$scenario" >/dev/null
   netpos evaluate "$out/$scenario" --json "$out/$scenario.json" >/dev/null
 done
@@ -28,6 +28,9 @@ if [ -d "$data" ]; then
   netpos import uwb-trolley "$data/uwb_trolley" "$out/uwb_trolley.in" >/dev/null
   netpos replay "$out/uwb_trolley.in" --out "$out/uwb_trolley" >/dev/null
   netpos evaluate "$out/uwb_trolley" --json "$out/uwb_trolley.json" >/dev/null
+  netpos import car-imu-rtk "$data/car_imu_rtk" "$out/car_imu_rtk.in" >/dev/null
+  netpos replay "$out/car_imu_rtk.in" --out "$out/car_imu_rtk" >/dev/null
+  netpos evaluate "$out/car_imu_rtk" --json "$out/car_imu_rtk.json" >/dev/null
 else
   echo "netpos: no real recordings at $data, so only the simulations were measured" >&2
 fi

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from netpos.bags import BagError, BagReader, codec
 from netpos.bags.importers.car_imu_rtk import CLOCK_OFFSET_S, load_car_drive, truth_of
+from netpos.bags.importers.common import recordings
 from netpos.scenario.recorded_drive import import_car_drive, station_drive
 from scipy.spatial.transform import Rotation
 
@@ -149,3 +150,15 @@ def test_the_real_recording() -> None:
     assert np.corrcoef(rate[steady], course[steady])[0, 1] > 0.98
     way = np.linalg.norm(np.diff(drive.antenna[:, :2], axis=0), axis=1).sum()
     assert way == pytest.approx(4050.0, abs=20.0)
+
+
+def test_recordings_are_found_where_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "shared" / "data" / "a").mkdir(parents=True)
+    monkeypatch.delenv("NETPOS_DATA", raising=False)
+    monkeypatch.setenv("NETPOS_ROOT", str(tmp_path / "project"))
+    assert recordings("a") == tmp_path / "shared" / "data" / "a"
+    monkeypatch.setenv("NETPOS_DATA", str(tmp_path))
+    assert recordings("a") is None
+    assert recordings("shared") == tmp_path / "shared"

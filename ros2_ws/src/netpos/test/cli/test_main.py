@@ -248,7 +248,7 @@ def test_recover_leaves_a_whole_bag_alone(netpos: Netpos, bag: Path) -> None:
     assert "nothing to recover" in result.stdout
 
 
-@pytest.mark.parametrize("kind", ["ble-aoa", "uwb-anchors"])
+@pytest.mark.parametrize("kind", ["ble-aoa", "uwb-anchors", "car-imu-rtk"])
 def test_import_of_nothing(netpos: Netpos, tmp_path: Path, kind: str) -> None:
     result = netpos("import", kind, tmp_path / "none", tmp_path / "b")
     assert_refused(result, "none")

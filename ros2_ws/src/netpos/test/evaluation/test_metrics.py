@@ -101,6 +101,15 @@ def test_height_counts_in_3d_only() -> None:
     assert (figures.rmse_m, figures.rmse_3d_m) == (pytest.approx(3.0), pytest.approx(5.0))
 
 
+def test_north_east_and_down_are_the_axes_of_map() -> None:
+    """Errors of 3 m east, 1 m north, 4 m up, and none at the second epoch."""
+    off = replace(pose(0, 3), position=np.array([3.0, 1.0, 4.0]))
+    figures = score(run_of([pose(0, 0), pose(1, 0)], [off, pose(1, 0)]), skip=0).figures
+    root = np.sqrt(0.5)
+    axes = (figures.north_rmse_m, figures.east_rmse_m, figures.down_rmse_m)
+    assert axes == pytest.approx((root, 3 * root, 4 * root))
+
+
 def test_skipped_estimates_do_not_count() -> None:
     truth = straight(41)
     estimate = [moved(p, 0.0, 100.0 if k < 20 else 1.0) for k, p in enumerate(truth)]

@@ -97,14 +97,15 @@ def test_values_are_those_of_the_geometry() -> None:
     for row in all_rows(rng):
         kind, predicted = int(row[KIND]), row[VALUE] - innovation(row, nav)[0]
         u = row[10:19].reshape(3, 3) @ (antenna - row[ORIGIN : ORIGIN + 3])
+        r = max(float(np.linalg.norm(u)), 1e-9)  # rows of a direction have no origin
         body = Rotation.from_quat(nav[6:10]).inv().apply(nav[3:6])
         expected = {
             Kind.AZIMUTH: math.atan2(u[1], u[0]),
-            Kind.ELEVATION: math.asin(u[2] / np.linalg.norm(u)),
-            Kind.RANGE: np.linalg.norm(u),
-            Kind.TOA: np.linalg.norm(u),
-            Kind.COSINE_Y: u[1] / np.linalg.norm(u),
-            Kind.COSINE_Z: u[2] / np.linalg.norm(u),
+            Kind.ELEVATION: math.asin(u[2] / r),
+            Kind.RANGE: r,
+            Kind.TOA: r,
+            Kind.COSINE_Y: u[1] / r,
+            Kind.COSINE_Z: u[2] / r,
             SpaceKind.PLACE: row[ORIGIN : ORIGIN + 3] @ antenna,
             SpaceKind.BODY_VELOCITY: row[ORIGIN : ORIGIN + 3] @ body,
             SpaceKind.BODY_RATE: row[ORIGIN : ORIGIN + 3] @ nav[GYRO_BIAS:],

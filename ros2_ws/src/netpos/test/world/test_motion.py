@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from netpos.world.frames import quaternion_from_yaw, wrap_angle, yaw_from_quaternion
+from netpos.world.hills import Hills
 from netpos.world.motion import Motion, follow
 
 ZIGZAG = [[0, 0], [20, 0], [20, 15], [35, 20], [35, 40]]
@@ -126,3 +127,12 @@ def test_frames(angle: float) -> None:
     assert math.cos(wrapped) == pytest.approx(math.cos(angle), abs=1e-9)
     back = float(yaw_from_quaternion(quaternion_from_yaw(angle)))
     assert math.cos(back - angle) == pytest.approx(1.0)
+
+
+def test_hills_are_checked() -> None:
+    with pytest.raises(ValueError, match="amplitude_m"):
+        Hills(amplitude_m=-1.0)
+    with pytest.raises(ValueError, match="period_s"):
+        Hills(amplitude_m=1.0, period_s=math.inf)
+    with pytest.raises(ValueError, match="no pauses"):
+        follow([[0, 0], [9, 0]], 1.0, pauses_s=[1, 0], hills=Hills(amplitude_m=1.0))

@@ -102,3 +102,21 @@ def test_result_has_the_agreed_form(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_bad_arguments_are_refused(arguments: dict[str, object], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         reproduce(**{"paper": "fokin2020", **arguments})  # type: ignore[arg-type]
+
+
+def test_fewer_runs_of_the_same_work() -> None:
+    with Work(21, 5, 1) as work:
+        few = work.with_runs(3)
+        assert [total for _, total in few.over_seeds("few", _sum, 0)] == [5 + 6 + 7]
+        assert sum(total for _, total in work.over_seeds("all", _sum, 0)) == sum(range(5, 26))
+
+
+def test_a_paper_may_name_its_number_of_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    outcome = Outcome(rows=(), draw=lambda folder: [])
+    module = SimpleNamespace(RUNS=7, warm_up=lambda: None, reproduce=lambda work: outcome)
+    monkeypatch.setitem(PAPERS, "some2026", "some.module")
+    monkeypatch.setattr(frame, "import_module", lambda name: module)
+    assert reproduce("some2026", workers=1).runs == 7
+    assert reproduce("some2026", runs=2, workers=1).runs == 2
+    del module.RUNS
+    assert reproduce("some2026", workers=1).runs == 1000
