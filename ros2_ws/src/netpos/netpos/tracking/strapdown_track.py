@@ -35,6 +35,7 @@ from netpos.tracking.protection import NisWindow, protection_level
 from netpos.tracking.rsus import Rsu
 from netpos.tracking.sequencer import Epoch, Item
 from netpos.tracking.smoothing import Posterior
+from netpos.tracking.strapdown_engine import compile_kernels
 from netpos.tracking.strapdown_models import sensors_of
 from netpos.tracking.strapdown_start import SampleBuffer, StrapdownStart
 from netpos.tracking.track import TrackOutput
@@ -86,6 +87,11 @@ class _Block:
     rows: Array
     lever: Array
     source: str
+
+
+def warm_up(config: TrackerConfig) -> None:
+    """Compile, or load, the kernels before the first measurement."""
+    compile_kernels(sensors_of(config))
 
 
 class StrapdownTrack:

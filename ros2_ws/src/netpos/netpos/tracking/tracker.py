@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 from netpos.messages.values import (
     GroundSpeed,
@@ -19,10 +21,10 @@ from netpos.tracking.health import HealthConfig, RsuHealth, RsuReport
 from netpos.tracking.rsus import Rsu
 from netpos.tracking.sequencer import IMU, Epoch, Item, Sequencer
 from netpos.tracking.smoothing import Posterior, check_smoothable
-from netpos.tracking.strapdown_engine import compile_kernels
-from netpos.tracking.strapdown_models import sensors_of
-from netpos.tracking.strapdown_track import StrapdownTrack
 from netpos.tracking.track import Track, TrackOutput
+
+if TYPE_CHECKING:
+    from netpos.tracking.strapdown_track import StrapdownTrack
 
 
 class Tracker:
@@ -41,7 +43,7 @@ class Tracker:
         if keep_posteriors:
             check_smoothable(self._config)
         if self._config.motion_model == "strapdown":
-            compile_kernels(sensors_of(self._config))
+            _strapdown().warm_up(self._config)
         self._rsus: dict[str, Rsu] = {}
         self._tracks: dict[str, Track | StrapdownTrack] = {}
         self._sequencers: dict[str, Sequencer] = {}
@@ -186,9 +188,16 @@ class Tracker:
     def track(self, vue_id: str) -> Track | StrapdownTrack:
         """Track of a device, new where there is none."""
         if vue_id not in self._tracks and self._config.motion_model == "strapdown":
-            self._tracks[vue_id] = StrapdownTrack(vue_id, self._config, self._rsus)
+            self._tracks[vue_id] = _strapdown().StrapdownTrack(vue_id, self._config, self._rsus)
         elif vue_id not in self._tracks:
             track = Track(vue_id, self._config, self._rsus, self._health)
             track.posteriors = [] if self._keep_posteriors else None
             self._tracks[vue_id] = track
         return self._tracks[vue_id]
+
+
+def _strapdown() -> ModuleType:
+    """The strapdown track, which brings SciPy's rotations: a planar tracker does without."""
+    from netpos.tracking import strapdown_track  # noqa: PLC0415
+
+    return strapdown_track

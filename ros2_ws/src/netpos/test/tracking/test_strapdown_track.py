@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
@@ -313,3 +315,13 @@ def test_an_rsu_may_look_anywhere(simulation: Simulation, items: list[Item]) -> 
     outputs = run(tracker, map(seen, items))
     assert np.abs(errors(simulation, outputs)[-10:]).max() < 2.5
     assert isinstance(simulation.rsus[0], RsuInfo)
+
+
+def test_a_planar_tracker_does_without_rotations() -> None:
+    """SciPy's rotations cost time and memory at the start of every tracker."""
+    code = (
+        "import sys; from netpos.tracking import Tracker; Tracker();"
+        "print([m for m in sys.modules if 'strapdown' in m or 'spatial.transform' in m])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
