@@ -22,6 +22,7 @@ from netpos.filters.fit import misfit
 from netpos.filters.measurement import (
     AXES,
     BIAS,
+    BLOCKED,
     COMMON,
     GROUP,
     HEADING,
@@ -237,7 +238,7 @@ def with_heading(
 ) -> tuple[Array, Array] | None:
     """A fix mean (6,), cov (6, 6) that ignored the lever arms of ``rows`` (m, ROW_WIDTH), and the
     heading they speak for: mean (7,), cov (7, 7); None where they leave it open."""
-    levers = rows[rows[:, HEADING] >= 0, LEVER:]
+    levers = rows[rows[:, HEADING] >= 0, LEVER:BLOCKED]
     if not levers.any():
         return None
     rows = rows.copy()

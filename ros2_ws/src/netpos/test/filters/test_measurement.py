@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from netpos.filters.measurement import (
     AXES,
     BIAS,
+    BLOCKED,
     COMMON,
     GATE_VARIANCE,
     HEADING,
@@ -61,7 +62,7 @@ def random_row(rng: np.random.Generator, kind: Kind, heading: int = -1) -> Array
     info = random_info(rng, AngleConvention.SPHERICAL)
     row[ORIGIN:AXES] = info.position
     row[AXES:HEADING] = rsu_axes(info)
-    row[HEADING], row[LEVER:] = heading, rng.uniform(-2, 2, 3)
+    row[HEADING], row[LEVER:BLOCKED] = heading, rng.uniform(-2, 2, 3)
     return row
 
 
@@ -140,7 +141,7 @@ def test_antenna_ahead_of_a_device_heading_north() -> None:
     nearer by 3/5 of 2 m per rad; all kinds see the same move."""
     row, x, h = np.zeros(ROW_WIDTH), np.array([3.0, 2.0, 0, 0, 7.0, 0, math.pi / 2]), np.empty(7)
     row[[BIAS, COMMON, HEADING]], row[AXES:HEADING] = (-1, -1, 6), np.eye(3).reshape(-1)
-    row[LEVER:] = 2.0, 0.0, 0.0
+    row[LEVER:BLOCKED] = 2.0, 0.0, 0.0
     for kind, value, gradient in (
         (Kind.RANGE, 5.0, [0.6, 0.8, 0, 0, 0, 0, -1.2]),
         (Kind.TOA, 12.0, [0.6, 0.8, 0, 0, 1, 0, -1.2]),
@@ -149,7 +150,7 @@ def test_antenna_ahead_of_a_device_heading_north() -> None:
         row[KIND] = kind
         assert predict_row(row, x, 0.0, h) == pytest.approx(value, rel=1e-15)
         np.testing.assert_allclose(h, gradient, rtol=1e-14, atol=1e-15)
-    row[KIND], row[LEVER:] = Kind.RANGE, (0.0, 1.0, 0.0)  # on its left: at (2, 2)
+    row[KIND], row[LEVER:BLOCKED] = Kind.RANGE, (0.0, 1.0, 0.0)  # on its left: at (2, 2)
     assert predict_row(row, x, 0.0, h) == pytest.approx(math.sqrt(8), rel=1e-15)
 
 
@@ -322,7 +323,7 @@ def half_trace(row: Array, x: Array, cov: Array, height_m: float) -> float:
 def level_row(kind: Kind, origin: Array) -> Array:
     row = random_row(np.random.default_rng(0), kind)
     row[ORIGIN:AXES], row[AXES:HEADING] = origin, np.eye(3).reshape(-1)
-    row[LEVER:] = 0.0
+    row[LEVER:BLOCKED] = 0.0
     return row
 
 
