@@ -12,6 +12,7 @@ from netpos.filters.conditioning import Robust, condition
 from netpos.filters.measurement import (
     AXES,
     BIAS,
+    BLOCKED,
     COMMON,
     GATE_VARIANCE,
     GROUP,
@@ -288,8 +289,20 @@ def test_only_ranges_and_times_come_late(kind: Kind) -> None:
     np.testing.assert_array_equal(out[1], rows[1])
     assert out[0, VALUE] < 1010.0
     np.testing.assert_array_equal(
-        np.flatnonzero(out[0] != rows[0]), [VALUE, VARIANCE, GATE_VARIANCE]
+        np.flatnonzero(out[0] != rows[0]), [VALUE, VARIANCE, GATE_VARIANCE, BLOCKED]
     )
+
+
+@pytest.mark.parametrize("excess", [-1.0, 0.5, 20.0])
+def test_a_row_says_how_likely_its_path_was_blocked(excess: float) -> None:
+    """It becomes the posterior, and is the prior in place of the option's where it is given."""
+    mean, cov, rows = range_row(Kind.RANGE, excess)
+    out = conditioned(mean, cov, rows, late=(0.2, 5.0))
+    assert 0.0 < out[0, BLOCKED] < 1.0
+    assert (out[0, BLOCKED] > 0.2) == (excess > 3.0)
+    given = rows.copy()
+    given[0, BLOCKED] = 0.2
+    np.testing.assert_array_equal(conditioned(mean, cov, given, late=(0.7, 5.0)), out)
 
 
 def test_weights_are_given_to_what_is_left_of_a_late_range() -> None:
