@@ -108,7 +108,7 @@ graph_abandon() { # the script ends early (Ctrl-C, an error): leave nothing runn
 start_trackers() { # SCENARIO_OR_BAG [ARGUMENT...]: one tracker, or one per network and the fusion of their tracks; waits
   local source=$1 network names
   shift
-  names=$(python -c 'import sys; from netpos.tracking.settings import settings_from; print(*settings_from(sys.argv[1]).networks)' "$source")
+  names=$(python "$NETPOS_ROOT/scripts/networks.py" "$source") || give_up
   trackers=()
   for network in $names; do
     trackers+=("ekf_tracker_$network")
