@@ -13,6 +13,7 @@ Delta, delta).
 ``kf``           linear filter with an optional floor under its gain
 ``imm``          interacting multiple models
 ``gate``         acceptance by group; ``conditioning``, ``robust``: what fits badly counts less
+``intersection``  two estimates of one state into one, whatever they have in common
 ``smooth``       Rauch-Tung-Striebel smoothing
 ``filterpy_backend``  the reference
 """

@@ -6,6 +6,8 @@
 ``rows``         filter rows of a whole simulated run
 ``pictures``     what papers draw
 ``fokin2020``    the first paper
+``dvornikov2017``  several networks, one track: ``network_truth``, ``network_stages``,
+               ``network_summary``, ``network_crossing``, ``network_pictures``
 """
 
 from netpos.evaluation.reproduce.frame import PAPERS, Reproduction, Row, reproduce

@@ -132,11 +132,11 @@ class TrackFusion:
     def _sequence(self, track: NetworkTrack) -> str | None:
         if not self._sequencer.newest_ns:
             for name in self._order:  # what has not been heard yet is waited for, too
-                self._sequencer.mark(name, track.stamp_ns - 1)
+                self._sequencer.mark(f"{name}/", track.stamp_ns - 1)
         # The sequencer asks an item for its stamp and its source only.
         reason = self._sequencer.add(cast(Item, track))
         if reason is None:
-            self._sequencer.mark(track.network, track.stamp_ns)
+            self._sequencer.mark(f"{track.network}/", track.stamp_ns)
         elif self._sequencer.set_back:
             self.reset()
         return reason
