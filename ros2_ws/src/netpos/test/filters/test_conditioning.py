@@ -298,7 +298,7 @@ def test_a_row_says_how_likely_its_path_was_blocked(excess: float) -> None:
     """It becomes the posterior, and is the prior in place of the option's where it is given."""
     mean, cov, rows = range_row(Kind.RANGE, excess)
     out = conditioned(mean, cov, rows, late=(0.2, 5.0))
-    assert 0.0 < out[0, BLOCKED] < 1.0
+    assert 0.0 < out[0, BLOCKED] <= 1.0
     assert (out[0, BLOCKED] > 0.2) == (excess > 3.0)
     given = rows.copy()
     given[0, BLOCKED] = 0.2
