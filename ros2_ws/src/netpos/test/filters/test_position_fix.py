@@ -118,7 +118,9 @@ def test_two_ranges_are_too_few() -> None:
 def test_stations_in_one_line_leave_the_position_open() -> None:
     line = np.column_stack([[0.0, 50.0, 90.0, 140.0], np.zeros(4), np.full(4, 10.0)])
     rows = rows_at(PLACE, line, Field.RANGE, None)
-    assert fix_position(rows, start_of(rows, 10.0)).status == FixStatus.GEOMETRY
+    fix = fix_position(rows, start_of(rows, 10.0))
+    assert fix.status == FixStatus.GEOMETRY
+    assert np.isfinite(fix.position).all()
 
 
 def test_one_height_of_all_stations_leaves_the_height_open() -> None:
@@ -126,7 +128,47 @@ def test_one_height_of_all_stations_leaves_the_height_open() -> None:
     flat = CORNERS.copy()
     flat[:, 2] = 10.0
     rows = rows_at(PLACE, flat, Field.RANGE, None)
-    assert fix_position(rows, np.array([30.0, 50.0, 10.0])).status == FixStatus.GEOMETRY
+    fix = fix_position(rows, np.array([30.0, 50.0, 10.0]))
+    assert fix.status == FixStatus.GEOMETRY
+    assert np.isfinite(fix.position).all()
+
+
+def test_a_height_known_to_kilometres_is_no_fix() -> None:
+    """A tenth of a millimetre below the plane of the stations: regular, and of no use."""
+    flat = CORNERS.copy()
+    flat[:, 2] = 10.0
+    place = np.array([35.0, 60.0, 9.9999])
+    rows = rows_at(place, flat, Field.RANGE, None)
+    fix = fix_position(rows, place)
+    assert fix.status == FixStatus.GEOMETRY
+    assert np.sqrt(fix.cov[2, 2]) > 1e3
+
+
+def test_a_device_in_the_west_is_not_torn_apart() -> None:
+    """Azimuths of two stations on either side of the wrap, each on its own side of the truth."""
+    place = np.array([-60.0, 0.0, 1.0])
+    stations = np.array([[0.0, 1.0, 9.0], [30.0, -1.0, 8.0]])
+    rows = rows_at(place, stations, ALL, None)
+    rows[0, VALUE], rows[3, VALUE] = math.pi - 0.05, -math.pi + 0.05
+    fix = fix_position(rows, start_of(rows, 0.0))
+    assert fix.status == FixStatus.CONVERGED
+    assert np.linalg.norm(fix.position - place) < 4.0
+
+
+@pytest.mark.parametrize("seed", [6, 32, 40, 58])
+def test_steps_that_overshoot_are_halved(seed: int) -> None:
+    """Noisy ranges with an open height, on which full Gauss-Newton steps run for ever."""
+    rows = rows_at(PLACE, CORNERS, Field.RANGE, np.random.default_rng(seed))
+    fix = fix_position(rows, start_of(rows, 0.0))
+    assert fix.status == FixStatus.CONVERGED
+
+    def residuals(p: Array) -> Array:
+        return np.asarray(np.linalg.norm(p - rows[:, 7:10], axis=1) - rows[:, VALUE])
+
+    best = least_squares(
+        residuals, fix.position - np.array([0.0, 0.0, 1.0]), xtol=1e-12, ftol=1e-12
+    )
+    np.testing.assert_allclose(fix.position, best.x, atol=0.05)
 
 
 def test_a_fix_that_does_not_settle_says_so() -> None:

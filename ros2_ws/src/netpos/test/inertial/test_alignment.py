@@ -27,11 +27,16 @@ def imu_of(motion: Motion, end_s: float, tilt: Rotation) -> tuple[Array, Array]:
 
 
 def aligned(
-    motion: Motion, end_s: float, sd_m: float = 0.0, tilt: Rotation | None = None, seed: int = 1
+    motion: Motion,
+    end_s: float,
+    sd_m: float = 0.0,
+    tilt: Rotation | None = None,
+    seed: int = 1,
+    begin_s: float = 0.0,
 ) -> tuple[Course | None, Array]:
     """The course from one fix a second, and the true position, heading and speed at the end."""
     times, rates = imu_of(motion, end_s, tilt or Rotation.identity())
-    at = np.arange(0.0, end_s + 1e-9, 1.0)
+    at = np.arange(begin_s, end_s + 1e-9, 1.0)
     fixes = motion.at(at).position
     fixes = fixes + sd_m * np.random.default_rng(seed).normal(size=fixes.shape)
     cov = np.tile(max(sd_m, 0.01) ** 2 * np.eye(2), (len(at), 1, 1))
@@ -64,6 +69,31 @@ def test_tilt_is_found_under_way() -> None:
     assert course is not None
     assert course.pitch == pytest.approx(0.04, abs=0.01)
     assert course.roll == pytest.approx(-0.03, abs=0.01)
+
+
+def test_the_way_counts_from_its_first_fix() -> None:
+    """The IMU runs 7 s before: the speed gained and turned until then are not counted."""
+    course, truth = aligned(FROM_REST, 16.0, begin_s=7.0)
+    assert course is not None
+    np.testing.assert_allclose(course.position, truth[:2], atol=0.3)
+    assert course.speed == pytest.approx(truth[3], abs=0.2)
+    times, rates = imu_of(FROM_REST, 16.0, Rotation.identity())
+    way = way_of(times, rates, np.arange(7.0, 16.1))
+    elapsed = way.time_s
+    assert elapsed[0] == 0.0
+    np.testing.assert_allclose(way.D[:4, 0], elapsed[:4] ** 2 / 2, atol=0.05)  # still straight
+    gained = FROM_REST.at(8.0).velocity[0] - FROM_REST.at(7.0).velocity[0]
+    mean = np.hypot(*FROM_REST.at(16.0).velocity[0]) / 16.0  # levelled away
+    assert way.gained[1] == pytest.approx(np.hypot(*gained) - mean, abs=0.03)
+    assert way.B[1, 0] == pytest.approx(way.gained[1] / 2, abs=0.05)
+
+
+def test_a_steady_turn_is_no_roll() -> None:
+    """2.2 m/s^2 to the side look like 0.22 rad."""
+    circle = follow([[0, 0], [60, 0], [60, 60], [0, 60], [0, 1]], 8.0, corner_radius_m=29.0)
+    course, _ = aligned(circle, 22.0, begin_s=5.0)
+    assert course is not None
+    assert abs(course.roll) < 0.06
 
 
 def test_errors_are_as_large_as_claimed() -> None:

@@ -338,6 +338,15 @@ def test_propagation_against_quadrature() -> None:
     np.testing.assert_allclose(cov, expected, atol=5e-7)
 
 
+def test_noise_alone_grows_as_its_densities_say() -> None:
+    """From a state known exactly: density^2 times time; for the biases 2 sd^2 / tau times time."""
+    noise, dt = InertialNoise(0.02, 0.003, 0.1, 0.01, 50.0), 0.1
+    cov = np.zeros((ERR, ERR))
+    propagate(cov, transition(np.zeros(3), np.eye(3), dt, 50.0, still_earth(G)), dt, noise)
+    expected = np.repeat([0.02**2, 0.003**2, 2 / 50 * 0.1**2, 2 / 50 * 0.01**2], 3) * dt
+    np.testing.assert_allclose(np.diag(cov)[3:], expected, rtol=0.02)
+
+
 def test_a_latitude_beyond_the_pole_is_refused() -> None:
     with pytest.raises(ValueError, match="latitude_rad"):
         earth_at(1.6)
