@@ -12,7 +12,7 @@ from netpos.filters.error_state import (
     correct,
     doubt_standstill,
 )
-from netpos.filters.measurement import VALUE, VARIANCE
+from netpos.filters.measurement import ROW_WIDTH, VALUE, VARIANCE
 from netpos.filters.space import (
     SpaceKind,
     bend_variance,
@@ -108,7 +108,7 @@ def test_a_bearing_is_iterated_to_the_most_probable_place() -> None:
     nav, cov = moving(0.0), 1e-9 * np.eye(ERR)
     nav[0] = 20.0
     cov[:3, :3] = np.diag([4.0, 25.0, 0.01])
-    row = np.zeros((1, 23))
+    row = np.zeros((1, ROW_WIDTH))
     row[0, VALUE], row[0, VARIANCE], row[0, 3], row[0, 19] = 0.5, 0.01, 0.01, -1
     row[0, 10:19] = np.eye(3).ravel()
     variance = 0.01 + bend_variance(row[0], nav, cov)

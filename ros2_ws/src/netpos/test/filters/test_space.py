@@ -6,7 +6,16 @@ import math
 
 import numpy as np
 import pytest
-from netpos.filters.measurement import KIND, LEVER, ORIGIN, VALUE, Kind, rsu_axes, rsu_rows
+from netpos.filters.measurement import (
+    KIND,
+    LEVER,
+    ORIGIN,
+    ROW_WIDTH,
+    VALUE,
+    Kind,
+    rsu_axes,
+    rsu_rows,
+)
 from netpos.filters.space import (
     SpaceKind,
     bend_variance,
@@ -152,7 +161,7 @@ def test_a_flat_covariance_is_refused() -> None:
 def test_bend_variance_covers_what_linearising_leaves_out(kind: Kind) -> None:
     """Monte Carlo: no smaller than the variance of the remainder, and no ten times larger."""
     rng = np.random.default_rng(9)
-    row = np.zeros(23)
+    row = np.zeros(ROW_WIDTH)
     row[KIND], row[19] = kind, -1
     row[10:19] = np.eye(3).ravel()
     nav = np.zeros(NAV)
