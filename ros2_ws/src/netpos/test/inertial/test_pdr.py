@@ -10,20 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from netpos.inertial.gait import Gait, GaitModel
-from netpos.inertial.gait import walk as walk_route
-from netpos.inertial.imu import (
-    ImuModel,
-    MagneticDisturbance,
-    MagnetometerModel,
-    simulate_imu,
-    simulate_magnetometer,
-)
 from netpos.inertial.pdr import PedestrianDeadReckoning
 from netpos.inertial.pdr_config import PdrConfig
 from netpos.inertial.pdr_output import StepEvent, StepVelocity, step_velocity
 from netpos.inertial.steps import StepConfig
-from netpos.world.routes import rectangle
 from scipy.spatial.transform import Rotation
 
 G = 9.80665
@@ -86,37 +76,6 @@ def run(
 def heading_error(event: StepEvent, heading_deg: float) -> float:
     d = event.heading_rad - math.radians(heading_deg)
     return abs(math.atan2(math.sin(d), math.cos(d)))
-
-
-def test_step_velocity_matches_petukhov_variances() -> None:
-    """Eqs. 7-8 as printed, term by term, by central differences of eq. 6."""
-    length, duration, heading, sd_l, sd_h = 0.7, 0.55, 0.9, 0.06, 0.12
-    velocity, cov = step_velocity(length, duration, heading, sd_l, sd_h)
-
-    def v(a: float, b: float) -> np.ndarray:
-        return np.array([a / duration * math.cos(b), a / duration * math.sin(b)])
-
-    h = 1e-6
-    dl = (v(length + h, heading) - v(length - h, heading)) / (2 * h)
-    dh = (v(length, heading + h) - v(length, heading - h)) / (2 * h)
-    expected = sd_l**2 * np.outer(dl, dl) + sd_h**2 * np.outer(dh, dh)
-    np.testing.assert_allclose(velocity, v(length, heading), rtol=1e-12)
-    np.testing.assert_allclose(cov, expected, rtol=1e-7)
-
-
-def test_step_velocity_covariance_by_monte_carlo() -> None:
-    rng = np.random.default_rng(11)
-    n, heading = 200_000, -2.0
-    lengths = rng.normal(0.7, 0.03, n)
-    headings = rng.normal(heading, 0.05, n)
-    sample = np.cov(lengths / 0.5 * np.cos(headings), lengths / 0.5 * np.sin(headings))
-    _, cov = step_velocity(0.7, 0.5, heading, 0.03, 0.05)
-    np.testing.assert_allclose(cov, sample, atol=0.02 * float(np.max(np.abs(cov))))
-
-
-def test_step_velocity_refuses_no_duration() -> None:
-    with pytest.raises(ValueError, match="duration"):
-        step_velocity(0.7, 0.0, 0.0, 0.1, 0.1)
 
 
 @pytest.mark.parametrize("heading_deg", [-135.0, 0.0, 60.0, 180.0])
@@ -453,68 +412,6 @@ def test_nested_config_reaches_the_detector() -> None:
     w = walk(walk_s=2.2)  # four steps
     assert len(run(w, PdrConfig(steps=StepConfig(bout_steps=9)))[1]) == 0
     assert len(run(w, PdrConfig(steps=StepConfig(bout_steps=2)))[1]) >= 4
-
-
-def simulated(
-    gait: Gait, seed: int, **magnetometer: Any
-) -> tuple[Gait, list[StepEvent], list[StepVelocity], PedestrianDeadReckoning]:
-    """A walking person's waist module through the core."""
-    imu = simulate_imu(ImuModel(), gait, 10**9, seed, "v")
-    model = MagnetometerModel(rate_hz=100.0, declination_deg=0.0, **magnetometer)
-    stamps, field = simulate_magnetometer(model, gait, 10**9, seed, "v")
-    core, events, velocities = PedestrianDeadReckoning(PdrConfig.of("waist")), [], []
-    for i, stamp in enumerate(imu.stamp_ns.tolist()):
-        out = core.add_imu(stamp, imu.angular_velocity[i], imu.specific_force[i])
-        assert stamps[i + 1] == stamp
-        core.add_magnetic_field(stamp, field[i + 1])
-        events += out.steps if out else ()
-        velocities += [out.velocity] if out and out.velocity else []
-    return gait, events, velocities, core
-
-
-PAPER_WALK = walk_route(
-    rectangle((0.0, 0.0), 5.7, 4.5),
-    GaitModel(cadence_hz=1 / 0.6375),
-    pauses_s=[1.0, 0.7, 0.7, 0.7, 1.0],
-)
-
-
-def test_a_simulated_walk_is_counted_placed_and_headed() -> None:
-    """Every foot contact within 0.1 s and no other; headings of the legs within 5 deg."""
-    gait, events, _, core = simulated(PAPER_WALK, 7)
-    ends = np.array([e.end_ns for e in events]) * 1e-9 - 1.0
-    assert len(events) == gait.contact_s.size == 32
-    np.testing.assert_allclose(ends, gait.contact_s, atol=0.1)
-    straight = [e for e in events if abs(e.length_m / 0.6375 - 1) < 0.3]
-    assert len(straight) >= 30
-    for e, contact in zip(events, gait.contact_s, strict=True):
-        before = gait.body_at(contact - 1 / gait.model.cadence_hz / 2).velocity[0]
-        assert heading_error(e, math.degrees(math.atan2(before[1], before[0]))) < 0.25
-    middle = [e for e, c in zip(events, gait.contact_s, strict=True) if 3 < c < 6.8]
-    assert np.mean([heading_error(e, 0.0) for e in middle]) < math.radians(5)
-    assert core.conditions == ()
-
-
-def test_step_velocities_of_simulated_walks_are_consistent() -> None:
-    """NEES of the velocity at every output, starts, stops and turns included; 2 expected."""
-    nees = []
-    for seed in range(4):
-        gait, _, velocities, _ = simulated(PAPER_WALK, seed)
-        truth = gait.body_at([v.stamp_ns * 1e-9 - 1.0 for v in velocities]).velocity[:, :2]
-        for v, true in zip(velocities, truth, strict=True):
-            error = v.velocity - true
-            nees.append(float(error @ np.linalg.solve(v.covariance, error)))
-    assert 0.4 < np.mean(nees) < 2.5
-    assert np.quantile(nees, 0.99) < 9.2
-
-
-def test_a_disturbed_field_leaves_the_heading_to_the_gyro() -> None:
-    """Iron on the way turns the field by tens of degrees; without the gate the heading follows."""
-    iron = MagneticDisturbance(center=(3.0, 0.0), radius_m=0.8, field_t=(25e-6, -10e-6, 20e-6))
-    gait = walk_route([[0, 0], [12, 0]], GaitModel(), pauses_s=[2.0, 1.0])
-    _, events, _, core = simulated(gait, 3, disturbances=(iron,))
-    assert core.counters["magnetic_disturbed"] > 50
-    assert max(heading_error(e, 0.0) for e in events[1:]) < math.radians(12)
 
 
 @pytest.mark.parametrize("late_ns", [0, 40_000_000, 90_000_000])
