@@ -47,6 +47,8 @@ class AttitudeConfig:
     gravity_tolerance_mps2: float = 3.0
     rest_gyro_radps: float = 0.15
     rest_acceleration_sd_mps2: float = 0.15
+    rest_bias_memory_s: float = 15.0
+    rest_bias_gate_radps: float = 0.02
     declination_rad: float = 0.0
     field_tolerance: float = 0.25
     dip_tolerance_rad: float = 0.26
@@ -155,6 +157,7 @@ class AttitudeFilter:
         kept = self.heading_rad if keep_heading and self.aligned else 0.0
         if not keep_heading:
             self._bias: Vector = (0.0, 0.0, 0.0)
+            self._rest_s = 0.0  # how much rest the bias is the mean of
             self._reference: HeadingReference = "relative"
             self._field: tuple[float, float] | None = None  # norm [T], dip [rad]
             self._last_field_ns: int | None = None
@@ -266,6 +269,20 @@ class AttitudeFilter:
         self.turn(gain * error)
         return "used"
 
+    def rest(self, dt_s: float, rate: Vector) -> None:
+        """Learn the gyro bias from a sample at rest, the ``dt_s`` after the last one: the mean of
+        all rest, or of about the last ``rest_bias_memory_s`` of it.
+
+        A rate further than ``rest_bias_gate_radps`` from the present bias is a turn, not rest.
+        """
+        bx, by, bz = self._bias
+        x, y, z = rate[0] - bx, rate[1] - by, rate[2] - bz
+        if self._q is None or max(abs(x), abs(y), abs(z)) > self._cfg.rest_bias_gate_radps:
+            return
+        self._rest_s = min(self._rest_s + dt_s, self._cfg.rest_bias_memory_s)
+        a = dt_s / self._rest_s if dt_s > 0 else 0.0
+        self._bias = (bx + a * x, by + a * y, bz + a * z)
+
     def turn(self, angle_rad: float) -> None:
         """Turn the attitude about map z (up), counter-clockwise."""
         if self._q is not None:
@@ -326,6 +343,7 @@ class AttitudeFilter:
         rate_norm = float(np.linalg.norm(mean[:3]))
         if rest and rate_norm < min(cfg.rest_gyro_radps, cfg.max_bias_radps):
             self._bias = (float(mean[0]), float(mean[1]), float(mean[2]))
+            self._rest_s = cfg.alignment_time_s
         self._q = level((float(mean[3]), float(mean[4]), float(mean[5])))
         self.turn(start)
         return True

@@ -105,6 +105,7 @@ class PedestrianDeadReckoning:
         self._step: StepEvent | None = None
         self._forward: deque[tuple[int, float, float]] = deque()
         self._turn_rate = math.inf
+        self._resting = False  # as of the last output
         self._watch.reset()
 
     def add_imu(
@@ -149,7 +150,10 @@ class PedestrianDeadReckoning:
         steps = [self._event(stamp_ns, s) for s in self._detector.add(stamp_ns, force)]
         if steps:
             self._step = steps[-1]
-        velocity = self._velocity(stamp_ns) if self._tick(stamp_ns) else None
+        velocity = None
+        if self._tick(stamp_ns):
+            self._resting = self._detector.still
+            velocity = self._velocity(stamp_ns)
         return PdrOutput(tuple(steps), velocity) if steps or velocity is not None else None
 
     def add_magnetic_field(self, stamp_ns: int, field_tesla: VectorLike) -> None:
@@ -246,6 +250,8 @@ class PedestrianDeadReckoning:
                 self._heading_fix_ns = stamp_ns
         self._watch_field(stamp_ns)
         self._attitudes.append((stamp_ns, self._attitude.quaternion))
+        if self._resting:
+            self._attitude.rest(dt_s, rate)
         bias = self._attitude.bias_radps
         norm = math.sqrt(sum((r - b) ** 2 for r, b in zip(rate, bias, strict=True)))
         a = min(dt_s / 0.5, 1.0) if self._turn_rate < math.inf else 1.0
@@ -341,7 +347,7 @@ class PedestrianDeadReckoning:
         cfg, reference = self.config, self._attitude.reference
         if not (self._watch.rate_ok and self._mounted):
             return self._isotropic(stamp_ns, cfg.undecided_speed_sd_mps, True)
-        if self._detector.still:
+        if self._resting:
             turning = self._turn_rate >= cfg.still_rate_radps
             sd = cfg.turning_speed_sd_mps if turning else cfg.still_speed_sd_mps
             return self._isotropic(stamp_ns, sd, turning)

@@ -131,6 +131,21 @@ def test_constant_gyro_bias_is_estimated() -> None:
     np.testing.assert_allclose(f.bias_radps[:2], [0.02, -0.01], atol=5e-4)
 
 
+@pytest.mark.parametrize(("rate", "learnt"), [(0.0199, True), (0.0201, False)])
+def test_rest_teaches_the_gyro_bias_within_its_gate(rate: float, learnt: bool) -> None:
+    """The mean with the 0.5 s of alignment at rest, then a memory of 2 s; a larger rate turns."""
+    f = AttitudeFilter(AttitudeConfig(rest_bias_memory_s=2.0, rest_bias_gate_radps=0.02))
+    rest(f, Rotation.identity())
+    for _ in range(100):
+        f.rest(0.01, (0.0, -rate, rate))
+    expected = rate * 1.0 / 1.5 if learnt else 0.0
+    np.testing.assert_allclose(f.bias_radps, [0.0, -expected, expected], atol=1e-12)
+    for _ in range(350):
+        f.rest(0.01, (0.0, -rate, rate))
+    expected = rate * (1 - (0.5 / 2.0) * (1 - 0.005) ** 300) if learnt else 0.0
+    np.testing.assert_allclose(f.bias_radps, [0.0, -expected, expected], atol=1e-12)
+
+
 @pytest.mark.parametrize("yaw_deg", [-170.0, -90.0, 0.0, 35.0, 179.0])
 @pytest.mark.parametrize("declination_rad", [0.0, 0.2])
 def test_first_field_sample_sets_the_heading(yaw_deg: float, declination_rad: float) -> None:

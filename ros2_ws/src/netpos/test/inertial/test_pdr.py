@@ -126,7 +126,7 @@ def test_device_tilt_does_not_change_steps_or_heading() -> None:
         _, events, _ = run(tilted)
         assert [e.end_ns for e in events] == [e.end_ns for e in reference]
         assert events[5].length_m == pytest.approx(reference[5].length_m, rel=1e-6)
-        assert max(heading_error(e, 0.0) for e in events) < 0.03
+        assert max(heading_error(e, 0.0) for e in events) < 0.05  # 20 s of gyro noise
 
 
 def test_rest_gives_a_tight_zero_and_the_walk_does_not() -> None:
@@ -435,3 +435,15 @@ def test_the_order_of_arrival_of_imu_and_field_does_not_matter(late_ns: int) -> 
     expected, got = through(True), through(False)
     assert expected[50:] == got[50:]
     assert len(got) > 200
+
+
+def test_a_gyro_bias_that_comes_later_is_learnt_while_standing() -> None:
+    """0.01 rad/s from 5 s to 45 s: without learning the heading ends 0.4 rad off."""
+    core, rng = PedestrianDeadReckoning(), np.random.default_rng(6)
+    for i in range(4500):
+        rate, force = rng.normal(scale=0.002, size=(2, 3))
+        rate[2] += 0.01 if i > 500 else 0.0
+        force[2] += G
+        core.add_imu(i * 10**7, rate, force)
+    assert core.attitude.bias_radps[2] == pytest.approx(0.01, abs=1.5e-3)
+    assert abs(core.attitude.heading_rad) < 0.15
