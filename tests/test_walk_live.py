@@ -16,7 +16,7 @@ from netpos.messages.values import ImuSample
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.offline import simulate_to_bag
 from netpos_msgs.msg import Step
-from runs import changed_scenario, graphs
+from runs import TRACK_STATUS, changed_scenario, finish, graphs, script
 
 RATE = 4
 
@@ -140,3 +140,17 @@ def test_swapped_axes_and_no_magnetometer_are_told_once_by_the_running_node(
     assert node.output.count("no magnetic field is heard") == 1
     assert node.output.count("WARN") == 2
     assert all(v.twist.twist.linear.x == 0.0 for v in velocities.messages[15:])
+
+
+def test_the_run_script_dead_reckons_who_walks(
+    scenario: str, graph: Graph, tmp_path: Path
+) -> None:
+    """run_graph.sh starts a pdr_node; the tracker fuses its velocities."""
+    bag_path = tmp_path / "run"
+    finish(script(graph, "run_graph", scenario, bag_path, str(RATE)))
+    with BagReader(bag_path) as bag:
+        steps = [e.message for e in bag.messages(["/vue_1/step"])]
+        status = [e.message for e in bag.messages([TRACK_STATUS])]
+    assert len(steps) == 32
+    fused = [s for s in status if "step_velocity" in s.sources]
+    assert len(fused) > 200

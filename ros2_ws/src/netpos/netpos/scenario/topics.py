@@ -73,16 +73,6 @@ def device_topics(scenario: Scenario) -> dict[str, str]:
     return found
 
 
-def pdr_topics(scenario: Scenario) -> dict[str, str]:
-    """Message type by topic of the dead reckoning of everybody who walks."""
-    return {
-        topics.of_vue(vue_id, name): type_name
-        for vue_id, device in scenario.each_device
-        for name, type_name in _OF_PDR.values()
-        if device.walks
-    }
-
-
 def to_message(codec: Codec, value: Value) -> Any:
     """The message of a value."""
     convert: dict[type, Callable[[Any], Any]] = {

@@ -177,6 +177,8 @@ def test_a_person_walks_a_route(tmp_path: Path) -> None:
         ("step_length_m: 0.6375", "step_length_m: 0.0", "step_length_m: input should be greater"),
         ("cadence_hz", "cadence", "gait.cadence: unknown key"),
         ("radius_m: 0.7", "radius_m: -1", "radius_m: input should be greater"),
+        ("    imu: {}", "    imu: {}\n    pdr: {height: 1.8}", "no parameter height of pdr"),
+        ("    imu: {}", "    imu: {}\n    pdr: {height_m: -1.0}", "pdr.height_m must be finite"),
     ],
 )
 def test_complaints_about_a_walker(tmp_path: Path, old: str, new: str, complaint: str) -> None:

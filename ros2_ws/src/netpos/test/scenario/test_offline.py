@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from netpos.bags import BagReader, codec
+from netpos.inertial.gait import Gait
 from netpos.messages.values import Beacon
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.offline import simulate_to_bag, timeline
@@ -61,3 +63,28 @@ def test_clock_leads_every_event_and_never_lags_a_period() -> None:
 def test_bad_clock_rate_is_refused(clock_hz: float) -> None:
     with pytest.raises(ValueError, match="clock_hz"):
         next(timeline(Simulation(load_scenario("fast_pass")), clock_hz))
+
+
+def test_who_walks_is_dead_reckoned_and_who_drives_is_not(tmp_path: Path) -> None:
+    """5 s of the person of ``pedestrian_walk``: steps of the true contacts, velocities in map."""
+    walk = load_scenario("pedestrian_walk", changes={"max_duration_s": 6.0})
+    gait = walk.devices[0].motion(walk.seed, "vue_1")
+    assert isinstance(gait, Gait)
+    simulate_to_bag(walk, tmp_path / "walk")
+    make = codec()
+    with BagReader(tmp_path / "walk") as bag:
+        steps = [e.message for e in bag.messages(["/vue_1/step"])]
+        velocities = [
+            make.velocity_from_msg(e.message, "vue_1")
+            for e in bag.messages(["/vue_1/step_velocity"])
+        ]
+    ends = np.array([s.end.sec + s.end.nanosec * 1e-9 for s in steps]) - walk.start_s
+    known = gait.contact_s[gait.contact_s < 6.0 - 0.5]
+    assert len(known) >= 4
+    np.testing.assert_allclose(ends[: len(known)], known, atol=0.1)
+    assert len(velocities) == pytest.approx(10 * 5.5, abs=2)
+    assert {v.frame_id for v in velocities[2:]} == {"map"}
+    drive = load_scenario("intersection_turn", changes={"max_duration_s": 2.0})
+    simulate_to_bag(drive, tmp_path / "drive")
+    with BagReader(tmp_path / "drive") as bag:
+        assert not {"/vue_1/step", "/vue_1/step_velocity"} & set(bag.topics)
