@@ -36,7 +36,10 @@ def declare_parameters(node: Node) -> PdrParameters:
     placement = declare(node, "placement", defaults.get("placement", "carried"), text)
     base = PdrConfig.from_mapping({**defaults, "placement": placement}).flat()
     values = {
-        name: declare(node, name, default, "see PdrConfig") for name, default in base.items()
+        name: declare(
+            node, name, list(value) if isinstance(value, tuple) else value, "see PdrConfig"
+        )
+        for name, value in base.items()
     }
     return PdrParameters(
         vue_id=vue_id, config=PdrConfig.from_mapping({"placement": placement, **values})

@@ -134,11 +134,13 @@ def test_every_entry_of_the_config_is_a_read_only_parameter(make: Any) -> None:
     node, plain = make(), PdrConfig().flat()
     assert {"height_m", "attitude.declination_rad", "steps.signal"} < set(plain)
     for name, value in plain.items():
-        assert node.get_parameter(name).value == value
+        given = node.get_parameter(name).value
+        assert (tuple(given) if isinstance(value, tuple) else given) == value
         assert node.describe_parameter(name).read_only
     assert node.get_parameter("vue").value == "vue_1"
-    assert make(**{"weinberg_k": 0.5, "steps.bout_steps": 4})._core.config == PdrConfig(
-        weinberg_k=0.5, steps=StepConfig(bout_steps=4)
+    changed = {"weinberg_k": 0.5, "steps.bout_steps": 4, "hard_iron_t": [1e-6, 0.0, 2e-6]}
+    assert make(**changed)._core.config == PdrConfig(
+        weinberg_k=0.5, steps=StepConfig(bout_steps=4), hard_iron_t=(1e-6, 0.0, 2e-6)
     )
 
 

@@ -157,7 +157,7 @@ class PedestrianDeadReckoning:
         return PdrOutput(tuple(steps), velocity) if steps or velocity is not None else None
 
     def add_magnetic_field(self, stamp_ns: int, field_tesla: VectorLike) -> None:
-        """Add one calibrated magnetometer sample (3,) in tesla, body frame.
+        """Add one magnetometer sample (3,) in tesla, body frame.
 
         A sample without 1-1000 microtesla (wrong unit), out of order, or of a time without
         attitude is counted and not used. It may arrive before the IMU samples of its time, and up
@@ -174,7 +174,12 @@ class PedestrianDeadReckoning:
             self._counters["magnetic_stamp_backwards"] += 1
             return
         self._last_field_ns = stamp_ns
-        self._fields.append((stamp_ns, value))
+        self._fields.append((stamp_ns, self._calibrated(value)))
+
+    def _calibrated(self, value: Vector) -> Vector:
+        x, y, z = (v - h for v, h in zip(value, self.config.hard_iron_t, strict=True))
+        a, b, c, d, e, f, g, h, i = self.config.field_matrix
+        return (a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z)
 
     def _use_fields(self, now_ns: int) -> None:
         """Use the field samples that are old enough, each with the attitude of its stamp."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
@@ -52,6 +52,8 @@ class PdrConfig:
     mount_heading_rad : walking direction minus the body x axis, counter-clockwise
     max_mount_tilt_rad : a mean specific force further from the body z axis than this means
         swapped axes: the heading is then unknown; pi for a device carried anyhow
+    hard_iron_t, field_matrix : the field is matrix (reading - hard iron), of
+        ``magnetic_calibration.fit_iron``; the matrix by rows
     field_hold_s : a field sample is used this long after its stamp, so that it does not matter
         whether it or the IMU sample of the same time arrives first
     field_patience_s : how long the heading may do without magnetic samples before it is said
@@ -73,6 +75,8 @@ class PdrConfig:
     heading_drift_radps: float = 0.001
     mount_heading_rad: float = 0.0
     max_mount_tilt_rad: float = math.pi
+    hard_iron_t: tuple[float, ...] = (0.0, 0.0, 0.0)
+    field_matrix: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     field_hold_s: float = 0.1
     field_patience_s: float = 3.0
     still_speed_sd_mps: float = 0.05
@@ -103,6 +107,10 @@ class PdrConfig:
             value = getattr(self, name)
             if not 0 <= value < math.inf:
                 raise ValueError(f"pdr.{name} must be finite and >= 0, got {value}; use 0 for off")
+        for name, size in (("hard_iron_t", 3), ("field_matrix", 9)):
+            numbers = getattr(self, name)
+            if len(numbers) != size or not all(map(math.isfinite, numbers)):
+                raise ValueError(f"pdr.{name} must be {size} finite numbers, got {numbers}")
         if not abs(self.mount_heading_rad) <= math.pi:
             raise ValueError(
                 f"pdr.mount_heading_rad must be in [-pi, pi] rad, got {self.mount_heading_rad}; "
@@ -172,6 +180,8 @@ class PdrConfig:
 
 def _like(default: Any, value: Any, name: str) -> Any:
     """The value in the type of the default; whole numbers may stand for floats."""
+    if isinstance(default, tuple) and isinstance(value, Sequence) and not isinstance(value, str):
+        return tuple(_like(0.0, number, name) for number in value)
     if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if type(value) is not type(default):

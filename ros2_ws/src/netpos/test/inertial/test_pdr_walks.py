@@ -15,10 +15,12 @@ from netpos.inertial.imu import (
     simulate_imu,
     simulate_magnetometer,
 )
+from netpos.inertial.magnetic_calibration import fit_iron
 from netpos.inertial.pdr import PedestrianDeadReckoning
 from netpos.inertial.pdr_config import PdrConfig
 from netpos.inertial.pdr_output import StepEvent, StepVelocity
 from netpos.world.routes import rectangle
+from scipy.spatial.transform import Rotation
 
 
 def heading_error(event: StepEvent, heading_deg: float) -> float:
@@ -85,3 +87,41 @@ def test_a_disturbed_field_leaves_the_heading_to_the_gyro() -> None:
     _, events, _, core = simulated(gait, 3, disturbances=(iron,))
     assert core.counters["magnetic_disturbed"] > 50
     assert max(heading_error(e, 0.0) for e in events[1:]) < math.radians(12)
+
+
+def test_hard_iron_that_was_calibrated_does_not_turn_the_heading() -> None:
+    """20 microtesla worn with the sensor: more than the horizontal field of 15."""
+    gait = walk_route([[0, 0], [6, 0]], GaitModel(), pauses_s=[2.0, 1.0])
+    imu = simulate_imu(ImuModel(), gait, 10**9, 2, "v")
+    model = MagnetometerModel(rate_hz=100.0, declination_deg=0.0, noise_sd_t=0.0)
+    iron = MagnetometerModel(
+        rate_hz=100.0, declination_deg=0.0, hard_iron_sd_t=20e-6, soft_iron_sd=0.05
+    )
+    clean = simulate_magnetometer(model, gait, 10**9, 2, "v")[1]
+    worn = simulate_magnetometer(iron, gait, 10**9, 2, "v")[1]
+    turned = Rotation.random(300, rng=np.random.default_rng(4)).apply(clean[0])
+    design = np.hstack([clean, np.ones((len(clean), 1))])
+    linear = np.linalg.lstsq(design, worn, rcond=None)[0]  # what this sensor makes of a field
+    fit = fit_iron(turned @ linear[:3] + linear[3])
+    errors = {}
+    for name, config in (
+        ("raw", PdrConfig.of("waist")),
+        (
+            "calibrated",
+            PdrConfig.from_mapping(
+                {
+                    "placement": "waist",
+                    "hard_iron_t": fit.offset.tolist(),
+                    "field_matrix": fit.matrix.ravel().tolist(),
+                }
+            ),
+        ),
+    ):
+        core, events = PedestrianDeadReckoning(config), []
+        for i, stamp in enumerate(imu.stamp_ns.tolist()):
+            out = core.add_imu(stamp, imu.angular_velocity[i], imu.specific_force[i])
+            core.add_magnetic_field(stamp, worn[i + 1])
+            events += out.steps if out else ()
+        errors[name] = np.median([heading_error(e, 0.0) for e in events])
+    assert errors["raw"] > math.radians(12)
+    assert errors["calibrated"] < math.radians(5)
