@@ -95,7 +95,11 @@ def test_hard_iron_that_was_calibrated_does_not_turn_the_heading() -> None:
     imu = simulate_imu(ImuModel(), gait, 10**9, 2, "v")
     model = MagnetometerModel(rate_hz=100.0, declination_deg=0.0, noise_sd_t=0.0)
     iron = MagnetometerModel(
-        rate_hz=100.0, declination_deg=0.0, hard_iron_sd_t=20e-6, soft_iron_sd=0.05
+        rate_hz=100.0,
+        declination_deg=0.0,
+        noise_sd_t=0.0,
+        hard_iron_sd_t=20e-6,
+        soft_iron_sd=0.05,
     )
     clean = simulate_magnetometer(model, gait, 10**9, 2, "v")[1]
     worn = simulate_magnetometer(iron, gait, 10**9, 2, "v")[1]
