@@ -1,10 +1,16 @@
-"""Pedestrian inertial navigation: attitude, steps, dead reckoning, recorded-data readers.
+"""Inertial sensors and pedestrians: simulated walks, attitude, steps, dead reckoning, recordings.
 
 Modules
 -------
+``gait``      how the waist of a walking person moves, in closed form
+``imu``       what an inertial sensor and a magnetometer make of a motion
 ``attitude``  gyro + accelerometer (+ magnetometer) -> orientation
-``steps``     streaming step detector, step length, stillness
-``pdr``       ``PedestrianDeadReckoning``: IMU samples in, steps and step velocity out
+``magnetic_calibration``  iron worn with a magnetometer
+``steps``     streaming step detector, stillness
+``length``    step length models and the scale of a person
+``pdr``       ``PedestrianDeadReckoning``: IMU samples in, steps and step velocity out; its
+              ``pdr_config``, ``pdr_output``, ``pdr_values`` (what is published), and ``watch``
+              (what is wrong with the input)
 ``loaders``   public gait, phone and attitude recordings -> SI arrays
 
 Frames
