@@ -28,7 +28,7 @@ start_up rsu_sensor
 walkers=$(python "$NETPOS_ROOT/scripts/walkers.py" "$scenario") || give_up
 pdr_nodes=()
 for vue in $walkers; do # who walks is dead-reckoned
-  start "pdr_$vue" pdr_node pdr_node --ros-args -r __node:="pdr_$vue" -p vue:="$vue" -p scenario:="$scenario"
+  start "pdr_$vue" pdr_node pdr_node --ros-args -r __node:="pdr_$vue" -p vue:="$vue" -p scenario:="$scenario" -p subscribers:=2
   pdr_nodes+=("pdr_$vue")
 done
 [ "${#pdr_nodes[@]}" = 0 ] || start_up "${pdr_nodes[@]}"

@@ -8,12 +8,14 @@ from geometry_msgs.msg import TwistWithCovarianceStamped
 from netpos.inertial.pdr import PedestrianDeadReckoning
 from netpos.messages import topics
 from netpos_msgs.msg import Step
-from netpos_node import BACKLOG, CODEC, STREAM, run
+from netpos_node import BACKLOG, CODEC, STREAM, run, wait_until_heard
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, MagneticField
 
 from pdr_node.conversions import messages
 from pdr_node.parameters import declare_parameters
+
+_PATIENCE_S = 30.0
 
 
 class PdrNode(Node):
@@ -28,10 +30,21 @@ class PdrNode(Node):
         self._velocity_pub = self.create_publisher(
             TwistWithCovarianceStamped, topics.of_vue(vue, topics.STEP_VELOCITY), STREAM
         )
+        self._wait_for_subscribers(parameters.subscribers)
         self.create_subscription(Imu, topics.of_vue(vue, topics.IMU), self._on_imu, BACKLOG)
         self.create_subscription(
             MagneticField, topics.of_vue(vue, topics.MAG), self._on_magnetic_field, BACKLOG
         )
+
+    def _wait_for_subscribers(self, wanted: int) -> None:
+        """Hear no sample before the steps are heard: who waits for imu's listeners loses none."""
+        publishers = {p.topic_name: p for p in (self._velocity_pub, self._step_pub)}
+        required = dict(zip(publishers, (wanted, max(wanted - 1, 0)), strict=True))
+        unheard = wait_until_heard(publishers, required, _PATIENCE_S, settle_s=0.0)
+        if unheard:
+            self.get_logger().warning(
+                f"too few subscribers to {', '.join(unheard)}; going on all the same"
+            )
 
     def _on_imu(self, msg: Any) -> None:
         imu = CODEC.imu_from_msg(msg)

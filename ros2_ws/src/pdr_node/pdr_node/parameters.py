@@ -18,7 +18,12 @@ class PdrParameters:
     """Everything the node reads at start."""
 
     vue_id: str
+    subscribers: int
     config: PdrConfig
+
+    def __post_init__(self) -> None:
+        if self.subscribers < 0:
+            raise ValueError(f"parameter subscribers must be >= 0, got {self.subscribers}")
 
 
 def declare_parameters(node: Node) -> PdrParameters:
@@ -41,8 +46,11 @@ def declare_parameters(node: Node) -> PdrParameters:
         )
         for name, value in base.items()
     }
+    text = "listen to imu once velocities have so many subscribers, and steps one less (30 s)"
     return PdrParameters(
-        vue_id=vue_id, config=PdrConfig.from_mapping({"placement": placement, **values})
+        vue_id=vue_id,
+        subscribers=declare(node, "subscribers", 0, text),
+        config=PdrConfig.from_mapping({"placement": placement, **values}),
     )
 
 

@@ -158,6 +158,7 @@ def test_placement_and_scenario_choose_defaults_that_explicit_values_override(ma
     [
         ({"vue": "a b"}, "vue: 'a b' is no device name"),
         ({"weinberg_k": -1.0}, r"pdr.weinberg_k must be finite and > 0, got -1.0"),
+        ({"subscribers": -1}, "subscribers must be >= 0, got -1"),
         ({"placement": "ankle"}, "placement must be carried or waist, got 'ankle'"),
         ({"length_model": "guess"}, "length_model must be frequency or weinberg"),
         ({"steps.smooth_sd_s": -1.0}, "steps.smooth_sd_s must be finite and > 0"),
