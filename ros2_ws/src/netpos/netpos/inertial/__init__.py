@@ -4,6 +4,8 @@ Modules
 -------
 ``gait``      how the waist of a walking person moves, in closed form
 ``imu``       what an inertial sensor and a magnetometer make of a motion
+``strapdown`` attitude, velocity and position from increments in space
+``alignment`` coarse alignment of strapdown navigation
 ``attitude``  gyro + accelerometer (+ magnetometer) -> orientation
 ``magnetic_calibration``  iron worn with a magnetometer
 ``steps``     streaming step detector, stillness
