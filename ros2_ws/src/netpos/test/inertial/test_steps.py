@@ -224,6 +224,32 @@ def test_impact_floor(jolt: float, expected: int) -> None:
     assert len(detect(stamps, force, StepConfig.waist())) == expected
 
 
+@pytest.mark.parametrize(("hz", "expected"), [(4.0, 0), (6.5, 20)])
+def test_only_sharp_jolts_are_contacts(hz: float, expected: int) -> None:
+    """Bursts of one frequency with the same jerk, below and above ``min_impact_hz`` of 5 Hz."""
+    contacts = 4.0 + 0.8 * np.arange(20)
+    t = np.arange(0.0, 22.0, 0.01)
+    tau = t[:, None] - contacts
+    burst = (np.exp(-((tau / 0.12) ** 2)) * np.sin(2 * np.pi * hz * tau)).sum(axis=1)
+    force = np.column_stack([0 * t, 0 * t, G + 12.0 / hz * burst])
+    stamps = np.rint(t * 1e9).astype(np.int64)
+    assert len(detect(stamps, force, StepConfig.waist())) == expected
+
+
+def test_a_step_after_a_stand_takes_a_typical_period() -> None:
+    """Contacts 0.6 s apart, a stand of 1.8 s in between, shorter than a bout's longest gap."""
+    contacts = np.concatenate([4.0 + 0.6 * np.arange(10), 11.2 + 0.6 * np.arange(10)])
+    t = np.arange(0.0, 20.0, 0.01)
+    stamps = np.rint(t * 1e9).astype(np.int64)
+    force = with_impacts(stamps, np.tile([0.0, 0.0, G], (t.size, 1)), contacts)
+    steps = detect(stamps, force, StepConfig.waist())
+    assert len(steps) == 20
+    durations = [s.duration_s for s in steps]
+    np.testing.assert_allclose(durations, 0.6, atol=0.07)
+    assert steps[10].start_ns > steps[9].end_ns
+    assert steps[11].start_ns == steps[10].end_ns
+
+
 def test_impact_delay_within_a_bout_is_bounded() -> None:
     config = StepConfig.waist()
     contacts = 4.0 + 0.6 * np.arange(20)
