@@ -14,7 +14,7 @@ from netpos.filters.measurement import (
     VALUE,
     VARIANCE,
     curvature_variance,
-    is_angle,
+    is_cyclic,
     linearise,
     predict_row,
     wrap,
@@ -51,7 +51,7 @@ def _values(rows: Array, x: Array, height_m: float) -> Array:
 
 
 def _difference(rows: Array) -> Callable[[Array, Array], Array]:
-    angle = np.array([is_angle(row) for row in rows])
+    angle = np.array([is_cyclic(row) for row in rows])
 
     def difference(a: Array, b: Array) -> Array:
         y = a - b

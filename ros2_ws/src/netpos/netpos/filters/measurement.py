@@ -22,6 +22,12 @@ With d = p - origin and u = axes d:
     SPEED      hypot(vx, vy)
     COSINE_Y   u_y / |u|    direction cosine of a linear array's cone angle
     COSINE_Z   u_z / |u|
+    PHASE      a d / |d|, known but for whole turns     petukhov:eq.5
+    UNWRAPPED_PHASE   the same with its whole turns (a sector of ambiguity has been chosen)
+
+For both phases the first three entries of AXES hold a: 2 pi L / lambda times the unit vector of
+the array from slave to master, in map. Range and TOA of such an array count from its master, L/2
+along a.
 """
 
 from __future__ import annotations
@@ -49,6 +55,8 @@ class Kind(IntEnum):
     SPEED = 5
     COSINE_Y = 6
     COSINE_Z = 7
+    PHASE = 8
+    UNWRAPPED_PHASE = 9
 
 
 KIND, VALUE, VARIANCE, GATE_VARIANCE, BIAS, COMMON, GROUP, ORIGIN, AXES = (
@@ -65,7 +73,7 @@ KIND, VALUE, VARIANCE, GATE_VARIANCE, BIAS, COMMON, GROUP, ORIGIN, AXES = (
 HEADING, LEVER, BLOCKED = 19, 20, 23
 # Plain integers: arithmetic of flags costs ten times as much.
 _AZIMUTH, _ELEVATION, _TOA = int(Field.AZIMUTH), int(Field.ELEVATION), int(Field.TOA)
-_RANGE, _POSITION = int(Field.RANGE), int(Field.POSITION)
+_RANGE, _PHASE, _POSITION = int(Field.RANGE), int(Field.PHASE), int(Field.POSITION)
 ROW_WIDTH = 24
 
 
@@ -80,8 +88,26 @@ def wrap(angle: float) -> float:
 
 @leaf
 def is_angle(row: Array) -> bool:
-    """Whether differences of the row's quantity are wrapped."""
+    """Whether differences of the row's predictions are wrapped."""
     return int(row[KIND]) <= Kind.ELEVATION
+
+
+@leaf
+def is_cyclic(row: Array) -> bool:
+    """Whether innovations of the row are wrapped: an angle, or a phase known but for whole
+    turns."""
+    return is_angle(row) or int(row[KIND]) == Kind.PHASE
+
+
+@leaf
+def _phase(row: Array, dx: float, dy: float, dz: float, h: Array) -> float:
+    """Phase difference of the offset d from the array's middle; its gradient to h[:2]."""
+    r = max(math.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
+    a = AXES
+    value = (row[a] * dx + row[a + 1] * dy + row[a + 2] * dz) / r
+    h[0] = (row[a] - value * dx / r) / r
+    h[1] = (row[a + 1] - value * dy / r) / r
+    return float(value)
 
 
 @leaf
@@ -137,6 +163,8 @@ def _from_rsu(row: Array, mean: Array, height_m: float, h: Array) -> float:
         if kind == Kind.TOA:
             h[4] = 1.0
             value += mean[4]
+    elif kind >= Kind.PHASE:
+        value = _phase(row, dx, dy, dz, h)
     else:
         value, h[0], h[1], _ = direction(row, dx, dy, dz)
     if heading >= 0:
@@ -174,7 +202,7 @@ def predict_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
 def innovation_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
     """Measured minus predicted value of one row, wrapped where it is an angle; fills ``h``."""
     innovation = row[VALUE] - predict_row(row, mean, height_m, h)
-    return wrap(innovation) if is_angle(row) else float(innovation)
+    return wrap(innovation) if is_cyclic(row) else float(innovation)
 
 
 @leaf
@@ -199,6 +227,9 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
         return float(0.5 * (across / max(rho2, 1e-6)) ** 2 / r2)
     square = cov[0, 0] ** 2 + 2.0 * cov[0, 1] ** 2 + cov[1, 1] ** 2
     d2 = max(rho2, 1e-6) if kind == Kind.AZIMUTH else r2
+    if kind >= Kind.PHASE:
+        a = AXES
+        square *= row[a] * row[a] + row[a + 1] * row[a + 1] + row[a + 2] * row[a + 2]
     return float(0.5 * square / (d2 * d2))
 
 
@@ -245,6 +276,12 @@ def rsu_axes(info: RsuInfo) -> Array:
     )
 
 
+def array_direction(axes: Array) -> Array:
+    """Unit vector (3,) in map along a two-antenna array, slave to master, for ``axes`` (9,) of
+    ``rsu_axes``: the paper's x axis, to the right of the boresight."""
+    return -axes[3:6]
+
+
 @dataclass(frozen=True, slots=True)
 class Coupling:
     """How the slow and coloured errors of one RSU enter its rows, by kind; what is absent is white
@@ -279,6 +316,8 @@ def scalar_values(
         yield Kind.TOA, c * m.toa_s, c * c * m.toa_var
     if fields & _RANGE:
         yield Kind.RANGE, m.range_m, m.range_var
+    if fields & _PHASE:
+        yield Kind.PHASE, m.phase_difference_rad, m.phase_difference_var
 
 
 def _cosine_var(angle: float, variance: float) -> float:
@@ -315,10 +354,23 @@ def rsu_rows(
             coupling.common.get(kind, -1),
             group,
         )
+    if info.baseline_m > 0.0:
+        _place_antennas(rows, info, array_direction(axes))
     if int(m.fields) & _POSITION:
         fix = linear_rows(m.position[:2], m.position_cov[:2, :2], np.eye(2, 6), group)
         rows = np.vstack([rows, fix])
     return rows
+
+
+def _place_antennas(rows: Array, info: RsuInfo, along: Array) -> None:
+    """Let the ``rows`` (m, ROW_WIDTH) of a two-antenna anchor count from its master, and its
+    phases along the array."""
+    for row in rows:
+        kind = int(row[KIND])
+        if kind in (Kind.RANGE, Kind.TOA):
+            row[ORIGIN:AXES] = info.position + info.baseline_m / 2.0 * along
+        elif kind == Kind.PHASE:
+            row[AXES : AXES + 3] = 2.0 * math.pi * info.baseline_m / info.wavelength_m * along
 
 
 def linear_rows(value: Array, cov: Array, H: Array, group: int) -> Array:

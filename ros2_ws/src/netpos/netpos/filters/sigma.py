@@ -24,7 +24,7 @@ import math
 import numpy as np
 
 from netpos.filters.compile import kernel
-from netpos.filters.measurement import VALUE, is_angle, predict_row, wrap
+from netpos.filters.measurement import VALUE, is_angle, is_cyclic, predict_row, wrap
 from netpos.filters.motion import propagate
 from netpos.messages.values import Array
 
@@ -97,7 +97,7 @@ def regress(mean: Array, L: Array, rows: Array, height_m: float) -> tuple[Array,
             E[i, n] += (up + down) / (2.0 * REACH2)
     for i in range(m):
         innovation[i] = rows[i, VALUE] - innovation[i] - E[i, n]
-        if is_angle(rows[i]):
+        if is_cyclic(rows[i]):
             innovation[i] = wrap(innovation[i])
         E[i, n] *= _SHIFT_WEIGHT
     return innovation, G, E

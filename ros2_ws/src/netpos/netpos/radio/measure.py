@@ -6,6 +6,9 @@ noise.
     toa       = |d| / c + clock offset of the device - clock error of the RSU
                                                                        (fokin2020:eq.14)
     range     = |d|, two-way, free of the clock
+    phase     = -2 pi L / lambda y / |d| of a two-antenna anchor, wrapped (netpos.radio.anchor)
+
+Range and TOA of an anchor count from its master antenna.
 
 Noise depends on (seed, RSU, device, stamp) only, so any process, live or offline, draws the same
 measurement."""
@@ -36,7 +39,8 @@ Ints = npt.NDArray[np.int64]
 
 Direction = tuple[float, float, float]
 
-AZIMUTH, ELEVATION, TOA, RANGE = range(4)  # columns of values and variances
+AZIMUTH, ELEVATION, TOA, RANGE, PHASE = range(5)  # columns of values and variances
+QUANTITIES = 5
 ALWAYS_VISIBLE = -1
 _ROUNDING = 1.0 + 1e-12  # squared distances may be compared within this factor only
 
@@ -49,6 +53,10 @@ class Sites(NamedTuple):
     noise_key: Key  # (m, 2)
     sight_key: Key  # (m, 2)
     clock_tones: Array  # (m, k, 3) of clocks.clock_tones; k = 0: perfect clocks
+    baseline_m: Array  # (m,) of a two-antenna anchor; 0: none
+    wavelength_m: Array  # (m,)
+    range_scale: Array  # (m,) what two-way ranging leaves of the clocks' drift
+    range_offset_m: Array  # (m,)
 
 
 class Sight(NamedTuple):
@@ -64,10 +72,10 @@ class Sight(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """Variances of the four quantities, either fixed or from the Cramér-Rao bound at the RSU's
-    distance."""
+    """Variances of the quantities, either fixed or from the Cramér-Rao bound at the RSU's
+    distance (not of a phase)."""
 
-    fixed: Array  # (4,) rad^2, rad^2, s^2, m^2; used where snr_at_0_db_loss is 0
+    fixed: Array  # (5,) rad^2, rad^2, s^2, m^2, rad^2; used where snr_at_0_db_loss is 0
     with_elevation: bool  # azimuth and elevation are estimated together
     snr_at_0_db_loss: float  # of Waveform, times the number of elements; 0: fixed variances
     path_loss: Array  # (5,) of PathLoss.coefficients
@@ -82,8 +90,8 @@ class Observations(NamedTuple):
 
     heard_by: Ints  # (n,) number of RSUs
     rsu: Ints  # (n, nearest) index of the RSU, -1 where none
-    values: Array  # (n, nearest, 4) azimuth rad, elevation rad, toa s, range m
-    variances: Array  # (n, nearest, 4)
+    values: Array  # (n, nearest, 5) azimuth rad, elevation rad, toa s, range m, phase rad
+    variances: Array  # (n, nearest, 5)
     rssi_dbm: Array  # (n, nearest), 0 where not modelled
 
 
@@ -186,7 +194,8 @@ def _cross_moment(moment: Array, a: Direction, b: Direction) -> float:
 def _variances(
     azimuth: float, elevation: float, distance: float, errors: Errors
 ) -> tuple[tuple[float, float, float, float], float]:
-    """Variances of the four quantities, and the received power [dBm], 0 where not modelled."""
+    """Variances of all quantities but the phase, and the received power [dBm], 0 where not
+    modelled."""
     if errors.snr_at_0_db_loss == 0.0:
         fixed = errors.fixed
         return (fixed[0], fixed[1], fixed[2], fixed[3]), 0.0
@@ -213,6 +222,22 @@ def _variances(
 
 
 @njit(cache=True)
+def _wrap(angle: float) -> float:
+    """In [-pi, pi), also where rounding would give pi."""
+    wrapped = (angle + math.pi) % (2.0 * math.pi) - math.pi
+    return wrapped if wrapped < math.pi else -math.pi
+
+
+@njit(cache=True)
+def _phase(stamp_ns: int, k: int, cosine: float, sites: Sites, sd: float) -> float:
+    """Noisy phase difference of a device whose direction has ``cosine`` with the y axis of anchor
+    k (petukhov:eq.5)."""
+    turns = -sites.baseline_m[k] / sites.wavelength_m[k] * cosine
+    noise = draw_normals(stamp_ns, 1, 0, sites.noise_key[k])[0]
+    return float(_wrap(2.0 * math.pi * turns + sd * noise))
+
+
+@njit(cache=True)
 def observe(
     stamps_ns: Ints,
     positions: Array,
@@ -226,8 +251,8 @@ def observe(
     n, nearest = stamps_ns.size, sight.nearest
     heard_by = np.zeros(n, dtype=np.int64)
     rsu = np.full((n, nearest), -1, dtype=np.int64)
-    values = np.zeros((n, nearest, 4))
-    variances = np.zeros((n, nearest, 4))
+    values = np.zeros((n, nearest, QUANTITIES))
+    variances = np.zeros((n, nearest, QUANTITIES))
     rssi = np.zeros((n, nearest))
     plane = np.empty(nearest)
     hint = np.full(nearest, -1, dtype=np.int64)
@@ -250,13 +275,19 @@ def observe(
             elevation = math.atan2(z, math.hypot(x, y)) if z != 0.0 else z
             var, rssi[i, j] = _variances(azimuth, elevation, distance, errors)
             noise = draw_normals(stamps_ns[i], 0, 0, sites.noise_key[k])
-            turned = azimuth + math.sqrt(var[AZIMUTH]) * noise[AZIMUTH]
-            values[i, j, AZIMUTH] = (turned + math.pi) % (2.0 * math.pi) - math.pi
+            values[i, j, AZIMUTH] = _wrap(azimuth + math.sqrt(var[AZIMUTH]) * noise[AZIMUTH])
             values[i, j, ELEVATION] = elevation + math.sqrt(var[ELEVATION]) * noise[ELEVATION]
             rsu_clock_s = clock_error(stamps_ns[i] * 1e-9, sites.clock_tones[k])
-            delay = distance / SPEED_OF_LIGHT_MPS + clock_offsets_s[i] - rsu_clock_s
+            to_master = distance
+            if sites.baseline_m[k] > 0.0:
+                to_master = math.hypot(math.hypot(x, z), y + sites.baseline_m[k] / 2.0)
+                sd = math.sqrt(errors.fixed[PHASE])
+                values[i, j, PHASE] = _phase(stamps_ns[i], k, y / distance, sites, sd)
+                variances[i, j, PHASE] = errors.fixed[PHASE]
+            delay = to_master / SPEED_OF_LIGHT_MPS + clock_offsets_s[i] - rsu_clock_s
             values[i, j, TOA] = delay + math.sqrt(var[TOA]) * noise[TOA]
-            values[i, j, RANGE] = distance + math.sqrt(var[RANGE]) * noise[RANGE]
+            ranged = to_master * (1.0 + sites.range_scale[k]) + sites.range_offset_m[k]
+            values[i, j, RANGE] = ranged + math.sqrt(var[RANGE]) * noise[RANGE]
             for quantity in range(4):
                 variances[i, j, quantity] = var[quantity]
     return Observations(heard_by, rsu, values, variances, rssi)

@@ -9,12 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from netpos.messages.values import RsuInfo
+from netpos.radio.anchor import HALF_VIEW_RAD, TwoWayRanging
 from netpos.radio.clocks import clock_tones
 from netpos.radio.measure import Errors, Sight, Sites, los_model_number
 from netpos.radio.noise import generator, stream_key
 from netpos.radio.propagation import SPEED_OF_LIGHT_MPS
-from netpos.scenario.places import Grid
-from netpos.scenario.schema import Device, FixedErrors, Scenario
+from netpos.scenario.measured import FixedErrors
+from netpos.scenario.places import Grid, RsuUnit
+from netpos.scenario.schema import Device, Scenario
 from netpos.world.frames import quaternion_from_yaw, yaw_from_quaternion
 from netpos.world.maps import METIS_KERB_OFFSET_M, METIS_MADRID, METIS_RSU_SPACING_M
 
@@ -59,15 +61,18 @@ def _placed(scenario: Scenario) -> tuple[RsuInfo, ...]:
         )
     if scenario.rsus.grid is not None:
         return _grid_rsus(scenario.rsus.grid, scenario)
-    return tuple(
-        RsuInfo(
-            rsu_id=unit.id,
-            position=np.array(unit.position, dtype=np.float64),
-            quaternion=quaternion_from_yaw(math.radians(unit.yaw_deg)),
-            network=unit.network,
-            stamp_ns=scenario.start_ns,
-        )
-        for unit in scenario.rsus.units
+    return tuple(_rsu_of(unit, scenario.start_ns) for unit in scenario.rsus.units)
+
+
+def _rsu_of(unit: RsuUnit, stamp_ns: int) -> RsuInfo:
+    return RsuInfo(
+        rsu_id=unit.id,
+        position=np.array(unit.position, dtype=np.float64),
+        quaternion=quaternion_from_yaw(math.radians(unit.yaw_deg)),
+        network=unit.network,
+        baseline_m=unit.antennas.baseline_m if unit.antennas else 0.0,
+        wavelength_m=unit.antennas.wavelength_m if unit.antennas else 0.0,
+        stamp_ns=stamp_ns,
     )
 
 
@@ -121,17 +126,43 @@ def clock_tones_of(scenario: Scenario, rsus: tuple[RsuInfo, ...]) -> Array:
 
 
 def sites_of(
-    rsus: tuple[RsuInfo, ...], rotations: Array, tones: Array, seed: int, vue_id: str
+    rsus: tuple[RsuInfo, ...],
+    rotations: Array,
+    tones: Array,
+    seed: int,
+    vue_id: str,
+    two_way: TwoWayRanging | None = None,
 ) -> Sites:
     """The RSUs as one device meets them: places, rotations of ``rotations_of``, clocks of
-    ``clock_tones_of``, noise streams."""
+    ``clock_tones_of``, noise streams, what ``two_way`` ranging leaves of the clocks' drift."""
+    residuals = np.array([_residual(two_way, seed, f"{r.rsu_id}/{vue_id}") for r in rsus])
     return Sites(
         position=np.array([rsu.position for rsu in rsus]),
         rotation=rotations,
         noise_key=np.array([stream_key(seed, f"{r.rsu_id}/{vue_id}/noise") for r in rsus]),
         sight_key=np.array([stream_key(seed, f"{r.rsu_id}/{vue_id}/sight") for r in rsus]),
         clock_tones=tones,
+        baseline_m=np.array([rsu.baseline_m for rsu in rsus]),
+        wavelength_m=np.array([rsu.wavelength_m for rsu in rsus]),
+        range_scale=residuals[:, 0],
+        range_offset_m=residuals[:, 1],
     )
+
+
+def _residual(two_way: TwoWayRanging | None, seed: int, link: str) -> tuple[float, float]:
+    """Scale and offset [m] of the ranges between one RSU and one device."""
+    if two_way is None:
+        return 0.0, 0.0
+    device, anchor = two_way.drift_sd * generator(seed, f"{link}/two_way_ranging").standard_normal(
+        2
+    )
+    return two_way.residual(float(device), float(anchor))
+
+
+def two_way_of(scenario: Scenario) -> TwoWayRanging | None:
+    """How the scenario's ranges are measured, where it says so."""
+    errors = scenario.measurement.errors
+    return errors.two_way_ranging if isinstance(errors, FixedErrors) else None
 
 
 def sight_of(scenario: Scenario, device: Device) -> Sight:
@@ -156,8 +187,12 @@ def errors_of(scenario: Scenario) -> Errors:
             math.radians(errors.azimuth_sd_deg or 0.0),
             math.radians(errors.elevation_sd_deg or 0.0),
             errors.toa_sd_s or 0.0,
-            errors.range_sd_m or 0.0,
+            errors.two_way_ranging.range_sd_m
+            if errors.two_way_ranging
+            else errors.range_sd_m or 0.0,
+            math.radians(errors.phase_sd_deg or 0.0),
         ]
+        phase = "phase" in scenario.measurement.quantities
         return Errors(
             fixed=np.square(sds),
             with_elevation=False,
@@ -165,12 +200,12 @@ def errors_of(scenario: Scenario) -> Errors:
             path_loss=np.zeros(5),
             second_moment=np.zeros((3, 3)),
             rms_bandwidth_hz=0.0,
-            half_view_rad=math.pi,
+            half_view_rad=HALF_VIEW_RAD if phase else math.pi,
             tx_power_dbm=0.0,
         )
     waveform, array = errors.waveform, errors.array
     return Errors(
-        fixed=np.zeros(4),
+        fixed=np.zeros(5),
         with_elevation="elevation" in scenario.measurement.quantities,
         snr_at_0_db_loss=array.count * waveform.energy_snr_at_0_db_loss,
         path_loss=errors.path_loss.coefficients(waveform.carrier_hz),

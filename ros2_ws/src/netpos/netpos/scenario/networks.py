@@ -12,7 +12,8 @@ import numpy.typing as npt
 from netpos.messages.values import Beacon, RsuInfo
 from netpos.radio.measure import Sites
 from netpos.radio.noise import generator, normals, stream_key
-from netpos.scenario.schema import FixedErrors, Network, Scenario
+from netpos.scenario.measured import FixedErrors
+from netpos.scenario.schema import Network, Scenario
 
 Array = npt.NDArray[np.float64]
 

@@ -6,6 +6,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from netpos.radio.anchor import TwoAntennas
 from netpos.radio.clocks import NetworkClockModel
 from netpos.scenario.section import Finite, Name, Positive, Section
 
@@ -33,12 +34,14 @@ class World(Section):
 
 
 class RsuUnit(Section):
-    """One RSU; ``yaw_deg`` turns its boresight (x axis) counter-clockwise from east."""
+    """One RSU; ``yaw_deg`` turns its boresight (x axis) counter-clockwise from east.
+    ``antennas``: of an anchor that measures phase differences."""
 
     id: Name
     position: tuple[Finite, Finite, Finite]
     yaw_deg: Finite = 0.0
     network: str = ""
+    antennas: TwoAntennas | None = None
 
 
 class Grid(Section):

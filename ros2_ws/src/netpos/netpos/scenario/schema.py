@@ -12,21 +12,12 @@ from pydantic import Field, model_validator
 from netpos.inertial.gait import GaitModel, walk
 from netpos.inertial.imu import ImuModel, MagnetometerModel, interval_ns
 from netpos.inertial.pdr_config import PdrConfig
-from netpos.radio.arrays import AntennaArray
 from netpos.radio.clocks import ClockModel
 from netpos.radio.noise import generator
-from netpos.radio.propagation import UMA_HIGHEST_DEVICE_M, LosModel, PathLoss
-from netpos.radio.waveform import Waveform
+from netpos.radio.propagation import UMA_HIGHEST_DEVICE_M
+from netpos.scenario.measured import Measurement
 from netpos.scenario.places import Rsus, World
-from netpos.scenario.section import (
-    Finite,
-    Name,
-    NotNegative,
-    Place,
-    Positive,
-    Quantity,
-    Section,
-)
+from netpos.scenario.section import Finite, Name, NotNegative, Place, Positive, Section
 from netpos.world.body import BodyMotion
 from netpos.world.hills import Hills
 from netpos.world.maps import METIS_MADRID
@@ -38,77 +29,6 @@ from netpos.world.wander import Wander
 Array = npt.NDArray[np.float64]
 
 NS = 1_000_000_000
-
-
-class LineOfSight(Section):
-    """Who may hear a beacon. Buildings of the world always block.
-
-    ``max_distance_m`` is fokin2020's d_los (plane distance; absent: no limit). ``probability``
-    draws the state by ITU-R M.2412 once per (seed, RSU, device) as a field over the plane with the
-    given correlation distance."""
-
-    max_distance_m: Positive | None = None
-    probability: LosModel | None = None
-    correlation_distance_m: Positive = 50.0
-
-
-class FixedErrors(Section):
-    """Constant standard deviations of the measurements."""
-
-    model: Literal["fixed"] = "fixed"
-    azimuth_sd_deg: Positive | None = None
-    elevation_sd_deg: Positive | None = None
-    toa_sd_s: Positive | None = None
-    range_sd_m: Positive | None = None
-    position_sd_m: Positive | None = None
-
-
-class CramerRaoErrors(Section):
-    """Variances are the Cramér-Rao bounds at the RSU's distance."""
-
-    model: Literal["cramer_rao"]
-    array: AntennaArray = AntennaArray()
-    waveform: Waveform = Waveform()
-    path_loss: PathLoss = PathLoss()
-
-
-class Measurement(Section):
-    """What the RSUs measure of each beacon; the ``nearest`` RSUs with a line of sight report it,
-    or of these a number drawn evenly for each beacon, at least ``fewest`` (deng2022)."""
-
-    quantities: tuple[Quantity, ...] = ("azimuth", "toa")
-    nearest: int = Field(default=2, ge=1)
-    fewest: int | None = Field(default=None, ge=1)
-    los: LineOfSight = LineOfSight()
-    errors: Annotated[FixedErrors | CramerRaoErrors, Field(discriminator="model")]
-
-    @model_validator(mode="after")
-    def _complete(self) -> Self:
-        if self.fewest is not None and self.fewest > self.nearest:
-            raise ValueError(f"fewest must be at most nearest ({self.nearest}), got {self.fewest}")
-        if not self.quantities or len(set(self.quantities)) < len(self.quantities):
-            raise ValueError(
-                "quantities must name each of azimuth, elevation, toa, range, position at most"
-                " once"
-            )
-        if isinstance(self.errors, FixedErrors):
-            keys = {
-                "azimuth": "azimuth_sd_deg",
-                "elevation": "elevation_sd_deg",
-                "toa": "toa_sd_s",
-                "range": "range_sd_m",
-                "position": "position_sd_m",
-            }
-            for quantity in self.quantities:
-                if getattr(self.errors, keys[quantity]) is None:
-                    raise ValueError(
-                        f"errors.{keys[quantity]} is missing: {quantity} is among the quantities"
-                    )
-        elif "position" in self.quantities:
-            raise ValueError("position needs errors of model fixed: it has no bound of its own")
-        elif "elevation" in self.quantities and self.errors.array.rows < 2:
-            raise ValueError("elevation needs an array with at least 2 rows")
-        return self
 
 
 class RandomRoute(Section):
@@ -392,6 +312,17 @@ class Scenario(Section):
                         f"interval_s and phase_s of network {network.name} must be multiples of"
                         f" beacon_interval_s ({device.beacon_interval_s:g})"
                     )
+        return self
+
+    @model_validator(mode="after")
+    def _phases_measurable(self) -> Self:
+        if "phase" in self.measurement.quantities:
+            single = [unit.id for unit in self.rsus.units if unit.antennas is None]
+            if single or self.rsus.layout != "list":
+                raise ValueError(
+                    "phase is among the quantities: give every RSU in rsus.units its antennas "
+                    f"(baseline_wavelengths, uwb_channel); without: {', '.join(single) or 'all'}"
+                )
         return self
 
     @model_validator(mode="after")

@@ -30,6 +30,7 @@ from netpos.radio.clocks import simulate_clock
 from netpos.radio.measure import (
     AZIMUTH,
     ELEVATION,
+    PHASE,
     RANGE,
     TOA,
     Observations,
@@ -45,6 +46,7 @@ from netpos.scenario.build import (
     rsus_of,
     sight_of,
     sites_of,
+    two_way_of,
 )
 from netpos.scenario.networks import Answering, answering_of
 from netpos.scenario.schema import Device, Scenario
@@ -60,8 +62,15 @@ _FIELDS = {
     "toa": Field.TOA,
     "range": Field.RANGE,
     "position": Field.POSITION,
+    "phase": Field.PHASE,
 }
-_COLUMNS = (Field.AZIMUTH, Field.ELEVATION, Field.TOA, Field.RANGE)  # of Observations.values
+_COLUMNS = (
+    Field.AZIMUTH,
+    Field.ELEVATION,
+    Field.TOA,
+    Field.RANGE,
+    Field.PHASE,
+)  # of Observations.values
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,12 +102,13 @@ class Simulation:
     def _place_devices(self) -> None:
         self._answering = answering_of(self.scenario, self.rsus)
         tones = clock_tones_of(self.scenario, self.rsus)
+        two_way = two_way_of(self.scenario)
         self._vues = {
             vue: _Vue(
                 self.scenario,
                 vue,
                 device,
-                sites_of(self.rsus, self._rotations, tones, self.scenario.seed, vue),
+                sites_of(self.rsus, self._rotations, tones, self.scenario.seed, vue, two_way),
                 self._sights[vue],
             )
             for vue, device in self.scenario.each_device
@@ -233,6 +243,8 @@ class Simulation:
             position=fix,
             position_cov=fix_cov,
             lever_arm=self._vues[beacon.vue_id].lever_arm_m,
+            phase_difference_rad=float(value[PHASE]),
+            phase_difference_var=float(variance[PHASE]),
         )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netpos.filters.measurement import UNCOUPLED, linear_rows, rsu_rows, speed_row
+from netpos.filters.measurement import UNCOUPLED, VARIANCE, linear_rows, rsu_rows, speed_row
 from netpos.messages.values import Array, GroundSpeed, RsuMeasurement, Velocity
 from netpos.tracking.rsus import BiasStates, Rsu
 
@@ -24,10 +24,18 @@ class Batch:
 
 
 def batch_of(
-    items: Sequence[Source], rsus: Mapping[str, Rsu], biases: BiasStates | None, heading: int
+    items: Sequence[Source],
+    rsus: Mapping[str, Rsu],
+    biases: BiasStates | None,
+    heading: int,
+    inflation: Mapping[str, float] | None = None,
 ) -> Batch:
     """Rows of the items, one group each; biases heard for the first time are added to ``biases``
-    (None: rows without). heading : state index of the device's heading, -1: none"""
+    (None: rows without).
+
+    heading : state index of the device's heading, -1: none
+    inflation : variance factor of velocities with correlated errors, by source
+    """
     blocks = []
     for group, item in enumerate(items):
         if isinstance(item, RsuMeasurement):
@@ -35,7 +43,35 @@ def batch_of(
             coupling = UNCOUPLED if biases is None else biases.coupling(rsu, item)
             blocks.append(rsu_rows(item, rsu.info, rsu.axes, group, coupling, heading))
         elif isinstance(item, Velocity):
-            blocks.append(linear_rows(item.velocity, item.cov, _VELOCITY_H, group))
+            rows = linear_rows(item.velocity, item.cov, _VELOCITY_H, group)
+            rows[:, VARIANCE] *= (inflation or {}).get(item.source, 1.0)
+            blocks.append(rows)
         else:
             blocks.append(speed_row(item.speed_mps, item.speed_var, group))
     return Batch(np.vstack(blocks) if len(blocks) > 1 else blocks[0], tuple(items))
+
+
+def velocity_inflation(
+    items: Sequence[Source], last_ns: Mapping[str, int], tau_s: float
+) -> dict[str, float]:
+    """Variance factors of velocities whose errors last, by source: white noise of the same
+    spectral density at 0 (as ``BiasStates`` has it for RSUs).
+
+    last_ns : stamp of the last velocity fused, by source; tau_s : correlation time, 0 for white
+    """
+    factors = {}
+    for item in items:
+        if tau_s > 0.0 and isinstance(item, Velocity) and item.source in last_ns:
+            since_s = (item.stamp_ns - last_ns[item.source]) * 1e-9
+            factors[item.source] = max(1.0, tau_s / since_s) if since_s > 0.0 else 1.0
+    return factors
+
+
+def mostly_accepted(batch: Batch, accepted: Array) -> bool:
+    """Whether at least half of the RSUs, or of all where there is none, were accepted."""
+    votes = [
+        bool(taken)
+        for item, taken in zip(batch.items, accepted, strict=True)
+        if isinstance(item, RsuMeasurement)
+    ] or [bool(taken) for taken in accepted]
+    return 2 * sum(votes) >= len(votes)

@@ -24,6 +24,7 @@ MOTION_MODELS = (
     "strapdown",
 )
 ROBUST = ("none", "huber", "student_t")
+AMBIGUITY = ("hypotheses", "step_heading")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,6 +170,25 @@ class TrackerConfig:
     nlos_mean_excess_m: float = _real(20.0, 1e-3, 1e5, "mean excess of a blocked path")
     nlos_memory: float = _real(
         100.0, 1.0, 1e9, "measurements over which the share of each RSU is learned"
+    )
+    ambiguity: str = _choice(
+        "hypotheses",
+        AMBIGUITY,
+        "how the sector of a phase difference is found: hypotheses (a weighted filter per sector)"
+        " | step_heading (petukhov:eq.16-18, once per first fix)",
+    )
+    sector_probability: float = _real(
+        0.999, 0.5, 1.0 - 1e-9, "hypotheses: TRACKING once a sector is this probable"
+    )
+    sector_slip_probability: float = _real(
+        1e-6, 1e-12, 1e-2, "hypotheses: least probability of a sector, so that a rival can return"
+    )
+    velocity_correlation_s: float = _real(
+        0.0,
+        0.0,
+        60.0,
+        "velocities in map: power spectral density at 0 of their errors over their variance (the"
+        " duration of a step where one error lasts a step); 0: white",
     )
     isolate_rsus: bool = field(
         default=True, metadata={"text": "refuse an RSU that at least two others contradict"}

@@ -90,9 +90,11 @@ def predict(
 
 
 @leaf
-def _update(
+def update(
     mean: Array, spread: Array, rows: Array, options: Array, accepted: Array, work: Array
 ) -> tuple[float, int]:
+    """Gate and apply one epoch, in place: NIS of the accepted rows and their number; ``accepted``
+    (groups,) is filled."""
     kind = int(options[Option.FILTER])
     height_m, gate = options[Option.HEIGHT], options[GATE:]
     if kind == Filter.UKF:
@@ -182,8 +184,8 @@ def step(
         jump = options[Option.INITIAL_SPEED]
         open_velocity(spread, jump, unheard_s, options)
     if options[Option.ROBUST] > 0.0 or options[Option.NLOS_PROBABILITY] > 0.0:
-        _condition(mean, spread, rows, options, work)
-    nis, used = _update(mean, spread, rows, options, accepted[0], work)
+        condition(mean, spread, rows, options, work)
+    nis, used = update(mean, spread, rows, options, accepted[0], work)
     taken = _count(accepted[0], groups)
     manoeuvre = options[Option.MANOEUVRE_SPEED]
     if taken < groups and manoeuvre > 0.0:
@@ -191,7 +193,7 @@ def step(
         if opened:
             open_velocity(second_spread, options[Option.INITIAL_SPEED], unheard_s, options)
         open_velocity(second_spread, manoeuvre, unheard_s, options)
-        second_nis, second_used = _update(
+        second_nis, second_used = update(
             second_mean, second_spread, rows, options, accepted[1], work
         )
         if _count(accepted[1], groups) > taken:
@@ -208,7 +210,8 @@ def step(
 
 
 @kernel
-def _condition(mean: Array, spread: Array, rows: Array, options: Array, work: Array) -> None:
+def condition(mean: Array, spread: Array, rows: Array, options: Array, work: Array) -> None:
+    """Re-weight the rows in place as the robust options say."""
     cov = spread
     if int(options[Option.FILTER]) == Filter.SRUKF:
         cov = srukf.covariance(spread)

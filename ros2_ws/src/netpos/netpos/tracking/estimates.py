@@ -54,6 +54,10 @@ class Estimate(Protocol):
         """Mean and covariance predicted in the last ``step``."""
 
     @property
+    def decided(self) -> bool:
+        """Whether it is known which of several solutions is the true one."""
+
+    @property
     def motion(self) -> Array:
         """(Parameter,) of the last step; of no use to a smoother for interacting models."""
 
@@ -63,6 +67,8 @@ class Estimate(Protocol):
 
 class Single:
     """One motion model in the compiled engine."""
+
+    decided = True
 
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
         self.stamp_ns = stamp_ns
@@ -144,6 +150,7 @@ class Single:
 class _Looks:
     """The looks of ``engine.step`` for estimates that are not one compiled step."""
 
+    decided = True
     stamp_ns: int
     mean: Array
     cov: Array

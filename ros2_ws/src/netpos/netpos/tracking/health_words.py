@@ -13,6 +13,7 @@ from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 _OFF = _SCATTERS = 3.0  # median and sd of the normalised innovations of what is refused
 _NORMAL_QUARTILE = 0.6744897501960817
 _RATE_NS = 10_000_000_000
+_CYCLIC = {"azimuth", "elevation", "phase"}
 
 
 class Observation(NamedTuple):
@@ -56,7 +57,7 @@ def _spread(values: Sequence[float]) -> float:
 
 def _phrase(kind: str, error: float, devices: int) -> str:
     side = "late" if error > 0.0 else "early"
-    if kind in {"azimuth", "elevation"}:
+    if kind in _CYCLIC:
         return f"{kind} off by {math.degrees(error):.1f} deg"
     if kind == "range":
         return f"range {side} by {abs(error):.1f} m"
@@ -78,7 +79,7 @@ def _by_kind(entries: Iterable[Observation]) -> dict[str, list[tuple[float, floa
 
 def _unwrapped(kind: str, values: list[tuple[float, float]]) -> list[float]:
     """Innovations, angles within half a turn of the first one: an array turned round is +-180."""
-    if kind not in {"azimuth", "elevation"}:
+    if kind not in _CYCLIC:
         return [value for value, _ in values]
     first = values[0][0]
     return [first + float(wrap(value - first)) for value, _ in values]

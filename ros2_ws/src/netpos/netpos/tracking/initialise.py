@@ -32,6 +32,7 @@ from netpos.filters.measurement import (
     VALUE,
     VARIANCE,
     Kind,
+    is_cyclic,
     predict_row,
     wrap,
 )
@@ -71,7 +72,7 @@ def _normal_equations(
         past[1] += state[3] * age
         past[4] += state[5] * age
         residual = rows[i, VALUE] - predict_row(rows[i], past, height_m, h)
-        if int(rows[i, KIND]) <= Kind.ELEVATION:
+        if is_cyclic(rows[i]):
             residual = wrap(residual)
         h[2] += age * h[0]
         h[3] += age * h[1]

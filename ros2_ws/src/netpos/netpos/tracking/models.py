@@ -90,6 +90,12 @@ def heading_index(config: TrackerConfig) -> int:
     return 6 if config.motion_model == "rigid_body" else -1
 
 
+def by_sectors(config: TrackerConfig) -> bool:
+    """Whether phase differences are resolved by a bank of filters."""
+    single = config.motion_model not in ("interacting", "rigid_body")
+    return config.ambiguity == "hypotheses" and config.backend == "compiled" and single
+
+
 def initial_extra_sd(config: TrackerConfig) -> Array:
     """Standard deviations of the motion model's own states at the first fix; their means are 0."""
     match config.motion_model:

@@ -12,6 +12,7 @@ from netpos.messages.values import AngleConvention, Array, RsuInfo, RsuMeasureme
 
 _RANGES = (Kind.TOA, Kind.RANGE)
 _AZIMUTHS = (Kind.AZIMUTH, Kind.COSINE_Y)
+_PHASES = (Kind.PHASE, Kind.UNWRAPPED_PHASE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,16 +42,23 @@ class Rsu:
             return self.info.range_bias_sd_m
         if kind in _AZIMUTHS:
             return self.info.azimuth_bias_sd_rad
+        if kind in _PHASES:
+            return 0.0
         return self.info.elevation_bias_sd_rad
 
     def kinds(self, m: RsuMeasurement) -> tuple[Kind, ...]:
         """Kinds of the scalar rows a measurement of this RSU gives."""
         return tuple(kind for kind, _, _ in scalar_values(m, self.info.angle_convention))
 
+    def phase_fault(self) -> str | None:
+        """Reason to refuse a phase difference of this RSU."""
+        return None if self.info.baseline_m > 0.0 else "no_baseline"
+
     def in_front(self, dx: float, dy: float) -> bool:
-        """Whether a horizontal offset from the RSU is one its array can see: a CONE array has no
-        back."""
-        if self.info.angle_convention is AngleConvention.SPHERICAL:
+        """Whether a horizontal offset from the RSU is one its array can see: neither a CONE array
+        nor two antennas tell front from back."""
+        spherical = self.info.angle_convention is AngleConvention.SPHERICAL
+        if spherical and not self.info.baseline_m:
             return True
         return bool(self.axes[0] * dx + self.axes[1] * dy >= 0.0)
 

@@ -29,7 +29,7 @@ from netpos.messages.values import (
     TrackStatus,
 )
 from netpos.tracking import estimates, output
-from netpos.tracking.batch import Batch, Source, batch_of
+from netpos.tracking.batch import Batch, Source, batch_of, mostly_accepted, velocity_inflation
 from netpos.tracking.blockage import Blockage
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.engine import GATE_SIZE
@@ -41,8 +41,10 @@ from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser, with_heading
 from netpos.tracking.models import gate_thresholds, heading_index, initial_extra_sd, pose_state
 from netpos.tracking.networks.secondary import OwnNoise, Secondary
+from netpos.tracking.phase_start import PhaseStart, corrections, with_sectors
 from netpos.tracking.protection import NisWindow, protection_level, unnoticed_shift
 from netpos.tracking.rsus import BiasStates, Rsu
+from netpos.tracking.sectors import Sectors
 from netpos.tracking.sequencer import Epoch, Item
 from netpos.tracking.smoothing import FixedLag, Posterior
 
@@ -74,6 +76,7 @@ class _State:
     biases: BiasStates
     initialiser: Initialiser
     blockage: Blockage
+    phase_start: PhaseStart
     segment: int = 0
     estimate: Estimate | None = None
     own: OwnNoise | None = None
@@ -85,6 +88,7 @@ class _State:
     rejected_in_row: int = 0
     unnoticed_m: float = 0.0
     last_accepted_ns: int = 0
+    velocity_ns: dict[str, int] = field(default_factory=dict)
     accepted: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
 
@@ -94,10 +98,12 @@ class _State:
         twin.blockage = self.blockage.copy()
         if self.estimate is None:
             twin.initialiser = self.initialiser.copy()
+            twin.phase_start = self.phase_start.copy()
         else:
             twin.estimate = self.estimate.copy()
         twin.nis_window = self.nis_window.copy()
         twin.rejected = self.rejected.copy()
+        twin.velocity_ns = self.velocity_ns.copy()
         return twin
 
 
@@ -130,7 +136,12 @@ class Track:
 
     def _fresh(self) -> _State:
         first = 6 + self._extra_sd.size
-        return _State(BiasStates(first), Initialiser(self._config), Blockage.of(self._config))
+        return _State(
+            BiasStates(first),
+            Initialiser(self._config),
+            Blockage.of(self._config),
+            PhaseStart(self._config),
+        )
 
     @property
     def rejected(self) -> Counter[str]:
@@ -177,7 +188,8 @@ class Track:
     def _smooth(self, result: TrackOutput) -> TrackOutput:
         """Keep the posterior and add what the smoother makes of it."""
         state, estimate = self._state, self._state.estimate
-        if estimate is None or (self._fixed_lag is None and self.posteriors is None):
+        unkept = self._fixed_lag is None and self.posteriors is None
+        if estimate is None or unkept or not estimate.decided:
             return result
         posterior = Posterior(
             stamp_ns=estimate.stamp_ns,
@@ -234,7 +246,10 @@ class Track:
 
     def _batch(self, items: list[Source]) -> Batch:
         biases = self._state.biases
-        batch = batch_of(items, self._rsus, biases, self._heading)
+        inflation = velocity_inflation(
+            items, self._state.velocity_ns, self._config.velocity_correlation_s
+        )
+        batch = batch_of(items, self._rsus, biases, self._heading, inflation)
         if len(biases.sd) > self._state.bias.shape[1]:
             self._state.bias = biases.arrays()
         return batch
@@ -259,6 +274,10 @@ class Track:
             for i, index in enumerate(batch.rows[:, column].astype(int)):
                 if index >= 0:
                     bias_var[i] += state.biases.sd[index - state.biases.first] ** 2
+        if state.phase_start.heard(batch):
+            state.estimate = state.phase_start.add(stamp_ns, batch.rows, bias_var)
+            started = np.full(len(batch.items), state.estimate is not None)
+            return self._note_accepted(stamp_ns, batch, started) if started.all() else ()
         solution = state.pose
         if solution is None:
             state.initialiser.add(stamp_ns, batch.rows, bias_var, heard)
@@ -278,6 +297,7 @@ class Track:
 
     def _update(self, stamp_ns: int, batch: Batch) -> tuple[float, int, tuple[str, ...]]:
         state = self._state
+        state.estimate = with_sectors(self._config, state.estimate, batch.rows)
         estimate = self._prepare(stamp_ns)
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
         state.blockage.expect(batch)
@@ -289,13 +309,14 @@ class Track:
             state.own = self._secondary.after(
                 state.own, stamp_ns, estimate, batch.rows, state.bias
             )
+        state.segment += corrections(estimate, state.rejected)
         state.has_clock |= bool((batch.rows[:, KIND] == Kind.TOA).any()) and dof > 0
         self._note_fit(stamp_ns, batch, accepted, nis, dof)
         refused = int(len(batch.items) - accepted.sum())
         if refused:
             state.rejected["gate"] += refused
         sources = self._note_accepted(stamp_ns, batch, accepted) if dof > 0 else ()
-        if _mostly_accepted(batch, accepted):
+        if mostly_accepted(batch, accepted):
             state.rejected_in_row = 0
             return nis, dof, sources
         state.rejected_in_row += 1
@@ -362,6 +383,7 @@ class Track:
                     sources.append(item.rsu_id)
                 else:
                     sources.append(item.source)
+                    state.velocity_ns[item.source] = item.stamp_ns
         state.last_accepted_ns = stamp_ns
         return tuple(sources)
 
@@ -385,6 +407,8 @@ class Track:
             unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
             moved = state.unnoticed_m + self._config.manoeuvre_speed_sd_mps * unheard_s
             level = max(level, min(moved, _LEVEL_MAX_M))
+            if isinstance(estimate, Sectors):
+                level = estimate.radius(level, risk)
         status = TrackStatus(
             stamp_ns=stamp_ns,
             vue_id=self._vue_id,
@@ -418,16 +442,7 @@ class Track:
             return TrackState.WAITING
         if stamp_ns - self._state.last_accepted_ns > self._config.coast_after_s * 1e9:
             return TrackState.COASTING
-        if position_sd > self._config.initial_position_sd_max_m:
+        undecided = not self._state.estimate.decided
+        if undecided or position_sd > self._config.initial_position_sd_max_m:
             return TrackState.INITIALISING
         return TrackState.TRACKING
-
-
-def _mostly_accepted(batch: Batch, accepted: Array) -> bool:
-    """Whether at least half of the RSUs, or of all where there is none, were accepted."""
-    votes = [
-        bool(taken)
-        for item, taken in zip(batch.items, accepted, strict=True)
-        if isinstance(item, RsuMeasurement)
-    ] or [bool(taken) for taken in accepted]
-    return 2 * sum(votes) >= len(votes)

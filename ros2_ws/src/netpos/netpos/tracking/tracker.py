@@ -8,6 +8,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from netpos.messages.values import (
+    Field,
     GroundSpeed,
     ImuSample,
     InitialPose,
@@ -166,6 +167,8 @@ class Tracker:
                 fault = validation.measurement_fault(item)
                 if fault is None and item.rsu_id not in self._rsus:
                     return "unknown_rsu"
+                if fault is None and item.fields & Field.PHASE:
+                    return self._rsus[item.rsu_id].phase_fault()
                 return fault
             case Velocity():
                 return validation.velocity_fault(item)

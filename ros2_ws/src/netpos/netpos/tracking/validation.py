@@ -7,6 +7,7 @@ from operator import attrgetter
 
 import numpy as np
 
+from netpos.filters.measurement import rsu_axes
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages.fields import MAP_FRAME
 from netpos.messages.topics import is_vue_id
@@ -30,11 +31,14 @@ _SCALARS = (
     (int(Field.RANGE), attrgetter("range_m", "range_var"), 1.0),
     (int(Field.PHASE), attrgetter("phase_difference_rad", "phase_difference_var"), 1.0),
 )
-_RANGE, _POSITION = int(Field.RANGE), int(Field.POSITION)
-_FUSED = int(Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE | Field.POSITION)
-_KNOWN = _FUSED | int(Field.PHASE)
+_RANGE, _POSITION, _PHASE = int(Field.RANGE), int(Field.POSITION), int(Field.PHASE)
+_KNOWN = int(
+    Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE | Field.POSITION | Field.PHASE
+)
 _LARGEST = 1e9
 _LEVER_ARM_MAX_M = 1e3
+_TILT_MAX = 0.05  # of the baseline: the first fix takes two antennas for level
+_BASELINE_MAX = 50.0  # wavelengths: each takes two hypotheses
 # Variances (m, rad, m/s) beyond which double precision cannot fuse with metres.
 _VAR_MIN, _VAR_MAX = 1e-6**2, 1e6**2
 _ASYMMETRY_MAX = 1e-6  # relative
@@ -50,8 +54,6 @@ def measurement_fault(m: RsuMeasurement) -> str | None:
     fields = int(m.fields)
     if not fields or fields & ~_KNOWN:
         return "no_fields" if not fields else "unknown_fields"
-    if not fields & _FUSED:
-        return "unsupported_fields"
     for flag, quantity, scale in _SCALARS:
         if fields & flag:
             value, variance = quantity(m)
@@ -63,6 +65,8 @@ def measurement_fault(m: RsuMeasurement) -> str | None:
         return "lever_arm"
     if fields & _RANGE and m.range_m < 0.0:
         return "negative_range"
+    if fields & _PHASE and abs(m.phase_difference_rad) > math.pi:
+        return "phase_not_wrapped"
     if fields & _POSITION:
         return _gaussian_fault(m.position, m.position_cov)
     return None
@@ -117,6 +121,35 @@ def rsu_fault(info: RsuInfo) -> str | None:
         return f"common_bias_correlation_time of {info.rsu_id} must be > 0 s where it has a bias"
     if not 0.0 <= info.noise_correlation_time_s < _LARGEST:
         return f"noise_correlation_time of {info.rsu_id} must be finite and >= 0 s"
+    return _array_fault(info)
+
+
+def _array_fault(info: RsuInfo) -> str | None:
+    """Reason to refuse the two antennas of an RSU; both values are 0 where it has none."""
+    baseline, wavelength = info.baseline_m, info.wavelength_m
+    if not (0.0 <= baseline < _LARGEST and 0.0 <= wavelength < _LARGEST):
+        return f"baseline and wavelength of {info.rsu_id} must be finite and >= 0 m"
+    if baseline > 0.0 and wavelength == 0.0:
+        return (
+            f"{info.rsu_id} has a baseline of {baseline:g} m but no wavelength; "
+            "give the wavelength of its channel [m]"
+        )
+    if wavelength > 0.0 and baseline < wavelength / 2.0 * (1.0 - 1e-9):
+        return (
+            f"baseline of {info.rsu_id} must be at least half its wavelength of {wavelength:g} m, "
+            f"got {baseline:g} m"
+        )
+    if baseline > _BASELINE_MAX * wavelength:
+        return (
+            f"baseline of {info.rsu_id} must be at most {_BASELINE_MAX:g} wavelengths of "
+            f"{wavelength:g} m, got {baseline:g} m"
+        )
+    tilt = abs(float(rsu_axes(info)[5])) if baseline > 0.0 else 0.0
+    if tilt > _TILT_MAX:
+        return (
+            f"the antennas of {info.rsu_id} must be level, one is {100.0 * tilt:.0f} % of the "
+            "baseline above the other; correct its orientation"
+        )
     return None
 
 

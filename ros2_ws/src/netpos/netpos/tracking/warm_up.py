@@ -54,8 +54,28 @@ def _angles_and_ranges() -> None:
             )
             tracker.add(m)
             tracker.process()
+    _hear_an_anchor(tracker)
     speed = GroundSpeed(stamp_ns=500_000_000, vue_id="warm_up", speed_mps=0.1, speed_var=0.01)
     pose = InitialPose(stamp_ns=600_000_000, vue_id="warm_up", position=position, cov=np.eye(3))
     for item in (speed, pose):
         tracker.add(item)
+        tracker.process()
+
+
+def _hear_an_anchor(tracker: Tracker) -> None:
+    """Two epochs of an ambiguous phase, for a device of its own."""
+    tracker.add_rsu(
+        RsuInfo(rsu_id="anchor", position=np.zeros(3), baseline_m=0.2, wavelength_m=0.1)
+    )
+    for k in (1, 2):
+        phase = RsuMeasurement(
+            stamp_ns=k * 100_000_000,
+            rsu_id="anchor",
+            vue_id="warm_up_sectors",
+            fields=Field.RANGE | Field.PHASE,
+            range_m=10.0,
+            range_var=0.01,
+            phase_difference_var=0.01,
+        )
+        tracker.add(phase)
         tracker.process()

@@ -34,6 +34,7 @@ from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMe
 from scipy.spatial.transform import Rotation
 
 ANGLE_KINDS = (Kind.AZIMUTH, Kind.ELEVATION)
+CYCLIC_KINDS = (*ANGLE_KINDS, Kind.PHASE)
 
 
 DIRECTION_KINDS = (*ANGLE_KINDS, Kind.COSINE_Y, Kind.COSINE_Z)
@@ -84,6 +85,8 @@ def closed_form(row: Array, x: Array, height_m: float) -> float:
         Kind.SPEED: lambda: abs(complex(x[2], x[3])),
         Kind.COSINE_Y: lambda: uy / r,
         Kind.COSINE_Z: lambda: uz / r,
+        Kind.PHASE: lambda: ux / r,  # an array of one radian along the x axis
+        Kind.UNWRAPPED_PHASE: lambda: ux / r,
     }[Kind(int(row[KIND]))]()
     return float(value) + x[6] + x[8]
 
@@ -270,7 +273,7 @@ def test_angle_innovation_crosses_pi(kind: Kind, side: int) -> None:
     assert innovation[0] == pytest.approx(0.02, abs=1e-12)
 
 
-@pytest.mark.parametrize("kind", [k for k in Kind if k not in ANGLE_KINDS])
+@pytest.mark.parametrize("kind", [k for k in Kind if k not in CYCLIC_KINDS])
 def test_other_innovations_are_not_wrapped(kind: Kind) -> None:
     rng = np.random.default_rng(3)
     row, x = random_row(rng, kind), random_state(rng)

@@ -14,7 +14,7 @@ HOUSES = np.array(
     [[10.0, 10.0, 40.0, 30.0], [55.0, -20.0, 70.0, 25.0], [-30.0, -40.0, 5.0, -10.0]]
 )
 FIXED = Errors(
-    fixed=np.array([1e-3, 0.0, 1e-16, 0.0]),
+    fixed=np.array([1e-3, 0.0, 1e-16, 0.0, 0.0]),
     with_elevation=False,
     snr_at_0_db_loss=0.0,
     path_loss=np.zeros(5),
@@ -33,6 +33,10 @@ def _sites(places: np.ndarray) -> Sites:
         noise_key=keys,
         sight_key=keys,
         clock_tones=np.zeros((len(places), 0, 3)),
+        baseline_m=np.zeros(len(places)),
+        wavelength_m=np.zeros(len(places)),
+        range_scale=np.zeros(len(places)),
+        range_offset_m=np.zeros(len(places)),
     )
 
 

@@ -62,6 +62,8 @@ CONFIGS: dict[str, dict[str, Any]] = {
     "interacting": {"motion_model": "interacting", "filter": "ekf", "manoeuvre_speed_sd_mps": 2.0},
     "inertial": {"motion_model": "inertial"},
     "robust": {"robust": "student_t", "nlos_probability": 0.2, "isolate_rsus": False},
+    "paper's rule": {"filter": "srukf", "ambiguity": "step_heading", "isolate_rsus": False},
+    "driven sectors": {"motion_model": "inertial", "filter": "srukf", "nlos_probability": 0.1},
     "nlos": {"filter": "srukf", "nlos_probability": 0.2, "motion_model": "constant_turn"},
     "no history": {"history_s": 0.0, "hold_s": 0.0, "filter": "ekf", "max_rejected_epochs": 2},
     "long history": {"history_s": 5.0, "hold_s": 1.0, "max_future_s": 1e9, "max_gap_s": 1e4},
@@ -86,7 +88,7 @@ def stations(rng: np.random.Generator) -> list[RsuInfo]:
         "noise_correlation_time_s": 0.3,
     }
     return [
-        RsuInfo(rsu_id="a", position=np.array([0.0, 5.0, 3.0])),
+        RsuInfo(rsu_id="a", position=np.array([0.0, 5.0, 3.0]), baseline_m=0.2, wavelength_m=0.05),
         RsuInfo(rsu_id="b", position=np.array([60.0, -5.0, 0.0]), **biases),
         RsuInfo(
             rsu_id="c",
@@ -187,10 +189,11 @@ class Generator:
         origin = self.infos[rsu_id].position if rsu_id in self.infos else np.zeros(3)
         d = np.array([x, y, 0.0]) - origin
         r = float(np.linalg.norm(d))
-        fields = int(self.one_of((1, 4, 5, 5, 5, 8, 9, 12, 13, 15, 32, 32, 37, 47)))
+        fields = int(self.one_of((1, 4, 5, 5, 5, 8, 9, 12, 13, 15, 24, 24, 32, 32, 37, 47)))
         if self.rng.random() < share:
             fields = int(self.rng.integers(0, 128))
         noise = self.rng.normal(size=5)
+        phase = -8.0 * math.pi * d[1] / max(r, 1e-3) + 0.1 * noise[3]
         return RsuMeasurement(
             stamp_ns=stamp,
             rsu_id=rsu_id,
@@ -205,7 +208,7 @@ class Generator:
             toa_var=self.variance(1e-18, share),
             range_m=self.spoilt(abs(r + 0.3 * noise[2]), share),
             range_var=self.variance(0.09, share),
-            phase_difference_rad=self.spoilt(1.0, share),
+            phase_difference_rad=self.spoilt(math.remainder(phase, math.tau), share),
             phase_difference_var=self.variance(0.01, share),
             position=np.array([self.spoilt(x, share), self.spoilt(y, share), 0.0]),
             position_cov=self.cov(share, 3),
@@ -305,7 +308,7 @@ def test_the_generator_reaches_all_parts() -> None:
     assert seen["taken"] > 0.5 * len(CONFIGS) * BATCH
     assert seen["tracked"] > 0.5 * seen["epochs"]
     reasons = {"not_finite", "variance", "zero_stamp", "duplicate", "late", "future_stamp"}
-    reasons |= {"no_fields", "unknown_fields", "unsupported_fields", "negative_range"}
+    reasons |= {"no_fields", "unknown_fields", "no_baseline", "negative_range"}
     assert reasons | {"unknown_rsu"} <= set(seen)
 
 

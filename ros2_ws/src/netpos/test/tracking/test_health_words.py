@@ -29,6 +29,7 @@ def observed(
         (Kind.AZIMUTH.name, math.radians(20.1), ("v",), "azimuth off by 20.1 deg"),
         (Kind.RANGE.name, 30.2, ("v",), "range late by 30.2 m"),
         ("elevation", math.radians(-20.1), ("v",), "elevation off by -20.1 deg"),
+        ("phase", math.radians(20.1), ("v",), "phase off by 20.1 deg"),
         ("range", 30.2, ("v",), "range late by 30.2 m"),
         ("range", -30.2, ("v",), "range early by 30.2 m"),
         ("toa", 31.478, ("v",), "clock step of 105 ns or blocked path"),

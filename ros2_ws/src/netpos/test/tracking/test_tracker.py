@@ -88,7 +88,11 @@ REFUSED = [
     ("zero_stamp", good(stamp_ns=0)),
     ("no_fields", good(fields=Field(0))),
     ("unknown_fields", good(fields=Field(64 | 8))),
-    ("unsupported_fields", good(fields=Field.PHASE, phase_difference_var=0.1)),
+    ("no_baseline", good(fields=Field.PHASE, phase_difference_var=0.1)),
+    (
+        "phase_not_wrapped",
+        good(fields=Field.PHASE, phase_difference_rad=3.2, phase_difference_var=0.1),
+    ),
     ("negative_range", good(range_m=-1.0)),
     (
         "frame",

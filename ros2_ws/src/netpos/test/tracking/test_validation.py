@@ -79,10 +79,15 @@ def test_fields() -> None:
     assert measurement_fault(replace(GOOD, fields=Field(2**31))) == "unknown_fields"
 
 
-def test_phase_alone_is_refused_and_checked_beside_others() -> None:
-    """No filter takes it yet."""
+def test_phase() -> None:
     phase = replace(GOOD, fields=Field.PHASE, phase_difference_var=0.01)
-    assert measurement_fault(phase) == "unsupported_fields"
+    assert measurement_fault(phase) is None
+    for value in (math.pi, -math.pi):
+        assert measurement_fault(replace(phase, phase_difference_rad=value)) is None
+        beyond = replace(phase, phase_difference_rad=value * (1 + 1e-15))
+        assert measurement_fault(beyond) == "phase_not_wrapped"
+        unused = replace(beyond, fields=Field.RANGE)
+        assert measurement_fault(unused) is None
     both = replace(phase, fields=Field.PHASE | Field.RANGE)
     assert measurement_fault(both) is None
     assert measurement_fault(replace(both, phase_difference_var=0.0)) == "variance"
@@ -241,6 +246,35 @@ def test_speed() -> None:
             "noise_correlation_time of a must be finite and >= 0 s",
         ),
         ({"noise_correlation_time_s": 0.5}, None),
+        ({"baseline_m": 0.2, "wavelength_m": 0.05}, None),
+        ({"baseline_m": 0.025, "wavelength_m": 0.05}, None),
+        (
+            {"baseline_m": 0.2},
+            "a has a baseline of 0.2 m but no wavelength; give the wavelength of its channel [m]",
+        ),
+        (
+            {"baseline_m": 0.0249, "wavelength_m": 0.05},
+            "baseline of a must be at least half its wavelength of 0.05 m, got 0.0249 m",
+        ),
+        (
+            {"wavelength_m": 0.05},
+            "baseline of a must be at least half its wavelength of 0.05 m, got 0 m",
+        ),
+        (
+            {"baseline_m": 2.51, "wavelength_m": 0.05},
+            "baseline of a must be at most 50 wavelengths of 0.05 m, got 2.51 m",
+        ),
+        (
+            {
+                "baseline_m": 0.2,
+                "wavelength_m": 0.05,
+                "quaternion": np.array([math.sin(0.03), 0.0, 0.0, math.cos(0.03)]),
+            },
+            "the antennas of a must be level, one is 6 % of the baseline above the other; "
+            "correct its orientation",
+        ),
+        ({"baseline_m": NAN}, "baseline and wavelength of a must be finite and >= 0 m"),
+        ({"wavelength_m": -1.0}, "baseline and wavelength of a must be finite and >= 0 m"),
     ],
 )
 def test_rsu(change: dict[str, Any], text: str | None) -> None:

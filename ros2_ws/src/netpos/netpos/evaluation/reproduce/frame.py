@@ -23,6 +23,7 @@ PAPERS = {
     "fokin2020": "netpos.evaluation.reproduce.fokin2020",
     "dvornikov2017": "netpos.evaluation.reproduce.dvornikov2017",
     "deng2022": "netpos.evaluation.reproduce.deng2022",
+    "petukhov": "netpos.evaluation.reproduce.petukhov",
 }
 """Module of each paper by its name."""
 

@@ -22,7 +22,7 @@ from netpos.filters.measurement import (
 )
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
-from netpos.radio.measure import AZIMUTH, ELEVATION, RANGE, TOA, Observations
+from netpos.radio.measure import AZIMUTH, ELEVATION, PHASE, RANGE, TOA, Observations
 from netpos.tracking.rsus import Rsu
 
 Ints = npt.NDArray[np.int64]
@@ -32,6 +32,7 @@ _COLUMNS = {
     Kind.ELEVATION: ELEVATION,
     Kind.TOA: TOA,
     Kind.RANGE: RANGE,
+    Kind.PHASE: PHASE,
 }
 
 

@@ -1,0 +1,172 @@
+"""petukhov's walk round the rectangle: one seed through simulator and tracker.
+
+Radio is that of the scenario ``pedestrian_rectangle``; the person walks at constant speed in
+steps, as the paper has it, and dead reckoning is its error model (``steps``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from netpos.evaluation.bounds import bound_covariances
+from netpos.evaluation.reproduce.experiment import VUE
+from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
+from netpos.evaluation.reproduce.steps import (
+    StepErrors,
+    reported_velocity,
+    steps_of,
+    velocity_rows,
+)
+from netpos.filters.measurement import GROUP
+from netpos.filters.motion import NO_BIAS
+from netpos.messages.values import Array, Velocity
+from netpos.radio.noise import generator
+from netpos.scenario import Simulation, load_scenario
+from netpos.scenario.schema import RectangleRoute
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.models import motions_of, pose_state
+from netpos.tracking.phase_start import PhaseStart
+
+Ints = npt.NDArray[np.int64]
+
+NS = 1_000_000_000
+SPEED_MPS, STEP_M, PAUSE_S = 1.0, 0.6375, 1.02
+WALKED_M, STEPS, DURATION_S = 20.4, 32, 25.5
+ERRORS = StepErrors()
+_DEVICE = {
+    "route": {
+        "kind": "rectangle",
+        "corner": [-2.85, 1.5],
+        "width_m": 5.7,
+        "height_m": 4.5,
+        "pauses_s": [PAUSE_S] * 5,
+    },
+    "speed_mps": SPEED_MPS,
+    "antenna_height_m": 1.0,
+    "beacon_interval_s": 0.1,
+}
+_BASELINE = "rsus.units.0.antennas.baseline_wavelengths"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """A way to walk the rectangle: baseline, settings of the tracker over the scenario's own, and
+    when the anchor is hidden (from, to) [s]."""
+
+    name: str
+    wavelengths: float
+    tracker: tuple[tuple[str, object], ...] = ()
+    hidden_s: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Walked:
+    """One run: times_s (n,), truth (n, 2) m, and from the first fix on (NaN before) mean (n, 6),
+    cov (n, 6, 6); whether the sector was decided (n,); nis and its
+    degrees of freedom (n,)."""
+
+    times_s: Array
+    truth: Array
+    mean: Array
+    cov: Array
+    decided: npt.NDArray[np.bool_]
+    nis: Array
+    dof: Array
+
+    @property
+    def error_m(self) -> Array:
+        """(n,) horizontal errors; NaN where there is no estimate or it is not decided."""
+        error = np.hypot(*(self.mean[:, :2] - self.truth).T)
+        return np.where(self.decided, error, np.nan)
+
+
+class Setup:
+    """What all seeds of a case share."""
+
+    def __init__(self, case: Case) -> None:
+        changes = {"devices.0": _DEVICE, _BASELINE: case.wavelengths}
+        scenario = load_scenario("pedestrian_rectangle", changes=changes)
+        self.simulation = Simulation(scenario)
+        self.config = TrackerConfig.from_mapping({**scenario.tracker, **dict(case.tracker)})
+        self._case = case
+        self._templates = RowTemplates.of(self.simulation.rsus, self.simulation.fields)
+        beacons = self.simulation.beacons(VUE)
+        self.stamps_ns = beacons.stamp_ns
+        self.times_s = (beacons.stamp_ns - beacons.stamp_ns[0]) / NS
+        self.truth: Array = beacons.position[:, :2]
+        self.velocity: Array = beacons.velocity
+        route = scenario.devices[0].route
+        assert isinstance(route, RectangleRoute)
+        points = route.waypoints(generator(0, ""))
+        self.steps = steps_of(points, np.array(route.pauses_s), SPEED_MPS, STEP_M)
+        self.heard = np.ones(len(self.times_s), dtype=bool)
+        if case.hidden_s is not None:
+            low, high = case.hidden_s
+            self.heard = (self.times_s < low) | (self.times_s >= high)
+
+    def rows(self, seed: int) -> Array:
+        """Rows (n, 4, ROW_WIDTH) of all epochs: range and phase, then velocity."""
+        seen = self.simulation.with_seed(seed).observations(VUE)
+        _, _, radio, _ = observation_rows(seen, self._templates, first_bias=6)
+        rng = generator(seed, f"{VUE}/steps")
+        tau_s = self.config.velocity_correlation_s
+        velocity, _ = velocity_rows(self.times_s, self.steps, ERRORS, rng, tau_s)
+        return np.concatenate([radio.reshape(len(velocity), 2, -1), velocity], axis=1)
+
+    def run(self, seed: int) -> Walked:
+        """Simulate and estimate one seed."""
+        rows, n = self.rows(seed), len(self.times_s)
+        mean, cov = np.full((n, 6), np.nan), np.full((n, 6, 6), np.nan)
+        decided, nis, dof = np.zeros(n, dtype=bool), np.zeros(n), np.zeros(n)
+        start, estimate, rejected, last_ns = PhaseStart(self.config), None, 0, 0
+        for k, stamp in enumerate(self.stamps_ns.tolist()):
+            own = rows[k] if self.heard[k] else _alone(rows[k, 2:])
+            if estimate is None:
+                velocity = np.round(reported_velocity(own[-2:]), 12)  # equal within a step
+                item = Velocity(stamp_ns=stamp, vue_id=VUE, velocity=velocity, cov=np.eye(2))
+                start.hear(item)
+                estimate = start.add(stamp, own, np.zeros(len(own)))
+            else:
+                unheard_s = (stamp - last_ns) / NS
+                nis[k], dof[k], taken = estimate.step(stamp, unheard_s, rejected, own, NO_BIAS)
+                rejected = 0 if 2 * taken.sum() >= taken.size else rejected + 1
+            last_ns = stamp
+            if estimate is not None:
+                mean[k], cov[k], decided[k] = estimate.mean, estimate.cov, estimate.decided
+        return Walked(self.times_s, self.truth, mean, cov, decided, nis, dof)
+
+    def bound_rmse_m(self) -> float:
+        """Posterior Cramér-Rao bound of the position RMSE under the tracker's own motion model,
+        the sector known, from the second epoch on."""
+        rows, n = self.rows(1), len(self.times_s)
+        truth = np.zeros((n, 6))
+        truth[:, :2], truth[:, 2:4] = self.truth, self.velocity
+        prior = pose_state(self.config, np.zeros(2), np.eye(2) * 100.0)[1]
+        bound = bound_covariances(
+            self.stamps_ns,
+            np.arange(n + 1) * 4,
+            rows.reshape(n * 4, -1),
+            truth,
+            prior,
+            self.config.device_height_m,
+            motions_of(self.config),
+            NO_BIAS,
+        )
+        return float(np.sqrt(np.mean(np.trace(bound[1:, :2, :2], axis1=1, axis2=2))))
+
+
+def _alone(rows: Array) -> Array:
+    """Velocity rows without the anchor's."""
+    own = rows.copy()
+    own[:, GROUP] = 0
+    return own
+
+
+@lru_cache(maxsize=8)
+def setup_of(case: Case) -> Setup:
+    """The set-up of a case, built once per process."""
+    return Setup(case)

@@ -1,0 +1,128 @@
+"""The first fix from range and phase of one array."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from netpos.filters.measurement import AXES, ORIGIN, VALUE, VARIANCE
+from netpos.messages.values import Array, Velocity
+from netpos.tracking import estimates
+from netpos.tracking.batch import Batch
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.estimates import Estimate
+from netpos.tracking.models import by_sectors, pose_state
+from netpos.tracking.phase_fix import TWO_PI, phase_scale, spawn
+from netpos.tracking.sectors import Sectors, phase_place
+from netpos.tracking.step_heading import choose_sector
+
+_WALKING_MPS = 0.1  # a step velocity below this is none
+_LEAST_EPOCHS = 3  # of a step, for a line through its places
+
+
+@dataclass(slots=True)
+class PhaseStart:
+    """Turns epochs with range and phase into a first estimate, as ``TrackerConfig.ambiguity``
+    says. ``step_heading`` collects the epochs of a step, which lasts as long as the velocity
+    reported stays the same, and applies the rule once it is over."""
+
+    config: TrackerConfig
+    _velocity: Array | None = None
+    _epochs: list[tuple[int, float, float]] = field(default_factory=list)
+    _step: tuple[Array, list[tuple[int, float, float]]] | None = None
+
+    def copy(self) -> PhaseStart:
+        """An independent copy."""
+        twin = copy.copy(self)
+        twin._epochs = self._epochs.copy()
+        return twin
+
+    def heard(self, batch: Batch) -> bool:
+        """Take the step velocities of an epoch; whether a track may start from it this way."""
+        for item in batch.items:
+            if isinstance(item, Velocity):
+                self.hear(item)
+        return (by_sectors(self.config) or self._by_heading) and phase_place(batch.rows) >= 0
+
+    @property
+    def _by_heading(self) -> bool:
+        plain = self.config.backend == "compiled" and self.config.motion_model != "rigid_body"
+        return self.config.ambiguity == "step_heading" and plain
+
+    def hear(self, velocity: Velocity) -> None:
+        """Take a step velocity, before the epoch it belongs to is added."""
+        if self._velocity is not None and np.array_equal(self._velocity, velocity.velocity):
+            return
+        if self._velocity is not None and math.hypot(*self._velocity) > _WALKING_MPS:
+            self._step = self._velocity, self._epochs
+        self._velocity, self._epochs = velocity.velocity, []
+
+    def add(self, stamp_ns: int, rows: Array, bias_var: Array) -> Estimate | None:
+        """The first estimate; None while there is none.
+
+        bias_var : (m,) variance of the biases in each row
+        """
+        rows = rows.copy()
+        rows[:, VARIANCE] += bias_var
+        at = phase_place(rows)
+        start = pose_state(self.config, np.zeros(2), np.eye(2))
+        if not self._by_heading:
+            return Sectors.begin(self.config, stamp_ns, rows, at, start)
+        turns = self._turns(rows, at)
+        self._epochs.append((stamp_ns, float(rows[at - 1, VALUE]), float(rows[at, VALUE])))
+        if turns is None:
+            return None
+        mean, cov = start
+        speed, height = self.config.initial_speed_sd_mps, self.config.device_height_m
+        if spawn(mean, cov, rows[at - 1], rows[at], turns, speed, height) == -math.inf:
+            return None
+        return estimates.start(self.config, stamp_ns, mean, cov)
+
+    def _turns(self, rows: Array, at: int) -> int | None:
+        """Turns of the phase ``rows[at]`` by the rule on the step that has just ended."""
+        step, self._step = self._step, None
+        if step is None or len(step[1]) < _LEAST_EPOCHS:
+            return None
+        velocity, epochs = step
+        ranged, phase = rows[at - 1], rows[at]
+        along = math.atan2(phase[AXES + 1], phase[AXES])
+        baseline_m = 2.0 * float(np.linalg.norm((ranged - phase)[ORIGIN : ORIGIN + 3]))
+        stamps, ranges, phases = (np.array(column) for column in zip(*epochs, strict=True))
+        choice = choose_sector(
+            (stamps - stamps[0]) * 1e-9,
+            ranges,
+            phases,
+            math.atan2(velocity[1], velocity[0]) - along,
+            baseline_m,
+            TWO_PI * baseline_m / float(phase_scale(phase)),
+        )
+        if choice is None:
+            return None
+        continuous = np.unwrap(np.append(phases, phase[VALUE]))
+        return choice.chosen + round(float(continuous[-1] - phase[VALUE]) / TWO_PI)
+
+
+def with_sectors(config: TrackerConfig, estimate: Estimate | None, rows: Array) -> Estimate:
+    """The estimate there is as a bank where ``rows`` hold a phase that it has not met before."""
+    assert estimate is not None
+    if isinstance(estimate, Sectors) or not by_sectors(config):
+        return estimate
+    at = phase_place(rows)
+    if at < 0:
+        return estimate
+    known = estimate.stamp_ns, estimate.mean, estimate.cov
+    return Sectors.promote(config, *known, rows, at)
+
+
+def corrections(estimate: Estimate, rejected: Counter[str]) -> int:
+    """How often a decision about the sector was replaced since last asked; counted as
+    ``sector_corrected``."""
+    if not isinstance(estimate, Sectors) or not estimate.corrected:
+        return 0
+    corrected, estimate.corrected = estimate.corrected, 0
+    rejected["sector_corrected"] += corrected
+    return corrected

@@ -1,0 +1,324 @@
+"""A bank of filters, one per sector of a phase difference's ambiguity, compiled.
+
+Slot s of a bank of S slots holds the device where the phase has M = s - S // 2 whole turns
+(petukhov:eq.9, 10); an empty slot has a log weight of -inf. Every epoch with a phase is an exact
+step of the Bayes filter for a wrapped phase, kept to one Gaussian per sector: each filter gives
+its likelihood of every number of turns, the weights of a sector add up, and its heir is the filter
+that contributes most. So neighbouring sectors are always there to take over: a weight never falls
+below a floor, the probability that the estimate has slipped unnoticed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from netpos.filters import srukf
+from netpos.filters.compile import kernel, leaf
+from netpos.filters.factor import factor
+from netpos.filters.gate import accepted_rows, gate_groups
+from netpos.filters.measurement import GROUP, KIND, VALUE, VARIANCE, Kind
+from netpos.filters.sigma import innovation_cov, regress
+from netpos.messages.values import Array
+from netpos.tracking import engine
+from netpos.tracking.engine import GATE, Filter, Option
+from netpos.tracking.phase_fix import TWO_PI, admissible, nearest_turns, spawn, to_fix
+
+Ints = npt.NDArray[np.int64]
+
+_WRAPPED, _UNWRAPPED = float(Kind.PHASE), float(Kind.UNWRAPPED_PHASE)
+_WIDE_RAD = 1.0  # a filter that knows the phase less well is moved to the fix itself
+_NEGLIGIBLE = 60.0  # squared distance of a number of turns that a filter does not explain
+
+
+@kernel
+def _evidence(rows: Array, innovation: Array, S: Array, gate: Array, accepted: Array) -> float:
+    """Log likelihood of the rows but for a constant.
+
+    A rejected group counts as one at its gate: an outlier costs every hypothesis the same and
+    decides nothing.
+    """
+    gate_groups(rows, innovation, S, gate, accepted)
+    index = accepted_rows(rows, accepted)
+    block = np.empty((index.size, index.size))
+    rest = innovation[index]
+    for i in range(index.size):
+        for j in range(index.size):
+            block[i, j] = S[index[i], index[j]]
+    L = factor(block)
+    total = 0.0
+    for i in range(index.size):
+        for k in range(i):
+            rest[i] -= L[i, k] * rest[k]
+        rest[i] /= L[i, i]
+        total += rest[i] * rest[i] + 2.0 * math.log(L[i, i])
+    start = 0
+    while start < rows.shape[0]:
+        group = int(rows[start, GROUP])
+        stop = start + 1
+        while stop < rows.shape[0] and int(rows[stop, GROUP]) == group:
+            stop += 1
+        if accepted[group] == 0.0:
+            total += gate[min(stop - start, gate.size - 1)]
+            L = factor(S[start:stop, start:stop].copy())
+            for i in range(stop - start):
+                total += 2.0 * math.log(L[i, i])
+        start = stop
+    return -0.5 * total
+
+
+@kernel
+def advance(
+    means: Array,
+    spreads: Array,
+    weights: Array,
+    dt: float,
+    jump_sd: float,
+    unheard_s: float,
+    motion: Array,
+    bias: Array,
+    options: Array,
+) -> None:
+    """Move every filter by ``dt`` seconds; ``jump_sd`` > 0 opens the velocities."""
+    for s in range(weights.size):
+        if weights[s] > -math.inf:
+            engine.predict(means[s], spreads[s], dt, motion, bias, options)
+            if jump_sd > 0.0:
+                engine.open_velocity(spreads[s], jump_sd, unheard_s, options)
+
+
+@leaf
+def _square_root(options: Array) -> bool:
+    return bool(int(options[Option.FILTER]) == Filter.SRUKF)
+
+
+@kernel
+def _factor_of(spread: Array, options: Array) -> Array:
+    if _square_root(options):
+        return spread.copy()
+    L: Array = factor(spread)
+    return L
+
+
+@kernel
+def weigh(
+    means: Array,
+    spreads: Array,
+    weights: Array,
+    rows: Array,
+    options: Array,
+    accepted: Array,
+    nis: Array,
+    used: Array,
+    work: Array,
+) -> None:
+    """An epoch without an ambiguous phase: every filter takes the rows, weights follow.
+
+    accepted (S, groups), nis (S,), used (S,) : filled
+    """
+    for s in range(weights.size):
+        if weights[s] == -math.inf:
+            continue
+        L = _factor_of(spreads[s], options)
+        innovation, G, E = regress(means[s], L, rows, options[Option.HEIGHT])
+        S = innovation_cov(G, E, rows[:, VARIANCE].copy())
+        weights[s] += _evidence(rows, innovation, S, options[GATE:], accepted[s])
+        nis[s], used[s] = engine.update(means[s], spreads[s], rows, options, accepted[s], work)
+    normalise(weights, 0.0)
+
+
+@leaf
+def normalise(weights: Array, floor: float) -> None:
+    """Log weights (S,) that sum to one, in place, none that is there below ``floor``."""
+    top = -math.inf
+    for s in range(weights.size):
+        top = max(top, weights[s])
+    for _ in range(2):
+        total = 0.0
+        for s in range(weights.size):
+            total += math.exp(weights[s] - top)
+        for s in range(weights.size):
+            if weights[s] > -math.inf:
+                weights[s] -= top + math.log(total)
+                if floor > 0.0:
+                    weights[s] = max(weights[s], math.log(floor))
+        top = 0.0
+
+
+@kernel
+def resolve(
+    means: Array,
+    spreads: Array,
+    weights: Array,
+    rows: Array,
+    at: int,
+    options: Array,
+    floor: float,
+    heir_of: Ints,
+    accepted: Array,
+    nis: Array,
+    used: Array,
+    work: Array,
+) -> None:
+    """An epoch whose row ``at`` is an ambiguous phase and ``at - 1`` the range of the same array.
+
+    heir_of (S,) : filled with the slot each filter comes from, -1 for one that was put where the
+    measurements say; accepted (S, groups), nis (S,), used (S,) : filled
+    """
+    rows[at, KIND] = _UNWRAPPED
+    gains, wide = _gains(means, spreads, weights, rows, at, options)
+    old_means, old_spreads = means.copy(), spreads.copy()
+    _inherit(gains, weights, rows[at], floor, heir_of)
+    nis[:], used[:], accepted[:] = 0.0, 0.0, 0.0
+    leader = int(np.argmax(weights))
+    group = int(rows[at, GROUP])
+    own = rows.copy()
+    for k in range(weights.size):
+        j = leader if k == 0 else (k - 1 if k <= leader else k)
+        if weights[j] == -math.inf:
+            continue
+        own[:] = rows
+        own[at, VALUE] += TWO_PI * (j - weights.size // 2)
+        parent = int(heir_of[j])
+        if parent >= 0:
+            means[j], spreads[j] = old_means[parent], old_spreads[parent]
+            if wide[parent] > 0.0:
+                to_fix(own, at, options[Option.HEIGHT])
+            nis[j], used[j] = engine.update(means[j], spreads[j], own, options, accepted[j], work)
+        lost = parent < 0 or accepted[j, group] == 0.0
+        if j != leader and lost and accepted[leader, group] == 1.0:
+            means[j], spreads[j] = old_means[heir_of[leader]], old_spreads[heir_of[leader]]
+            own[:] = rows
+            own[at, VALUE] += TWO_PI * (j - weights.size // 2)
+            heir_of[j] = -1
+            if _put(means[j], spreads[j], own, at, options):
+                _take_rest(means[j], spreads[j], own, group, options, accepted[j], work)
+            else:
+                weights[j] = -math.inf
+        elif parent < 0:
+            weights[j] = -math.inf
+    normalise(weights, floor)
+    rows[at, KIND] = _WRAPPED
+
+
+@kernel
+def _gains(
+    means: Array, spreads: Array, weights: Array, rows: Array, at: int, options: Array
+) -> tuple[Array, Array]:
+    """Log weight of every number of turns (columns) as each filter (rows) has it, (S, S); and 1
+    for a filter that knows the phase too badly for a tangent, (S,)."""
+    count, gate = weights.size, options[GATE:]
+    gains, wide = np.full((count, count), -math.inf), np.zeros(count)
+    flags = np.zeros(int(rows[rows.shape[0] - 1, GROUP]) + 1)
+    for i in range(count):
+        if weights[i] == -math.inf:
+            continue
+        L = _factor_of(spreads[i], options)
+        innovation, G, E = regress(means[i], L, rows, options[Option.HEIGHT])
+        S = innovation_cov(G, E, rows[:, VARIANCE].copy())
+        raw = innovation[at]
+        nearest = nearest_turns(rows[at], -raw)
+        if S[at, at] - rows[at, VARIANCE] > _WIDE_RAD * _WIDE_RAD:
+            wide[i] = 1.0
+        for j in range(count):
+            turns = j - count // 2
+            off = raw + TWO_PI * turns
+            far = turns != nearest and off * off > _NEGLIGIBLE * S[at, at]
+            if far or not admissible(rows[at], turns):
+                continue
+            if wide[i] > 0.0:
+                gains[i, j] = weights[i] + _fix_evidence(means[i], L, rows, at, turns, options)
+            else:
+                innovation[at] = off
+                gains[i, j] = weights[i] + _evidence(rows, innovation, S, gate, flags)
+    return gains, wide
+
+
+@kernel
+def _fix_evidence(
+    mean: Array, L: Array, rows: Array, at: int, turns: int, options: Array
+) -> float:
+    """Log likelihood of the rows with range and phase taken as the fix they give."""
+    own = rows.copy()
+    own[at, VALUE] += TWO_PI * turns
+    if not to_fix(own, at, options[Option.HEIGHT]):
+        return -math.inf
+    innovation, G, E = regress(mean, L, own, options[Option.HEIGHT])
+    S = innovation_cov(G, E, own[:, VARIANCE].copy())
+    flags = np.zeros(int(rows[rows.shape[0] - 1, GROUP]) + 1)
+    like = _evidence(own, innovation, S, options[GATE:], flags)
+    return float(like - 0.5 * math.log(rows[at, VARIANCE] * rows[at - 1, VARIANCE]))
+
+
+@kernel
+def _inherit(gains: Array, weights: Array, phase: Array, floor: float, heir_of: Ints) -> None:
+    """Weights (S,) of the sectors and the filter each inherits: the one that gives it most."""
+    top = gains.max()
+    for j in range(weights.size):
+        heir_of[j], weights[j] = -1, -math.inf
+        if not admissible(phase, j - weights.size // 2):
+            continue
+        best = int(np.argmax(gains[:, j]))
+        if gains[best, j] > -math.inf:
+            total = 0.0
+            for i in range(weights.size):
+                total += math.exp(gains[i, j] - gains[best, j])
+            weights[j] = gains[best, j] + math.log(total)
+            heir_of[j] = best
+        else:
+            weights[j] = top + math.log(floor)
+
+
+@kernel
+def _put(mean: Array, spread: Array, own: Array, at: int, options: Array) -> bool:
+    """Place a filter anew where range and phase ``own[at - 1]``, ``own[at]`` say."""
+    cov = srukf.covariance(spread) if _square_root(options) else spread.copy()
+    speed, height = options[Option.INITIAL_SPEED], options[Option.HEIGHT]
+    if spawn(mean, cov, own[at - 1], own[at], 0, speed, height) == -math.inf:
+        return False
+    if _square_root(options):
+        spread[:] = factor(cov)
+    else:
+        spread[:] = cov
+    return True
+
+
+@kernel
+def _take_rest(
+    mean: Array,
+    spread: Array,
+    own: Array,
+    group: int,
+    options: Array,
+    accepted: Array,
+    work: Array,
+) -> None:
+    """Update a filter just placed by ``group`` with the other groups."""
+    index = np.flatnonzero(own[:, GROUP] != group)
+    accepted[:] = 1.0
+    if index.size > 0:
+        flags = np.zeros(accepted.size)
+        engine.update(mean, spread, own[index], options, flags, work)
+        for g in range(accepted.size):
+            accepted[g] = 1.0 if g == group else flags[g]
+
+
+@kernel
+def combine(means: Array, spreads: Array, weights: Array, options: Array) -> tuple[Array, Array]:
+    """Mean (n,) and covariance (n, n) of the whole bank."""
+    n = means.shape[1]
+    mean, cov = np.zeros(n), np.zeros((n, n))
+    for s in range(weights.size):
+        if weights[s] > -math.inf:
+            mean += math.exp(weights[s]) * means[s]
+    for s in range(weights.size):
+        if weights[s] > -math.inf:
+            P = srukf.covariance(spreads[s]) if _square_root(options) else spreads[s].copy()
+            w = math.exp(weights[s])
+            for a in range(n):
+                for b in range(n):
+                    apart = (means[s, a] - mean[a]) * (means[s, b] - mean[b])
+                    cov[a, b] += w * (P[a, b] + apart)
+    return mean, cov

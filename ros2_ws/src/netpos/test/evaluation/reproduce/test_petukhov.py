@@ -1,0 +1,160 @@
+"""petukhov: a few seeds of each experiment, and what the rows are made of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from netpos.evaluation.reproduce import petukhov, rectangle
+from netpos.evaluation.reproduce.frame import Work
+from netpos.evaluation.reproduce.sector_choice import (
+    AREA_M,
+    STEPS,
+    Conditions,
+    Found,
+    sector_choice,
+    setup_of,
+)
+from netpos.evaluation.reproduce.waist_chain import run_chain
+
+SEED = 7000
+
+
+@pytest.fixture(scope="module")
+def walks() -> dict[rectangle.Case, petukhov.Figures]:
+    cases = (petukhov.LONG, petukhov.SHORT, petukhov.PAPER_LONG, petukhov.HIDDEN)
+    with Work(6, SEED, 1) as work:
+        return {case: petukhov._figures(work, case) for case in cases}
+
+
+def test_a_long_baseline_is_more_than_twice_as_good(
+    walks: dict[rectangle.Case, petukhov.Figures],
+) -> None:
+    long, short = walks[petukhov.LONG], walks[petukhov.SHORT]
+    assert 0.01 < long.rmse_m < 0.03
+    assert short.rmse_m > 2.0 * long.rmse_m
+    assert long.lost == short.lost == 0
+    assert 1.0 < long.nees.mean < 2.5
+
+
+def test_the_paper_s_scheme_knows_too_much_of_itself(
+    walks: dict[rectangle.Case, petukhov.Figures],
+) -> None:
+    """Errors of a step taken as white: worse, and far surer."""
+    paper, ours = walks[petukhov.PAPER_LONG], walks[petukhov.LONG]
+    assert paper.nees.mean > 2.0 * ours.nees.mean
+
+
+def test_a_hidden_anchor_is_missed_while_it_is_hidden(
+    walks: dict[rectangle.Case, petukhov.Figures],
+) -> None:
+    hidden = walks[petukhov.HIDDEN]
+    times = rectangle.setup_of(petukhov.HIDDEN).times_s
+    gone = (times >= 13.0) & (times < 15.0)
+    back = times >= 17.0
+    assert 0.05 < np.sqrt(hidden.error2[:, gone].mean(axis=0)).max() < 0.5
+    assert np.sqrt(hidden.error2[:, back].mean(axis=0)).max() < 0.1
+    assert hidden.lost == 0
+
+
+def test_the_truth_of_the_rectangle() -> None:
+    setup = rectangle.setup_of(petukhov.LONG)
+    rows = list(petukhov._walk(setup))
+    assert all(row.ok for row in rows)
+    assert setup.truth.min(axis=0).tolist() == [-2.85, 1.5]
+    np.testing.assert_allclose(setup.truth.max(axis=0), [2.85, 6.0])
+
+
+def test_hidden_epochs_hold_no_radio() -> None:
+    setup = rectangle.setup_of(petukhov.HIDDEN)
+    assert setup.times_s[~setup.heard].min() == pytest.approx(10.0)
+    assert setup.times_s[~setup.heard].max() == pytest.approx(14.9)
+
+
+def test_starts_and_ends_stay_in_the_area() -> None:
+    with Work(12, SEED, 1) as work:
+        found = sector_choice(work, petukhov.TARGET)
+    assert found.right.shape == (12, STEPS)
+    assert found.share_right(5) >= 0.9
+    assert found.share_right(1) > found.rule_share
+    assert (found.claimed > 0.1).all()
+    assert AREA_M[0][1] > 0.0
+
+
+def test_measurements_of_a_start_are_those_of_its_conditions() -> None:
+    conditions = Conditions(wavelengths=8.0, phase_sd_deg=12.0)
+    setup, rng = setup_of(conditions), np.random.default_rng(1)
+    places = np.tile([1.0, 3.0], (4000, 1))
+    rows, turns = setup.measured(rng, places)
+    unwrapped = rows[:, 1, 1] + 2 * np.pi * turns
+    assert np.abs(rows[:, 1, 1]).max() <= np.pi
+    expected = 2 * np.pi * 8.0 * np.sin(np.arctan2(1.0, 3.0))
+    assert unwrapped.mean() == pytest.approx(expected, abs=0.02)
+    assert unwrapped.std() == pytest.approx(np.radians(12.0), rel=0.05)
+    ranged = np.hypot(1.0 - setup.info.baseline_m / 2, 3.0)
+    assert rows[:, 0, 1].mean() == pytest.approx(ranged, abs=2e-3)
+    assert rows[:, 0, 1].std() == pytest.approx(0.03, rel=0.05)
+
+
+def test_shares_count_runs() -> None:
+    right = np.array([[True, True], [False, True], [True, False], [True, True]])
+    decided = np.array([[True, True], [True, True], [False, True], [False, False]])
+    found = Found(right, decided, right.astype(float), ~right)
+    assert found.share_right(1) == 0.75
+    assert found.share_decided(2) == 0.75
+    assert (found.share_wrong(1), found.share_wrong(2)) == (0.25, 0.25)
+    assert found.rule_share == 0.25
+
+
+@pytest.mark.parametrize("settings", [(), petukhov.TIGHT])
+def test_the_whole_chain_from_a_simulated_gait(settings: tuple[tuple[str, object], ...]) -> None:
+    chain = run_chain(SEED, settings)
+    assert chain.steps_found == 32
+    error = np.hypot(*chain.error[chain.tracking].T)
+    assert chain.tracking.mean() > 0.7
+    assert np.sqrt((error**2).mean()) < 0.06
+    assert error.max() < 0.2
+
+
+def test_rows_miss_their_target_where_they_should() -> None:
+    figures = petukhov.Figures(
+        runs=1,
+        rmse_m=0.031,
+        error_max_m=0.1,
+        nees=rectangle_nees(1.9),
+        decided_s=1.0,
+        lost=0,
+        error2=np.full((1, 5), 0.031**2),
+    )
+    better = replace(figures, rmse_m=0.029, nees=rectangle_nees(2.9))
+    short = replace(figures, rmse_m=0.06)
+    case, other = petukhov.LONG, petukhov.SHORT
+    for long, rmse_ok, ratio_ok, nees_ok in (
+        (figures, False, False, True),
+        (better, True, True, False),
+    ):
+        rows = {row.name: row for row in petukhov._pair(long, short, case, other)}
+        assert rows[f"{case.name}: RMSE"].ok is rmse_ok
+        assert rows["netpos: RMSE of lambda/2 over that of 4 lambda"].ok is ratio_ok
+        assert rows[f"{case.name}: NEES, mean (expected 2)"].ok is nees_ok
+
+
+def rectangle_nees(mean: float) -> petukhov.MeanTest:
+    return petukhov.MeanTest(mean=mean, bounds=(1.8, 2.2), n_eff=100.0)
+
+
+def test_pictures_are_drawn(tmp_path: Path) -> None:
+    with Work(2, SEED, 1) as work:
+        walked = {c: petukhov._figures(work, c) for c in (petukhov.LONG, petukhov.SHORT)}
+    some = Found(
+        *(np.ones((2, STEPS), dtype=bool) for _ in range(2)),
+        np.ones((2, STEPS)),
+        np.ones((2, STEPS), dtype=bool),
+    )
+    conditions = (petukhov.TARGET, *petukhov.BY_BASELINE, *petukhov.BY_PHASE)
+    paths = petukhov._draw(SEED, walked, dict.fromkeys(conditions, some), tmp_path)
+    names = {path.stem for path in paths}
+    assert names == {"fig7_residuals", "fig8_tracks", "fig9_errors", "sectors"}
+    assert all(path.stat().st_size > 10_000 for path in paths)

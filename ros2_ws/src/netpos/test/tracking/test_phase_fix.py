@@ -1,0 +1,167 @@
+"""Positions behind range and phase: against the rows' own model, and by simulation."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from netpos.filters.measurement import KIND, VALUE, Kind, predict_row, rsu_axes, rsu_rows
+from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
+from netpos.tracking.phase_fix import admissible, nearest_turns, place, spawn, to_fix
+from scipy.spatial.transform import Rotation
+
+HEIGHT = 1.2
+WAVELENGTH = 0.05
+
+
+def anchor(turn_deg: float = 35.0, wavelengths: float = 4.0) -> RsuInfo:
+    return RsuInfo(
+        rsu_id="a",
+        position=np.array([1.0, -2.0, 2.5]),
+        quaternion=Rotation.from_euler("z", turn_deg, degrees=True).as_quat(),
+        baseline_m=wavelengths * WAVELENGTH,
+        wavelength_m=WAVELENGTH,
+    )
+
+
+def rows_of(info: RsuInfo, xy: Array, range_sd: float = 0.03, phase_sd: float = 0.1) -> Array:
+    """Noise-free range and wrapped phase of a device."""
+    measured = RsuMeasurement(
+        stamp_ns=1,
+        rsu_id="a",
+        vue_id="v",
+        fields=Field.RANGE | Field.PHASE,
+        range_var=range_sd**2,
+        phase_difference_var=phase_sd**2,
+    )
+    rows = rsu_rows(measured, info, rsu_axes(info), 0)
+    state = np.array([*xy, 0.0, 0.0, 0.0, 0.0])
+    for row in rows:
+        row[VALUE] = predict_row(row, state, HEIGHT, np.empty(6))
+    return rows
+
+
+def in_front(info: RsuInfo, ahead: float, right: float) -> Array:
+    """Position so far ahead of the anchor and to the right of its boresight."""
+    x, y, _ = Rotation.from_quat(info.quaternion).apply([ahead, -right, 0.0])
+    return info.position[:2] + np.array([x, y])
+
+
+def wrapped(rows: Array) -> tuple[Array, int]:
+    """Rows with the phase in [-pi, pi), and the turns taken off."""
+    turns = math.floor((rows[1, VALUE] + math.pi) / (2 * math.pi))
+    rows[1, VALUE] -= 2 * math.pi * turns
+    return rows, turns
+
+
+@pytest.mark.parametrize("ahead", [1.0, 4.0, 9.0])
+@pytest.mark.parametrize("right", [-4.0, -0.3, 0.0, 2.0])
+def test_the_place_is_the_one_measured_from(ahead: float, right: float) -> None:
+    info = anchor()
+    xy = in_front(info, ahead, right)
+    rows, turns = wrapped(rows_of(info, xy))
+    point, cov = np.empty(2), np.empty((2, 2))
+    assert place(rows[0], rows[1], turns, HEIGHT, point, cov)
+    np.testing.assert_allclose(point, xy, atol=1e-9)
+
+
+@pytest.mark.parametrize("turns", range(-5, 6))
+def test_every_sector_explains_range_and_phase(turns: int) -> None:
+    """K = 2 floor(L / lambda) + 1 sectors of petukhov:eq.11 for a phase around 0."""
+    info = anchor()
+    rows, _ = wrapped(rows_of(info, in_front(info, 5.0, 0.01)))
+    point, cov = np.empty(2), np.empty((2, 2))
+    found = place(rows[0], rows[1], turns, 2.5, point, cov)
+    assert found == (abs(turns) <= 4)
+    if found and abs(turns) < 4:  # beyond, the noise hides the angle
+        again = rows_of(info, point)
+        state = np.array([*point, 0.0, 0.0, 0.0, 0.0])
+        assert predict_row(rows[0], state, 2.5, np.empty(6)) == pytest.approx(rows[0, VALUE])
+        phase = predict_row(rows[1], state, 2.5, np.empty(6))
+        assert phase == pytest.approx(rows[1, VALUE] + 2 * math.pi * turns)
+        assert len(again) == 2
+        ahead = Rotation.from_quat(info.quaternion).inv().apply([*(point - info.position[:2]), 0])
+        assert ahead[0] > 0.0
+
+
+def test_the_covariance_is_that_of_noisy_measurements() -> None:
+    info, rng = anchor(), np.random.default_rng(3)
+    xy = in_front(info, 4.0, 2.0)
+    rows, turns = wrapped(rows_of(info, xy))
+    stated, points, spare = np.empty((2, 2)), np.empty((20000, 2)), np.empty((2, 2))
+    assert place(rows[0], rows[1], turns, HEIGHT, points[0], stated)
+    for point in points:
+        noisy = rows.copy()
+        noisy[:, VALUE] += rng.normal(size=2) * [0.03, 0.1]
+        assert place(noisy[0], noisy[1], turns, HEIGHT, point, spare)
+    np.testing.assert_allclose(np.cov(points.T), stated, rtol=0.05, atol=1e-6)
+    assert np.hypot(*(points.mean(axis=0) - xy)) < 3e-3
+
+
+def test_no_place_inside_the_array_or_above_it() -> None:
+    info = anchor()
+    rows = rows_of(info, in_front(info, 4.0, 0.0))
+    point, cov = np.empty(2), np.empty((2, 2))
+    rows[0, VALUE] = 0.05
+    assert not place(rows[0], rows[1], 0, HEIGHT, point, cov)
+    rows[0, VALUE] = 1.29  # the height difference is 1.3 m
+    assert not place(rows[0], rows[1], 0, HEIGHT, point, cov)
+
+
+def test_turns_end_three_sd_beyond_end_fire() -> None:
+    phase = rows_of(anchor(), np.array([4.0, 4.0]))[1]
+    edge = 8 * math.pi + 0.3
+    for value, turns, expected in (
+        (edge - 8 * math.pi - 1e-9, 4, True),
+        (edge - 8 * math.pi + 1e-9, 4, False),
+        (-edge + 8 * math.pi + 1e-9, -4, True),
+        (-edge + 8 * math.pi - 1e-9, -4, False),
+    ):
+        phase[VALUE] = value
+        assert admissible(phase, turns) is expected
+
+
+def test_the_nearest_turns_stay_admissible() -> None:
+    phase = rows_of(anchor(), np.array([4.0, 4.0]))[1]
+    phase[VALUE] = 1.0
+    assert [nearest_turns(phase, 2 * math.pi * x) for x in (-2.6, -0.4, 0.4, 1.6)] == [-3, 0, 0, 2]
+    assert nearest_turns(phase, 100.0) == 3  # 1 + 8 pi lies beyond
+    assert nearest_turns(phase, -100.0) == -4
+
+
+def test_spawn_opens_the_velocity_and_keeps_the_rest() -> None:
+    info = anchor()
+    xy = in_front(info, 4.0, 2.0)
+    rows, turns = wrapped(rows_of(info, xy))
+    mean, rng = np.arange(8.0), np.random.default_rng(1)
+    A = rng.normal(size=(8, 8))
+    cov = A @ A.T
+    rest = cov[4:, 4:].copy()
+    area = spawn(mean, cov, rows[0], rows[1], turns, 1.5, HEIGHT)
+    np.testing.assert_allclose(mean, [*xy, 0.0, 0.0, 4.0, 5.0, 6.0, 7.0], atol=1e-9)
+    np.testing.assert_array_equal(cov[4:, 4:], rest)
+    np.testing.assert_array_equal(cov[:4, 4:], 0.0)
+    np.testing.assert_array_equal(cov[2:4, 2:4], 2.25 * np.eye(2))
+    assert area == pytest.approx(0.5 * math.log(np.linalg.det(cov[:2, :2])))
+    before = mean.copy()
+    assert spawn(mean, cov, rows[0], rows[1], 9, 1.5, HEIGHT) == -math.inf
+    np.testing.assert_array_equal(mean, before)
+
+
+def test_a_fix_as_linear_rows_has_its_place_and_covariance() -> None:
+    info = anchor()
+    xy = in_front(info, 4.0, 2.0)
+    rows, turns = wrapped(rows_of(info, xy))
+    point, cov = np.empty(2), np.empty((2, 2))
+    place(rows[0], rows[1], turns, HEIGHT, point, cov)
+    rows[1, VALUE] += 2 * math.pi * turns
+    assert to_fix(rows, 1, HEIGHT)
+    assert rows[:, KIND].tolist() == [Kind.LINEAR, Kind.LINEAR]
+    H, h = np.empty((2, 6)), np.empty(6)
+    for i in range(2):
+        predict_row(rows[i], np.zeros(6), HEIGHT, h)
+        H[i] = h
+    np.testing.assert_allclose(np.linalg.solve(H[:, :2], rows[:, VALUE]), xy, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.inv(H[:, :2].T @ H[:, :2]), cov, rtol=1e-9)
+    np.testing.assert_array_equal(H[:, 2:], 0.0)
