@@ -9,8 +9,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters.measurement import linear_rows, rsu_axes, rsu_rows
+from netpos.filters.measurement import (
+    KIND,
+    VALUE,
+    VARIANCE,
+    Kind,
+    linear_rows,
+    rsu_axes,
+    rsu_rows,
+)
 from netpos.filters.motion import NO_BIAS
+from netpos.filters.sigma import innovation_cov, regress
 from netpos.messages.values import (
     Array,
     Field,
@@ -20,8 +29,9 @@ from netpos.messages.values import (
     TrackState,
     Velocity,
 )
-from netpos.tracking import Tracker, TrackerConfig, TrackOutput
-from netpos.tracking.models import pose_state
+from netpos.tracking import Tracker, TrackerConfig, TrackOutput, sector_bank
+from netpos.tracking.engine import GATE
+from netpos.tracking.models import options_of, pose_state
 from netpos.tracking.sectors import Sectors, phase_place, sectors_of
 from scipy.spatial.transform import Rotation
 from scipy.special import logsumexp
@@ -365,3 +375,39 @@ def test_where_a_phase_with_its_range_is_found() -> None:
     assert phase_place(rows[1:]) == -1
     assert phase_place(rows[:1]) == -1
     assert sectors_of(rows[1]) == 11
+
+
+def test_the_weights_that_meet_in_a_sector_add_up() -> None:
+    """Heir is the filter that gives a sector most; a sector nobody explains gets the floor."""
+    phase = rows_at(Walk(np.array([0.8, 4.5]), 0.3, 0.2, 1), 0, 0.1)[1]
+    phase[VALUE] = 0.0
+    with np.errstate(divide="ignore"):
+        gains = np.log(np.zeros((11, 11)))
+        gains[4, 5], gains[5, 5], gains[6, 7] = np.log([0.2, 0.3, 0.5])
+    weights, heirs = np.zeros(11), np.zeros(11, dtype=np.int64)
+    sector_bank._inherit(gains, weights, phase, 1e-4, heirs)
+    expected = np.full(11, 0.5 * 1e-4)
+    expected[5], expected[7] = 0.5, 0.5
+    expected[[0, 10]] = 0.0  # five turns are none of the array's
+    np.testing.assert_allclose(np.exp(weights), expected, rtol=1e-12)
+    assert (heirs[5], heirs[7]) == (5, 6)
+    assert set(np.delete(heirs, [5, 7]).tolist()) == {-1}
+
+
+def test_a_fix_says_as_much_as_range_and_phase_do() -> None:
+    """Where a tangent reaches, both ways to weigh a number of turns agree."""
+    walk = Walk(np.array([0.8, 4.5]), 0.3, 0.2, 1)
+    options = options_of(TrackerConfig(**CONFIG))
+    rows = rows_at(walk, 0, 0.05)
+    turns = round(float(true_values(walk.position)[1][0] - walk.phases[0]) / (2 * math.pi))
+    for off in (0.0, 0.03, -0.05):
+        mean = np.array([0.8 + off, 4.5 - off, *walk.velocity, 0.0, 0.0])
+        L = np.diag([0.03, 0.04, 0.1, 0.1, 1.0, 1.0])
+        own = rows.copy()
+        own[1, KIND], own[1, VALUE] = Kind.UNWRAPPED_PHASE, rows[1, VALUE] + 2 * math.pi * turns
+        innovation, G, E = regress(mean, L, own, 0.0)
+        S = innovation_cov(G, E, own[:, VARIANCE].copy())
+        gate = options[GATE:]
+        expected = sector_bank._evidence(own, innovation, S, gate, np.zeros(2))
+        ours = sector_bank._fix_evidence(mean, L, rows, 1, turns, options)
+        assert ours == pytest.approx(expected, abs=0.1)
