@@ -41,11 +41,11 @@ from netpos.messages.values import Array
 
 
 class SpaceKind(IntEnum):
-    """What a row measures that a planar filter does not take."""
+    """What a row measures that a planar filter does not take; numbered on from ``Kind``."""
 
-    PLACE = 8
-    BODY_VELOCITY = 9
-    BODY_RATE = 10
+    PLACE = 10
+    BODY_VELOCITY = 11
+    BODY_RATE = 12
 
 
 @leaf

@@ -92,7 +92,7 @@ def heading_index(config: TrackerConfig) -> int:
 
 def by_sectors(config: TrackerConfig) -> bool:
     """Whether phase differences are resolved by a bank of filters."""
-    single = config.motion_model not in ("interacting", "rigid_body")
+    single = config.motion_model not in ("interacting", "rigid_body", "strapdown")
     return config.ambiguity == "hypotheses" and config.backend == "compiled" and single
 
 
