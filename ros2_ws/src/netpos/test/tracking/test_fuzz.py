@@ -216,7 +216,8 @@ class Generator:
 
 
 def faults(output: TrackOutput, newest_ns: int, exact: bool = False) -> list[str]:
-    """What is wrong with an output; the covariance of an ``exact`` clock may be 0."""
+    """What is wrong with an output; the covariance of an ``exact`` clock may be 0 but for
+    rounding (1 fs)."""
     status, found = output.status, []
     numbers = [status.nis, status.position_sd_m, status.protection_level_m]
     if not all(map(math.isfinite, numbers)) or status.nis < 0.0 or status.position_sd_m < 0.0:
@@ -240,7 +241,7 @@ def faults(output: TrackOutput, newest_ns: int, exact: bool = False) -> list[str
         blocks["clock"] = clock.cov
     for name, cov in blocks.items():
         try:
-            np.linalg.cholesky(cov + (exact and name == "clock") * np.eye(2) * 1e-300)
+            np.linalg.cholesky(cov + (exact and name == "clock") * np.eye(2) * 1e-30)
         except np.linalg.LinAlgError:
             found.append(f"{name} covariance {cov.tolist()}")
     return found

@@ -42,6 +42,8 @@ def test_bias_sd_by_kind() -> None:
         Kind.COSINE_Z: 0.02,
         Kind.TOA: 0.3,
         Kind.RANGE: 0.3,
+        Kind.PHASE: 0.0,
+        Kind.UNWRAPPED_PHASE: 0.0,
     }
 
 
