@@ -112,14 +112,14 @@ def test_order_and_arguments(graph: Graph, stubs: Stubs, repository: Path, tmp_p
 def test_play_order_and_arguments(
     graph: Graph, stubs: Stubs, repository: Path, tmp_path: Path
 ) -> None:
-    (tmp_path / "recorded").mkdir()
+    recorded = repository / "bags" / "fast_pass"
     script = str(repository / "scripts" / "play_bag.sh")
-    command = [script, str(tmp_path / "recorded"), str(tmp_path / "out"), "5"]
+    command = [script, str(recorded), str(tmp_path / "out"), "5"]
     process = graph.start("play_bag", command)
     assert process.wait() == 0, process.describe()
     assert stubs.stopped() == ["ekf_tracker", "netpos_record"]
     (said,) = [line for line in stubs.notes if line.startswith("netpos_play started")]
-    assert f"started {tmp_path / 'recorded'} --rate 5 --input-only" in said
+    assert f"started {recorded} --rate 5 --input-only" in said
 
 
 @pytest.mark.parametrize("victim", ["netpos_record", "rsu_sensor", "vue_sim"])
