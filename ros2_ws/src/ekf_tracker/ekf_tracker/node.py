@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from netpos.messages import topics
 from netpos.tracking import Tracker, TrackOutput
-from netpos.tracking.warm_up import warm_up
+from netpos.tracking.warm_up import warm_up, warm_up_anchors
 from netpos_msgs.msg import NetworkTrack, RsuInfo, RsuMeasurement
 from netpos_node import CDR, CODEC, LATCHED, STREAM, run
 from netpos_node.estimating import EstimatingNode, spin
@@ -23,9 +23,11 @@ class EkfTrackerNode(EstimatingNode):
     """Feeds a ``Tracker``. Measurements and estimates come and go as bytes."""
 
     def __init__(self, **node_options: Any) -> None:
-        warm_up()  # before the node is seen: whoever sees it may count on it
+        warm_up("")  # before the node is seen: whoever sees it may count on it
         super().__init__("ekf_tracker", **node_options)
         parameters = declare_parameters(self)
+        if parameters.config.network:
+            warm_up(parameters.config.network)
         self._tracker = Tracker(parameters.config)
         self._network = parameters.config.network
         self._begin(self._tracker, publish_tf=parameters.publish_tf)
@@ -46,9 +48,13 @@ class EkfTrackerNode(EstimatingNode):
 
     def _on_rsu_info(self, msg: Any) -> None:
         try:
-            self._tracker.add_rsu(CODEC.rsu_info_from_msg(msg))
+            info = CODEC.rsu_info_from_msg(msg)
+            self._tracker.add_rsu(info)
         except ValueError as error:
             self.get_logger().error(str(error))
+            return
+        if info.baseline_m > 0.0:
+            warm_up_anchors()
 
     def _on_measurement(self, cdr: bytes) -> None:
         self._take_waiting(*self._inputs[0])  # descriptions of RSUs come first

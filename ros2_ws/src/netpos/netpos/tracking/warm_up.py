@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from netpos.messages.values import Field, GroundSpeed, InitialPose, RsuInfo, RsuMeasurement
@@ -9,10 +11,39 @@ from netpos.tracking.config import TrackerConfig
 from netpos.tracking.tracker import Tracker
 
 
-def warm_up() -> None:
-    """Run tiny tracks through every kernel: first fix, prediction, gate, update."""
+def warm_up(network: str | None = None) -> None:
+    """Run tiny tracks through the kernels: first fix, prediction, gate, update.
+
+    network : of the tracker, "" where it takes all; None: every kernel, as at set-up. Those for
+        anchors follow with the first anchor (``warm_up_anchors``): a kernel that is only loaded
+        costs a tracker memory and time, too.
+    """
     _angles_and_ranges()
-    _fixes_of_a_network()
+    if network is None:
+        warm_up_anchors()
+    if network != "":
+        _fixes_of_a_network()
+
+
+@cache
+def warm_up_anchors() -> None:
+    """Two epochs of an ambiguous phase; once in a process."""
+    tracker = Tracker(TrackerConfig(hold_s=0.0, manoeuvre_speed_sd_mps=1.0))
+    tracker.add_rsu(
+        RsuInfo(rsu_id="anchor", position=np.zeros(3), baseline_m=0.2, wavelength_m=0.1)
+    )
+    for k in (1, 2):
+        phase = RsuMeasurement(
+            stamp_ns=k * 100_000_000,
+            rsu_id="anchor",
+            vue_id="warm_up",
+            fields=Field.RANGE | Field.PHASE,
+            range_m=10.0,
+            range_var=0.01,
+            phase_difference_var=0.01,
+        )
+        tracker.add(phase)
+        tracker.process()
 
 
 def _fixes_of_a_network() -> None:
@@ -54,28 +85,8 @@ def _angles_and_ranges() -> None:
             )
             tracker.add(m)
             tracker.process()
-    _hear_an_anchor(tracker)
     speed = GroundSpeed(stamp_ns=500_000_000, vue_id="warm_up", speed_mps=0.1, speed_var=0.01)
     pose = InitialPose(stamp_ns=600_000_000, vue_id="warm_up", position=position, cov=np.eye(3))
     for item in (speed, pose):
         tracker.add(item)
-        tracker.process()
-
-
-def _hear_an_anchor(tracker: Tracker) -> None:
-    """Two epochs of an ambiguous phase, for a device of its own."""
-    tracker.add_rsu(
-        RsuInfo(rsu_id="anchor", position=np.zeros(3), baseline_m=0.2, wavelength_m=0.1)
-    )
-    for k in (1, 2):
-        phase = RsuMeasurement(
-            stamp_ns=k * 100_000_000,
-            rsu_id="anchor",
-            vue_id="warm_up_sectors",
-            fields=Field.RANGE | Field.PHASE,
-            range_m=10.0,
-            range_var=0.01,
-            phase_difference_var=0.01,
-        )
-        tracker.add(phase)
         tracker.process()
