@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 from ekf_tracker.node import EkfTrackerNode
 from nav_msgs.msg import Odometry
 from netpos.bags import BagWriter, codec, typestore
@@ -26,10 +25,10 @@ from netpos.messages.values import (
 from netpos_msgs.msg import ClockState
 from netpos_msgs.msg import TrackStatus as TrackStatusMsg
 from netpos_node import CODEC
+from nodes import Kept, nodes_of
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
-from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import serialize_message
 from rclpy.time import Time
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
@@ -39,32 +38,10 @@ T0 = 1_000_000_000
 PLACES = {"a": (0.0, 10.0), "b": (60.0, -10.0), "c": (120.0, 10.0)}
 
 
-class Kept:
-    """A publisher that keeps what it is given: messages, or their bytes."""
-
-    def __init__(self, kind: Any = None) -> None:
-        self.messages: list[Any] = []
-        self._kind = kind
-
-    def publish(self, msg: Any) -> None:
-        self.messages.append(deserialize_message(msg, self._kind) if self._kind else msg)
-
-
 @pytest.fixture
 def make() -> Iterator[Any]:
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    nodes = []
-
-    def node(**overrides: Any) -> EkfTrackerNode:
-        values = [Parameter(name, value=value) for name, value in overrides.items()]
-        nodes.append(EkfTrackerNode(context=context, parameter_overrides=values))
-        return nodes[-1]
-
-    yield node
-    for one in nodes:
-        one.destroy_node()
-    rclpy.shutdown(context=context)
+    with nodes_of(EkfTrackerNode, DOMAIN) as node:
+        yield node
 
 
 def arrive(node: EkfTrackerNode, topic: str, msg: Any) -> None:

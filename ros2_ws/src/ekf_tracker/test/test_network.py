@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 from ekf_tracker.node import EkfTrackerNode
 from netpos.messages.network_tracks import network_track_from_msg
 from netpos.messages.values import Field, RsuInfo, RsuMeasurement
 from netpos_node import CODEC
-from rclpy.parameter import Parameter
+from nodes import Kept, nodes_of
 from rclpy.serialization import serialize_message
 
 DOMAIN = 44
@@ -25,31 +24,10 @@ SETTINGS = {
 }
 
 
-class Kept:
-    """A publisher that keeps what it is given."""
-
-    def __init__(self) -> None:
-        self.messages: list[Any] = []
-
-    def publish(self, msg: Any) -> None:
-        self.messages.append(msg)
-
-
 @pytest.fixture
 def make() -> Iterator[Any]:
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    nodes = []
-
-    def node(**overrides: Any) -> EkfTrackerNode:
-        values = [Parameter(name, value=value) for name, value in overrides.items()]
-        nodes.append(EkfTrackerNode(context=context, parameter_overrides=values))
-        return nodes[-1]
-
-    yield node
-    for one in nodes:
-        one.destroy_node()
-    rclpy.shutdown(context=context)
+    with nodes_of(EkfTrackerNode, DOMAIN) as node:
+        yield node
 
 
 def fix(rsu: str, t_s: float, vue: str) -> bytes:

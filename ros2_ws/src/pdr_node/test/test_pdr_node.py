@@ -8,15 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 from netpos.inertial.pdr_config import PdrConfig
 from netpos.inertial.pdr_output import StepEvent, StepVelocity
 from netpos.inertial.pdr_values import frame_of, step_value, velocity_value
 from netpos.inertial.steps import StepConfig
 from netpos.messages.values import ImuSample, MagneticSample
 from netpos_node import CODEC
+from nodes import Kept, nodes_of
 from pdr_node.node import PdrNode
-from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 DOMAIN = 36
@@ -24,31 +23,10 @@ G = 9.80665
 T0 = 1_700_000_000_000_000_000
 
 
-class Kept:
-    """A publisher that keeps what it is given."""
-
-    def __init__(self) -> None:
-        self.messages: list[Any] = []
-
-    def publish(self, msg: Any) -> None:
-        self.messages.append(msg)
-
-
 @pytest.fixture
 def make() -> Iterator[Any]:
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    nodes = []
-
-    def node(**overrides: Any) -> PdrNode:
-        values = [Parameter(name, value=value) for name, value in overrides.items()]
-        nodes.append(PdrNode(context=context, parameter_overrides=values))
-        return nodes[-1]
-
-    yield node
-    for one in nodes:
-        one.destroy_node()
-    rclpy.shutdown(context=context)
+    with nodes_of(PdrNode, DOMAIN) as node:
+        yield node
 
 
 def walk(node: PdrNode, magnetic: bool, stop_s: float = 16.0) -> tuple[list[Any], list[Any]]:

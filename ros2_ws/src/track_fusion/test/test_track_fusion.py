@@ -7,15 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 from netpos.messages.network_tracks import network_track_to_msg
 from netpos.messages.values import NetworkTrack
 from netpos_msgs.msg import ClockState, TrackStatus
 from netpos_node import CODEC
-from rclpy.parameter import Parameter
-from rclpy.serialization import deserialize_message
+from nodes import Kept, nodes_of
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 from track_fusion.node import TrackFusionNode
@@ -25,32 +23,10 @@ T0 = 1_000_000_000
 AT_ONCE = {"networks": ["wimax", "wifi"], "hold_s": 0.0, "confirm_s": 0.0, "jerk_density": 0.0}
 
 
-class Kept:
-    """A publisher that keeps what it is given: messages, or their bytes."""
-
-    def __init__(self, kind: Any = None) -> None:
-        self.messages: list[Any] = []
-        self._kind = kind
-
-    def publish(self, msg: Any) -> None:
-        self.messages.append(deserialize_message(msg, self._kind) if self._kind else msg)
-
-
 @pytest.fixture
 def make() -> Iterator[Any]:
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    nodes = []
-
-    def node(**overrides: Any) -> TrackFusionNode:
-        values = [Parameter(name, value=value) for name, value in overrides.items()]
-        nodes.append(TrackFusionNode(context=context, parameter_overrides=values))
-        return nodes[-1]
-
-    yield node
-    for one in nodes:
-        one.destroy_node()
-    rclpy.shutdown(context=context)
+    with nodes_of(TrackFusionNode, DOMAIN) as node:
+        yield node
 
 
 def arrive(node: TrackFusionNode, network: str, t_s: float, x: float, **change: Any) -> None:
