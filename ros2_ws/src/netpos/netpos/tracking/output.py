@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
-from netpos.messages.values import Array, ClockState, Odometry
+from netpos.messages.values import Array, ClockState, Odometry, TrackState
+from netpos.tracking.config import TrackerConfig
 
 # What a planar tracker does not estimate (height, roll, pitch and their rates) is reported with
 # this variance.
@@ -96,3 +97,18 @@ def clock_state(stamp_ns: int, vue_id: str, mean: Array, cov: Array) -> ClockSta
         drift=float(mean[5]) / c,
         cov=cov[4:6, 4:6] / (c * c),
     )
+
+
+def track_state(
+    config: TrackerConfig, stamp_ns: int, last_accepted_ns: int | None, position_sd_m: float
+) -> TrackState:
+    """What a track is worth at ``stamp_ns``; last_accepted_ns : of its last accepted measurement,
+    None before the first fix; position_sd_m : along its worst axis [m], inf where it is not
+    decided."""
+    if last_accepted_ns is None:
+        return TrackState.WAITING
+    if stamp_ns - last_accepted_ns > config.coast_after_s * 1e9:
+        return TrackState.COASTING
+    if position_sd_m > config.initial_position_sd_max_m:
+        return TrackState.INITIALISING
+    return TrackState.TRACKING

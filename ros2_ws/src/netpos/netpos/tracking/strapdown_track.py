@@ -24,7 +24,6 @@ from netpos.messages.values import (
     InitialPose,
     Odometry,
     RsuMeasurement,
-    TrackState,
     TrackStatus,
 )
 from netpos.tracking import output
@@ -273,15 +272,16 @@ class StrapdownTrack:
         self, stamp_ns: int, nis: float, dof: int, sources: tuple[str, ...]
     ) -> TrackOutput:
         state, estimate = self._state, self._state.estimate
-        position_sd, level = 0.0, -1.0
+        position_sd, level, heard_ns = 0.0, -1.0, None
         if estimate is not None:
+            heard_ns = state.last_accepted_ns
             position_sd = output.largest_sd(estimate.cov)
             risk, inflation = self._config.integrity_risk, state.nis_window.inflation()
             level = protection_level(estimate.cov[:2, :2], risk, inflation)
         status = TrackStatus(
             stamp_ns=stamp_ns,
             vue_id=self._vue_id,
-            state=self._track_state(stamp_ns, position_sd),
+            state=output.track_state(self._config, stamp_ns, heard_ns, position_sd),
             nis=nis,
             nis_dof=dof,
             used=len(sources),
@@ -300,15 +300,6 @@ class StrapdownTrack:
         rate = rates[-1, :3] - estimate.nav[13:] if len(rates) else np.zeros(3)
         return odometry_of(stamp, self._vue_id, estimate.nav, estimate.cov, rate,
                            self._config.gyro_noise_density)  # fmt: skip
-
-    def _track_state(self, stamp_ns: int, position_sd: float) -> TrackState:
-        if self._state.estimate is None:
-            return TrackState.WAITING
-        if stamp_ns - self._state.last_accepted_ns > self._config.coast_after_s * 1e9:
-            return TrackState.COASTING
-        if position_sd > self._config.initial_position_sd_max_m:
-            return TrackState.INITIALISING
-        return TrackState.TRACKING
 
 
 def _widen(rows: Array, rsu: Rsu) -> None:

@@ -438,11 +438,8 @@ class Track:
         return TrackOutput(odometry, clock, status, network=self._config.network, track=track)
 
     def _track_state(self, stamp_ns: int, position_sd: float) -> TrackState:
-        if self._state.estimate is None:
-            return TrackState.WAITING
-        if stamp_ns - self._state.last_accepted_ns > self._config.coast_after_s * 1e9:
-            return TrackState.COASTING
-        undecided = not self._state.estimate.decided
-        if undecided or position_sd > self._config.initial_position_sd_max_m:
-            return TrackState.INITIALISING
-        return TrackState.TRACKING
+        estimate = self._state.estimate
+        heard_ns = None if estimate is None else self._state.last_accepted_ns
+        if estimate is not None and not estimate.decided:
+            position_sd = math.inf
+        return output.track_state(self._config, stamp_ns, heard_ns, position_sd)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from netpos.messages.values import Array
-from netpos.tracking import output
+from netpos.messages.values import Array, TrackState
+from netpos.tracking import TrackerConfig, output
 from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 
@@ -130,3 +130,21 @@ def test_largest_sd() -> None:
     assert output.largest_sd(cov) == pytest.approx(expected, rel=1e-12)
     assert output.largest_sd(np.zeros((6, 6))) == 0.0
     assert output.largest_sd(-np.eye(6)) == 0.0  # rounding below a covariance of zero
+
+
+@pytest.mark.parametrize(
+    ("heard_ns", "position_sd", "expected"),
+    [
+        (None, 0.0, TrackState.WAITING),
+        (0, 1.0, TrackState.TRACKING),
+        (0, 1.0001, TrackState.INITIALISING),
+        (-1, 0.0, TrackState.COASTING),
+        (-1, math.inf, TrackState.COASTING),
+        (0, math.inf, TrackState.INITIALISING),
+    ],
+)
+def test_what_a_track_is_worth(
+    heard_ns: int | None, position_sd: float, expected: TrackState
+) -> None:
+    config = TrackerConfig(coast_after_s=2.0, initial_position_sd_max_m=1.0)
+    assert output.track_state(config, 2_000_000_000, heard_ns, position_sd) is expected
