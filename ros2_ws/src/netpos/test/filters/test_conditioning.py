@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from filter_rows import NO_GATE, random_spd
 from netpos.filters import ekf, robust
 from netpos.filters.conditioning import Robust, condition
 from netpos.filters.measurement import (
@@ -28,13 +29,7 @@ from netpos.filters.measurement import (
 from netpos.messages.values import Array
 from scipy.integrate import quad
 
-NO_GATE = np.full(13, np.inf)
 OTHERS = [k for k in Kind if k not in {Kind.TOA, Kind.RANGE}]
-
-
-def random_spd(rng: np.random.Generator, n: int) -> Array:
-    A = rng.normal(size=(n, n))
-    return A @ A.T + 0.1 * np.eye(n)
 
 
 def row(kind: Kind, value: float, variance: float, group: int, origin: Array) -> Array:

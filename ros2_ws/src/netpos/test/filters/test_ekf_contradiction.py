@@ -4,39 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from filter_rows import linear_row
 from netpos.filters import ekf
 from netpos.filters.measurement import (
-    AXES,
-    BIAS,
-    COMMON,
-    GATE_VARIANCE,
     GROUP,
-    HEADING,
-    KIND,
     ORIGIN,
-    ROW_WIDTH,
     VALUE,
-    VARIANCE,
-    Kind,
 )
 from netpos.messages.values import Array
 from scipy.stats import chi2
-
-
-def row(kind: Kind, value: float, variance: float, group: int, origin: Array) -> Array:
-    out = np.zeros(ROW_WIDTH)
-    out[[KIND, VALUE, VARIANCE, GATE_VARIANCE]] = kind, value, variance, variance
-    out[[BIAS, COMMON, GROUP, HEADING]] = -1, -1, group, -1
-    out[ORIGIN:AXES] = origin
-    out[AXES:HEADING] = np.eye(3).reshape(-1)
-    return out
-
-
-def linear_row(h: Array, value: float, variance: float, group: int) -> Array:
-    out = row(Kind.LINEAR, value, variance, group, np.zeros(3))
-    out[ORIGIN:HEADING] = 0.0
-    out[ORIGIN : ORIGIN + 6] = h
-    return out
 
 
 def updated(

@@ -6,17 +6,11 @@ import math
 
 import numpy as np
 import pytest
+from filter_rows import NO_GATE, random_spd, row
 from netpos.filters import ekf, fit, fusion
 from netpos.filters.measurement import (
-    AXES,
-    BIAS,
-    COMMON,
     GATE_VARIANCE,
     GROUP,
-    HEADING,
-    KIND,
-    ORIGIN,
-    ROW_WIDTH,
     VALUE,
     VARIANCE,
     Kind,
@@ -26,22 +20,6 @@ from netpos.filters.measurement import (
 from netpos.messages.values import Array
 from scipy.optimize import brentq, least_squares
 from scipy.stats import chi2
-
-NO_GATE = np.full(13, np.inf)
-
-
-def random_spd(rng: np.random.Generator, n: int) -> Array:
-    A = rng.normal(size=(n, n))
-    return A @ A.T + 0.1 * np.eye(n)
-
-
-def row(kind: Kind, value: float, variance: float, group: int, origin: Array) -> Array:
-    out = np.zeros(ROW_WIDTH)
-    out[[KIND, VALUE, VARIANCE, GATE_VARIANCE]] = kind, value, variance, variance
-    out[[BIAS, COMMON, GROUP, HEADING]] = -1, -1, group, -1
-    out[ORIGIN:AXES] = origin
-    out[AXES:HEADING] = np.eye(3).reshape(-1)
-    return out
 
 
 def scratch(n: int, m: int) -> Array:

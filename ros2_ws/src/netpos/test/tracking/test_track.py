@@ -11,41 +11,15 @@ import pytest
 from netpos.messages.values import (
     Array,
     Field,
-    InitialPose,
     TrackState,
 )
 from netpos.tracking import TrackOutput
 from netpos.tracking.models import gate_thresholds
 from scipy.constants import speed_of_light
 from scipy.stats import chi2
-
-T0 = 1_000_000_000
-
+from track_cases import T0, error, pose, standing, straight
 
 ALL = Field.AZIMUTH | Field.TOA
-
-
-def straight(t_s: float, clock_m: float = 0.0, drift_mps: float = 0.0) -> Array:
-    """East along the street at 8 m/s."""
-    return np.array([8.0 * t_s, 0.0, 8.0, 0.0, clock_m + drift_mps * t_s, drift_mps])
-
-
-def standing(x: float = 40.0, y: float = 2.0) -> Array:
-    return np.array([x, y, 0.0, 0.0, 0.0, 0.0])
-
-
-def pose(t_s: float, x: float, y: float, var: float = 1.0) -> InitialPose:
-    return InitialPose(
-        stamp_ns=T0 + round(t_s * 1e9),
-        vue_id="vue_1",
-        position=np.array([x, y, 0.0]),
-        cov=var * np.eye(3),
-    )
-
-
-def error(output: TrackOutput, truth: Array) -> float:
-    assert output.odometry is not None
-    return float(np.linalg.norm(output.odometry.position[:2] - truth[:2]))
 
 
 def map_velocity(output: TrackOutput) -> Array:

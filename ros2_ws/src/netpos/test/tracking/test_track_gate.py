@@ -8,39 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 from netpos.messages.values import (
-    Array,
     Field,
     GroundSpeed,
-    InitialPose,
     TrackState,
 )
-from netpos.tracking import TrackOutput
-
-T0 = 1_000_000_000
-
+from track_cases import error, pose, standing
 
 ALL = Field.AZIMUTH | Field.TOA
 
 
 STILL = {"accel_density_mps2_sqrthz": 1e-6}
-
-
-def standing(x: float = 40.0, y: float = 2.0) -> Array:
-    return np.array([x, y, 0.0, 0.0, 0.0, 0.0])
-
-
-def pose(t_s: float, x: float, y: float, var: float = 1.0) -> InitialPose:
-    return InitialPose(
-        stamp_ns=T0 + round(t_s * 1e9),
-        vue_id="vue_1",
-        position=np.array([x, y, 0.0]),
-        cov=var * np.eye(3),
-    )
-
-
-def error(output: TrackOutput, truth: Array) -> float:
-    assert output.odometry is not None
-    return float(np.linalg.norm(output.odometry.position[:2] - truth[:2]))
 
 
 def settled(world: Any, feed: Any, fields: Field = ALL, **config: Any) -> Any:

@@ -12,7 +12,6 @@ from netpos.messages.values import (
     Array,
     Field,
     GroundSpeed,
-    InitialPose,
     RsuInfo,
     TrackState,
     Velocity,
@@ -20,12 +19,7 @@ from netpos.messages.values import (
 from netpos.tracking import TrackOutput
 from scipy.constants import speed_of_light
 from scipy.stats import chi2
-
-T0 = 1_000_000_000
-
-
-KNOWN_CLOCK = {"clock_offset_sd_s": 1e-12, "clock_drift_mean": 0.0, "clock_drift_sd": 1e-12}
-
+from track_cases import KNOWN_CLOCK, T0, error, pose, standing, straight
 
 ALL = Field.AZIMUTH | Field.TOA
 
@@ -33,32 +27,9 @@ ALL = Field.AZIMUTH | Field.TOA
 STILL = {"accel_density_mps2_sqrthz": 1e-6}
 
 
-def straight(t_s: float, clock_m: float = 0.0, drift_mps: float = 0.0) -> Array:
-    """East along the street at 8 m/s."""
-    return np.array([8.0 * t_s, 0.0, 8.0, 0.0, clock_m + drift_mps * t_s, drift_mps])
-
-
-def standing(x: float = 40.0, y: float = 2.0) -> Array:
-    return np.array([x, y, 0.0, 0.0, 0.0, 0.0])
-
-
-def pose(t_s: float, x: float, y: float, var: float = 1.0) -> InitialPose:
-    return InitialPose(
-        stamp_ns=T0 + round(t_s * 1e9),
-        vue_id="vue_1",
-        position=np.array([x, y, 0.0]),
-        cov=var * np.eye(3),
-    )
-
-
 def velocity(t_s: float, v: tuple[float, float], var: float = 0.01, **change: Any) -> Velocity:
     values = {"stamp_ns": T0 + round(t_s * 1e9), "vue_id": "vue_1"}
     return Velocity(velocity=np.array(v), cov=var * np.eye(2), **(values | change))
-
-
-def error(output: TrackOutput, truth: Array) -> float:
-    assert output.odometry is not None
-    return float(np.linalg.norm(output.odometry.position[:2] - truth[:2]))
 
 
 def map_velocity(output: TrackOutput) -> Array:
