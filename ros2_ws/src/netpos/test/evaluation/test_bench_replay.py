@@ -1,4 +1,4 @@
-"""What the replay and memory rows count; never how fast they are."""
+"""What the replay, memory and route rows count; never how fast they are."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from netpos.bags import BagReader
-from netpos.evaluation.bench import memory, replay
+from netpos.evaluation.bench import memory, replay, routes
 from netpos.evaluation.bench.common import Row, Unavailable
 from netpos.messages import topics
 from netpos.scenario import load_scenario
@@ -68,3 +68,31 @@ def test_resident_memory_is_of_the_order_of_a_process() -> None:
     except Unavailable as reason:
         pytest.skip(str(reason))
     assert 1e7 < size < 1e10
+
+
+def test_route_rows_scale_the_limit_and_fit_the_growth(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Here:
+        """A pool of this process: (16, 32, 64) routes in 1, 2, 4 s."""
+
+        def __init__(self, *_: object, **__: object) -> None: ...
+        def __enter__(self) -> Here:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+        def submit(self, _: object, counts: tuple[int, ...]) -> Here:
+            assert counts == (16, 32, 64)
+            return self
+
+        def result(self) -> tuple[list[float], float]:
+            return [1.0, 2.0, 4.0], 2.0**29
+
+    monkeypatch.setattr(routes, "ProcessPoolExecutor", Here)
+    duration, memory_row, exponent = routes.route_rows(quick=True)
+    ratios = [row.ratio for row in (duration, memory_row, exponent) if isinstance(row, Row)]
+    assert ratios == pytest.approx([4.0 / (30.0 * 0.064), 0.5, 1.0])
+
+
+def test_routes_are_run_and_their_processes_counted() -> None:
+    seconds, size = routes.run_routes((1, 2))
+    assert len(seconds) == 2
+    assert 5e7 < size < 5e9

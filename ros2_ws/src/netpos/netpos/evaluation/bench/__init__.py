@@ -5,6 +5,7 @@
 ``filters``     against FilterPy and C (``yardstick``), ``stone_soup`` where it is installed
 ``replay``      offline replay against real time and rosbags
 ``memory``      the tracker's core over an hour
+``routes``      Monte Carlo over METIS routes
 ``live``        the running node: latency, load, start
 """
 
@@ -27,6 +28,7 @@ PARTS = {
     "stonesoup": ("stone_soup", "stone_soup_rows"),
     "replay": ("replay", "replay_rows"),
     "memory": ("memory", "memory_rows"),
+    "routes": ("routes", "route_rows"),
     "ready": ("live", "ready_rows"),
     "latency": ("live", "latency_rows"),
     "load": ("live", "load_rows"),
