@@ -23,6 +23,7 @@ from netpos.filters.fusion import (
     is_definite,
     workspace,
 )
+from netpos.filters.gate import leave_odd_out
 from netpos.filters.iteration import (
     bends,
     is_wide,
@@ -286,33 +287,20 @@ def _fuse_used(mean: Array, cov: Array, rows: Array, work: Array) -> float:
 
 @kernel
 def _odd_one_out(rows: Array, n: int, gate_nis: Array, accepted: Array, work: Array) -> int:
-    """Take the group out without which the others agree, where three or more pass one by one but
-    contradict each other; the number of its rows, 0 where there is none."""
+    """``gate.leave_odd_out`` of the rows in the workspace; the number of rows taken out."""
     m = rows.shape[0]
-    cov = work[W_COV : W_COV + n, :n].copy()
-    groups = 0
-    for g in range(int(rows[m - 1, GROUP]) + 1):
-        groups += int(accepted[g])
-    if groups < 3:
-        return 0
-    odd, least, odd_rows = -1, np.inf, 0
-    for g in range(int(rows[m - 1, GROUP]) + 1):
-        if accepted[g] == 0.0:
-            continue
-        keep = (work[W_USE, :m] == 1.0) & (rows[:, GROUP] != g)
-        H = work[W_COV + n : W_COV + n + m, :n][keep]
-        innovation, variance = work[W_INNOVATION, :m][keep], work[W_GATE_VARIANCE, :m][keep]
-        nis = group_nis(cov, innovation, H, variance)
-        if nis < least and nis <= gate_nis[innovation.size]:
-            odd, least = g, nis
-    if odd < 0:
-        return 0
-    accepted[odd] = 0.0
+    H = work[W_COV + n : W_COV + n + m, :n].copy()
+    S = H @ work[W_COV : W_COV + n, :n].copy() @ H.T
     for i in range(m):
-        if int(rows[i, GROUP]) == odd:
+        S[i, i] += work[W_GATE_VARIANCE, i]
+    if not leave_odd_out(rows, work[W_INNOVATION, :m].copy(), S, gate_nis, accepted):
+        return 0
+    taken_out = 0
+    for i in range(m):
+        if work[W_USE, i] == 1.0 and accepted[int(rows[i, GROUP])] == 0.0:
             work[W_USE, i] = 0.0
-            odd_rows += 1
-    return odd_rows
+            taken_out += 1
+    return taken_out
 
 
 @kernel

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netpos.filters.compile import kernel
-from netpos.filters.gate import accepted_rows, gate_groups, joint_nis
+from netpos.filters.gate import gate_groups, select_rows
 from netpos.filters.measurement import (
     GATE_VARIANCE,
     GROUP,
@@ -108,10 +108,9 @@ def correct(
             S[i, j] = _dot(H[j], projected)
         S[i, i] += rows[i, GATE_VARIANCE] + bend
     gate_groups(rows, innovation, S, gate_nis, accepted)
-    index = accepted_rows(rows, accepted)
+    index, nis = select_rows(rows, innovation, S, gate_nis, accepted)
     if index.size == 0:
         return 0.0, 0
-    nis = joint_nis(innovation, S, index)
     prior, error = nav.copy(), np.zeros(ERR)
     posterior = cov
     for _ in range(ITERATIONS):

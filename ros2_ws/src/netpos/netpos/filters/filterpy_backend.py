@@ -166,8 +166,22 @@ def _update(
         keep[members] = passes
     if not keep.any():
         return 0.0, 0
+
+    def together(chosen: Array) -> float:
+        some = rows[chosen]
+        fit = fused(mean, cov, some, some[:, GATE_VARIANCE], height_m)
+        return float(fit.mahalanobis**2)
+
+    nis = together(keep)
+    groups = np.unique(rows[keep, GROUP])
+    if keep.sum() < len(gate_nis) and nis > gate_nis[keep.sum()] and groups.size > 2:
+        rests = [(together(keep & (rows[:, GROUP] != g)), g) for g in groups]
+        best = [(d, g) for d, g in rests if d <= gate_nis[(keep & (rows[:, GROUP] != g)).sum()]]
+        if best:
+            nis, odd = min(best)
+            accepted[int(odd)] = 0.0
+            keep &= rows[:, GROUP] != odd
     kept = rows[keep]
-    nis = fused(mean, cov, kept, kept[:, GATE_VARIANCE], height_m).mahalanobis ** 2
     posterior = fused(mean, cov, kept, kept[:, VARIANCE], height_m)
     mean[:], cov[:] = posterior.x, posterior.P
     return float(nis), int(keep.sum())

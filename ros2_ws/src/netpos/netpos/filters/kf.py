@@ -7,7 +7,7 @@ import numpy as np
 
 from netpos.filters.compile import kernel
 from netpos.filters.factor import factor
-from netpos.filters.gate import accepted_rows, gate_groups, joint_nis
+from netpos.filters.gate import gate_groups, select_rows
 from netpos.filters.measurement import GATE_VARIANCE, GROUP, KIND, VARIANCE, Kind, linearise
 from netpos.filters.motion import N_CORE
 from netpos.messages.values import Array
@@ -27,7 +27,8 @@ def update(
     accepted: Array,
     gain_floor: Array,
 ) -> tuple[float, int]:
-    """One epoch, in place: gate each group as a whole, fuse what passed row by row.
+    """One epoch, in place: gate each group as a whole and all together, fuse what passed row by
+    row.
 
     A group that holds a row other than ``LINEAR`` is rejected. Nothing changes where nothing
     passes.
@@ -68,10 +69,9 @@ def update_shared(
     for i in range(m):
         if int(rows[i, KIND]) != Kind.LINEAR:
             accepted[int(rows[i, GROUP])] = 0.0
-    index = accepted_rows(rows, accepted)
+    index, nis = select_rows(rows, innovation, S, gate_nis, accepted)
     if index.size == 0:
         return 0.0, 0
-    nis = joint_nis(innovation, S, index)
     start = mean.copy()
     for i in index:
         residual = innovation[i] - np.dot(H[i], mean - start)

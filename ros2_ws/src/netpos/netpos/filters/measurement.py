@@ -12,7 +12,8 @@ array a compiled kernel can take:
     forward and left count only where there is a heading), BLOCKED (probability that the path was
     blocked; 0: the option's)
 
-For ``LINEAR`` rows the first six entries of ORIGIN and AXES hold H of the six core states.
+For ``LINEAR`` rows the first six entries of ORIGIN and AXES hold H of the six core states; the
+position in it is that of the antenna.
 With d = p - origin and u = axes d:
 
     AZIMUTH    atan2(u_y, u_x)                          fokin2020:eq.13, 42
@@ -144,14 +145,21 @@ def direction(row: Array, dx: float, dy: float, dz: float) -> tuple[float, float
 
 
 @leaf
+def _turned_lever(row: Array, mean: Array) -> tuple[float, float]:
+    """Lever arm of a row with a heading, in map."""
+    heading = mean[int(row[HEADING])]
+    c, s = math.cos(heading), math.sin(heading)
+    return c * row[LEVER] - s * row[LEVER + 1], s * row[LEVER] + c * row[LEVER + 1]
+
+
+@leaf
 def _from_rsu(row: Array, mean: Array, height_m: float, h: Array) -> float:
     """Quantities of the offset between the RSU and the device's antenna."""
     x, y = mean[0], mean[1]
     heading = int(row[HEADING])
     lx = ly = 0.0
     if heading >= 0:
-        c, s = math.cos(mean[heading]), math.sin(mean[heading])
-        lx, ly = c * row[LEVER] - s * row[LEVER + 1], s * row[LEVER] + c * row[LEVER + 1]
+        lx, ly = _turned_lever(row, mean)
     dx = x + lx - row[ORIGIN]
     dy = y + ly - row[ORIGIN + 1]
     dz = height_m + row[LEVER + 2] - row[ORIGIN + 2]
@@ -184,6 +192,10 @@ def predict_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
         for i in range(6):
             h[i] = row[ORIGIN + i]
             value += h[i] * mean[i]
+        if row[HEADING] >= 0.0:
+            lx, ly = _turned_lever(row, mean)
+            value += h[0] * lx + h[1] * ly
+            h[int(row[HEADING])] = h[1] * lx - h[0] * ly
     elif kind == Kind.SPEED:
         value = math.sqrt(mean[2] * mean[2] + mean[3] * mean[3])
         h[2] = mean[2] / max(value, 1e-6)
@@ -219,6 +231,10 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
         return 0.0
     dx = mean[0] - row[ORIGIN]
     dy = mean[1] - row[ORIGIN + 1]
+    if row[HEADING] >= 0.0:
+        lx, ly = _turned_lever(row, mean)
+        dx += lx
+        dy += ly
     dz = height_m + row[LEVER + 2] - row[ORIGIN + 2]
     rho2 = dx * dx + dy * dy
     r2 = max(rho2 + dz * dz, 1e-6)
@@ -333,8 +349,8 @@ def rsu_rows(
     coupling: Coupling = UNCOUPLED,
     heading: int = -1,
 ) -> Array:
-    """Rows (m, ROW_WIDTH) of one RSU measurement; a position fix becomes two decorrelated LINEAR
-    rows.
+    """Rows (m, ROW_WIDTH) of one RSU measurement; a position fix of its antenna becomes two
+    decorrelated LINEAR rows.
 
     axes : (9,) of ``rsu_axes``
     heading : state index of the device's heading, by which its lever arm turns; -1: none
@@ -358,6 +374,7 @@ def rsu_rows(
         _place_antennas(rows, info, array_direction(axes))
     if int(m.fields) & _POSITION:
         fix = linear_rows(m.position[:2], m.position_cov[:2, :2], np.eye(2, 6), group)
+        fix[:, HEADING:BLOCKED] = heading, *m.lever_arm
         rows = np.vstack([rows, fix])
     return rows
 

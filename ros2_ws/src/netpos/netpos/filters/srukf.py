@@ -20,7 +20,7 @@ import numpy as np
 
 from netpos.filters.compile import kernel
 from netpos.filters.factor import factor
-from netpos.filters.gate import accepted_rows, gate_groups, joint_nis
+from netpos.filters.gate import gate_groups, select_rows
 from netpos.filters.measurement import GATE_VARIANCE, VARIANCE
 from netpos.filters.motion import noise
 from netpos.filters.sigma import innovation_cov, move, regress
@@ -112,10 +112,9 @@ def update(
     innovation, G, E = regress(mean, spread, rows, height_m)
     S = innovation_cov(G, E, rows[:, GATE_VARIANCE].copy())
     gate_groups(rows, innovation, S, gate_nis, accepted)
-    index = accepted_rows(rows, accepted)
+    index, nis = select_rows(rows, innovation, S, gate_nis, accepted)
     if index.size == 0:
         return 0.0, 0
-    nis = joint_nis(innovation, S, index)
     fuse(mean, spread, innovation[index], G[index], E[index], rows[index, VARIANCE])
     return nis, index.size
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from netpos.filters.compile import kernel
 from netpos.filters.factor import factor, solve_factored
-from netpos.filters.gate import accepted_rows, gate_groups, joint_nis
+from netpos.filters.gate import gate_groups, select_rows
 from netpos.filters.measurement import GATE_VARIANCE, VARIANCE
 from netpos.filters.motion import add_noise
 from netpos.filters.sigma import innovation_cov, move, regress
@@ -38,7 +38,8 @@ def update(
     mean: Array, cov: Array, rows: Array, height_m: float, gate_nis: Array, accepted: Array
 ) -> tuple[float, int]:
     """One epoch, in place: sigma points redrawn from the prediction, each group of rows gated as a
-    whole, one joint update with what passed. Nothing changes where nothing passes.
+    whole and all together, one joint update with what passed. Nothing changes where nothing
+    passes.
 
     rows : (m, ROW_WIDTH), rows of a group adjacent
     gate_nis : (d + 1,) largest accepted squared Mahalanobis distance for d degrees of freedom
@@ -50,10 +51,9 @@ def update(
     innovation, G, E = regress(mean, L, rows, height_m)
     S = innovation_cov(G, E, rows[:, GATE_VARIANCE].copy())
     gate_groups(rows, innovation, S, gate_nis, accepted)
-    index = accepted_rows(rows, accepted)
+    index, nis = select_rows(rows, innovation, S, gate_nis, accepted)
     if index.size == 0:
         return 0.0, 0
-    nis = joint_nis(innovation, S, index)
     fuse(mean, cov, L, innovation[index], G[index], E[index], rows[index, VARIANCE])
     return nis, index.size
 

@@ -187,6 +187,72 @@ def test_jacobian_in_the_heading_is_the_difference(
     )
 
 
+@pytest.mark.parametrize("yaw", [-3.0, 0.4, 2.0])
+def test_a_position_fix_is_that_of_the_antenna(yaw: float) -> None:
+    """Its Jacobian is the difference, and its decorrelated innovation that of the antenna."""
+    cov = np.array([[2.0, 0.7, 0.0], [0.7, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    m = RsuMeasurement(
+        stamp_ns=1,
+        rsu_id="r",
+        vue_id="v",
+        fields=Field.POSITION,
+        position=np.array([7.0, 5.5, 0.0]),
+        position_cov=cov,
+        lever_arm=(1.5, -0.7, 0.4),
+    )
+    info = RsuInfo(rsu_id="r", position=np.zeros(3))
+    rows = rsu_rows(m, info, rsu_axes(info), 0, heading=6)
+    mean = np.array([6.0, 5.0, 0.0, 0.0, 3.0, 0.0, yaw, 0.0])
+    innovation, H = linearise(rows, mean, 1.2)
+    step = 1e-6 * np.eye(8)
+    for column in range(8):
+        ahead, _ = linearise(rows, mean + step[column], 1.2)
+        behind, _ = linearise(rows, mean - step[column], 1.2)
+        np.testing.assert_allclose(H[:, column], (behind - ahead) / 2e-6, atol=1e-7)
+    assert np.abs(H[:, 6]).max() > 0.1
+    c, s = math.cos(yaw), math.sin(yaw)
+    off = m.position[:2] - (6.0 + 1.5 * c + 0.7 * s, 5.0 + 1.5 * s - 0.7 * c)
+    assert innovation @ innovation == pytest.approx(off @ np.linalg.solve(cov[:2, :2], off))
+    planar = rsu_rows(m, info, rsu_axes(info), 0)  # no heading: the fix is the device's
+    off = m.position[:2] - mean[:2]
+    bare = linearise(planar, mean, 1.2)[0]
+    assert bare @ bare == pytest.approx(off @ np.linalg.solve(cov[:2, :2], off))
+
+
+@pytest.mark.parametrize("filter_name", ["ekf", "iekf", "ukf", "srukf", "kf"])
+def test_fixes_of_two_antennas_tell_the_heading(feed: Any, filter_name: str) -> None:
+    """Two metres apart, fixed to 0.1 m each, on a circle."""
+    antennas = {"a": (1.0, 0.0, 0.0), "b": (-1.0, 0.0, 0.0)}
+    rng, sd = np.random.default_rng(3), 0.1
+    target, reports = tracker(filter=filter_name), []
+    for name in antennas:
+        target.add_rsu(RsuInfo(rsu_id=name, position=np.zeros(3)))
+    for k in range(100):
+        x, y, yaw = circle(0.1 * k)
+        c, s = math.cos(yaw), math.sin(yaw)
+        fixes = [
+            RsuMeasurement(
+                stamp_ns=T0_NS + k * 10**8,
+                rsu_id=name,
+                vue_id="vue_1",
+                expected=2,
+                fields=Field.POSITION,
+                position=np.array([x + c * arm[0], y + s * arm[0], 0.0])
+                + sd * np.append(rng.normal(size=2), 0.0),
+                position_cov=sd**2 * np.eye(3),
+                lever_arm=arm,
+            )
+            for name, arm in antennas.items()
+        ]
+        (report,) = feed(target, fixes)
+        reports.append((0.1 * k, report))
+    place, turned = errors(circle, reports)
+    alone = sd / math.sqrt(2.0)  # of the middle in one axis, and of the heading over 1 m
+    assert np.abs(turned).max() < 4.0 * alone
+    assert np.sqrt(np.mean(turned[20:] ** 2)) < 0.8 * alone
+    assert np.sqrt(np.mean(place[20:] ** 2)) < 0.8 * alone
+
+
 @pytest.mark.parametrize("yaw", [0.0, 1.3, math.pi - 1e-3, -math.pi + 1e-3, -1.9])
 @pytest.mark.parametrize("filter_name", ["ekf", "iekf", "ukf", "srukf"])
 def test_heading_of_a_device_at_rest(feed: Any, filter_name: str, yaw: float) -> None:

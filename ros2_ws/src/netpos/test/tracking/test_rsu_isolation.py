@@ -56,12 +56,19 @@ def truth(t_s: float) -> Array:
 
 
 def drive(
-    world: Any, lie: Lie, fields: Field, start_s: float, honest_s: float, seed: int, end_s: float
+    world: Any,
+    lie: Lie,
+    fields: Field,
+    start_s: float,
+    honest_s: float,
+    seed: int,
+    end_s: float,
+    **config: Any,
 ) -> tuple[Tracker, list[tuple[float, TrackOutput]], dict[float, RsuReport]]:
     """Outputs with the errors, and what is said of RSU b second by second."""
     world.rng = np.random.default_rng(seed)
     world.angle_sd, world.range_sd = math.radians(0.8), 0.4
-    tracker = world.tracker()
+    tracker = world.tracker(**config)
     found, reports = [], {}
     for k in range(round(end_s / STEP_S)):
         t = STEP_S * k
@@ -100,6 +107,34 @@ def test_a_lie_is_found_named_isolated_and_forgiven(world: Any, name: str, seed:
     assert last.rejected["isolated_rsu"] > 50
     assert "track_lost" not in last.rejected
     assert last.state is TrackState.TRACKING
+
+
+@pytest.mark.parametrize("filter_name", ["ekf", "ukf", "srukf"])
+@pytest.mark.parametrize("name", LIES)
+def test_every_filter_leaves_a_liar_out(world: Any, name: str, filter_name: str) -> None:
+    """The clock steps while its drift is still unknown: every time of arrival passes alone."""
+    lie, fields, words = LIES[name]
+    start_s, config = 0.5, {"filter": filter_name, "clock_walk_density": 1e-6}
+    _, found, reports = drive(world, lie, fields, start_s, 99.0, 5, 12.0, **config)
+    settled = [error for error, o in found if o.status.stamp_ns > T0 + 2 * 10**9]
+    assert max(settled) < 1.0
+    assert found[-1][1].status.rejected["gate"] > 0
+    assert "track_lost" not in found[-1][1].status.rejected
+    assert reports[12.0].state is RsuState.ISOLATED
+    assert re.search(words, reports[12.0].text), reports[12.0].text
+
+
+def moved(m: RsuMeasurement) -> RsuMeasurement:
+    return replace(m, position=m.position + np.array([5.0, -5.0, 0.0]))
+
+
+@pytest.mark.parametrize("filter_name", ["kf", "iekf"])
+def test_a_network_whose_fixes_are_off(world: Any, filter_name: str) -> None:
+    config = {"filter": filter_name, "accel_density_mps2_sqrthz": 20.0}
+    drift = Field.POSITION
+    _, found, reports = drive(world, moved, drift, START_S, 99.0, 1, 16.0, **config)
+    assert max(error for error, o in found if o.status.stamp_ns > T0 + 2 * 10**9) < 1.5
+    assert reports[16.0].state is RsuState.ISOLATED
 
 
 @pytest.mark.parametrize("name", ["range", "azimuth", "clock"])
