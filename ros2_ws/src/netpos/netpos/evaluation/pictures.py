@@ -16,7 +16,7 @@ from scipy.stats import chi2
 
 from netpos.evaluation.evaluate import Evaluation, VueEvaluation
 from netpos.evaluation.metrics import NS, clock_error_series
-from netpos.evaluation.pairing import wrap_angle
+from netpos.evaluation.pairing import Trajectory, wrap_angle
 from netpos.messages.values import Array
 
 FORMATS = (".png", ".svg", ".pdf")
@@ -166,9 +166,14 @@ def _draw_track(
     )
     axes.plot(*estimate.position[0, :2], "o", mfc="white", mec=colour, ms=6, zorder=4)
     shown = estimate.take(np.unique(np.linspace(0, n - 1, ELLIPSES_PER_TRACK).astype(np.int64)))
+    return handles + _draw_ellipses(axes, shown, colour, extent_m)
+
+
+def _draw_ellipses(axes: Axes, shown: Trajectory, colour: str, extent_m: float) -> list[Line2D]:
+    """The 95 % ellipses of some poses and their legend; none where no covariance is known."""
     cov = shown.position_cov[:, :2, :2]
     if not cov.any():
-        return handles
+        return []
     major, minor, angle = ellipse_axes(cov)
     enlarged = magnification(major, extent_m)
     axes.add_collection(
@@ -185,19 +190,17 @@ def _draw_track(
             zorder=3.5,
         )
     )
-    handles.append(
-        Line2D(
-            [],
-            [],
-            marker="o",
-            ls="",
-            ms=9,
-            mfc=colour + "1C",
-            mec=colour + "A0",
-            label="95 % ellipse" if enlarged == 1 else f"95 % ellipse × {enlarged}",
-        )
+    handle = Line2D(
+        [],
+        [],
+        marker="o",
+        ls="",
+        ms=9,
+        mfc=colour + "1C",
+        mec=colour + "A0",
+        label="95 % ellipse" if enlarged == 1 else f"95 % ellipse × {enlarged}",
     )
-    return handles
+    return [handle]
 
 
 def draw_map(evaluation: Evaluation) -> Figure:

@@ -59,6 +59,13 @@ class TrackerConfig:
     accel_density_mps2_sqrthz: float = _real(
         1.0, 1e-6, 1e3, "continuous: density of the white acceleration [m/s^2/sqrt(Hz)]"
     )
+    steady_accel_density_mps2_sqrthz: float = _real(
+        0.0,
+        0.0,
+        1e3,
+        "continuous: the same while velocities in map are reported, well known and unchanged; not"
+        " with an IMU; 0: not looked at",
+    )
     accel_sd_mps2: float = _real(1.0, 1e-6, 1e3, "white_acceleration: acceleration sd per step")
     velocity_step_sd_mps: float = _real(0.1, 1e-9, 1e3, "werner: velocity sd per step")
     drift_step_sd: float = _real(
@@ -247,6 +254,8 @@ class TrackerConfig:
             raise ValueError("backend filterpy has no motion_model interacting; use compiled")
         if self.motion_model == "interacting" and self.fixed_lag_s > 0.0:
             raise ValueError("fixed_lag_s must be 0 with motion_model interacting")
+        if self.steady_accel_density_mps2_sqrthz > 0.0:
+            self._check_steady()
         plain = self.robust == "none" and self.nlos_probability == 0.0
         if not plain and (self.backend == "filterpy" or self.motion_model == "interacting"):
             raise ValueError(
@@ -256,6 +265,15 @@ class TrackerConfig:
         if self.motion_model == "interacting" and self.filter not in ("ekf", "iekf"):
             raise ValueError(
                 f"motion_model interacting takes filter ekf or iekf, not {self.filter!r}"
+            )
+
+    def _check_steady(self) -> None:
+        several = self.motion_model in ("interacting", "constant_acceleration")
+        if self.process_noise != "continuous" or several:
+            raise ValueError(
+                "steady_accel_density_mps2_sqrthz needs process_noise continuous and one motion"
+                f" model moved by white acceleration, got {self.process_noise!r} and"
+                f" {self.motion_model!r}; set it to 0"
             )
 
     def _check_strapdown(self) -> None:

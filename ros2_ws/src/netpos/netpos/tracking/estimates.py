@@ -40,6 +40,9 @@ class Estimate(Protocol):
     def drive(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
         """Set what the IMU integrated since ``stamp_ns``, and how good its yaw rate was."""
 
+    def shake(self, accel_density: float) -> None:
+        """Set the density of the white acceleration [m/s^2/sqrt(Hz)] from ``stamp_ns`` on."""
+
     def predict(self, stamp_ns: int, bias: Array) -> None:
         """Move to ``stamp_ns``."""
 
@@ -112,6 +115,9 @@ class Single:
         self._motion[Parameter.YAW_INCREMENT] = yaw_rad
         self._motion[Parameter.SPEED_INCREMENT] = speed_mps
         self._motion[Parameter.GYRO] = gyro_density
+
+    def shake(self, accel_density: float) -> None:
+        self._motion[Parameter.ACCEL] = accel_density
 
     def predict(self, stamp_ns: int, bias: Array) -> None:
         dt = (stamp_ns - self.stamp_ns) * 1e-9
@@ -257,6 +263,9 @@ class Interacting(_Looks):
     def drive(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
         raise NotImplementedError("interacting models take no IMU")
 
+    def shake(self, accel_density: float) -> None:
+        raise NotImplementedError("interacting models have several accelerations")
+
     def _move(self, stamp_ns: int, bias: Array) -> None:
         dt = (stamp_ns - self.stamp_ns) * 1e-9
         state = self._state()
@@ -322,6 +331,9 @@ class Reference(_Looks):
         self._motion[Parameter.YAW_INCREMENT] = yaw_rad
         self._motion[Parameter.SPEED_INCREMENT] = speed_mps
         self._motion[Parameter.GYRO] = gyro_density
+
+    def shake(self, accel_density: float) -> None:
+        self._motion[Parameter.ACCEL] = accel_density
 
     def _note_jump(self, sd: float, unheard_s: float) -> None:
         self._motion[Parameter.JUMP_SPEED] = sd

@@ -179,8 +179,7 @@ def resolve(
         j = leader if k == 0 else (k - 1 if k <= leader else k)
         if weights[j] == -math.inf:
             continue
-        own[:] = rows
-        own[at, VALUE] += TWO_PI * (j - weights.size // 2)
+        _unwrap(rows, at, j - weights.size // 2, own)
         parent = int(heir_of[j])
         if parent >= 0:
             means[j], spreads[j] = old_means[parent], old_spreads[parent]
@@ -190,17 +189,39 @@ def resolve(
         lost = parent < 0 or accepted[j, group] == 0.0
         if j != leader and lost and accepted[leader, group] == 1.0:
             means[j], spreads[j] = old_means[heir_of[leader]], old_spreads[heir_of[leader]]
-            own[:] = rows
-            own[at, VALUE] += TWO_PI * (j - weights.size // 2)
+            _unwrap(rows, at, j - weights.size // 2, own)
             heir_of[j] = -1
-            if _put(means[j], spreads[j], own, at, options):
-                _take_rest(means[j], spreads[j], own, group, options, accepted[j], work)
-            else:
+            if not _start_over(means[j], spreads[j], own, at, options, accepted[j], work):
                 weights[j] = -math.inf
         elif parent < 0:
             weights[j] = -math.inf
     normalise(weights, floor)
     rows[at, KIND] = _WRAPPED
+
+
+@kernel
+def _unwrap(rows: Array, at: int, turns: int, own: Array) -> None:
+    """``own`` becomes ``rows`` with the phase ``rows[at]`` in the sector of ``turns``."""
+    own[:] = rows
+    own[at, VALUE] += TWO_PI * turns
+
+
+@kernel
+def _start_over(
+    mean: Array,
+    spread: Array,
+    own: Array,
+    at: int,
+    options: Array,
+    accepted: Array,
+    work: Array,
+) -> bool:
+    """Place a filter anew by range and phase and update it with the rest; False where they have no
+    place."""
+    if not _put(mean, spread, own, at, options):
+        return False
+    _take_rest(mean, spread, own, int(own[at, GROUP]), options, accepted, work)
+    return True
 
 
 @kernel
@@ -241,8 +262,8 @@ def _fix_evidence(
     mean: Array, L: Array, rows: Array, at: int, turns: int, options: Array
 ) -> float:
     """Log likelihood of the rows with range and phase taken as the fix they give."""
-    own = rows.copy()
-    own[at, VALUE] += TWO_PI * turns
+    own = np.empty_like(rows)
+    _unwrap(rows, at, turns, own)
     if not to_fix(own, at, options[Option.HEIGHT]):
         return -math.inf
     innovation, G, E = regress(mean, L, own, options[Option.HEIGHT])

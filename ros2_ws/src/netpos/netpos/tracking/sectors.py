@@ -182,6 +182,9 @@ class Sectors:
         self._motion[Parameter.SPEED_INCREMENT] = speed_mps
         self._motion[Parameter.GYRO] = gyro_density
 
+    def shake(self, accel_density: float) -> None:
+        self._motion[Parameter.ACCEL] = accel_density
+
     def _advance(self, stamp_ns: int, jump_sd: float, unheard_s: float, bias: Array) -> None:
         dt = (stamp_ns - self.stamp_ns) * 1e-9
         sector_bank.advance(

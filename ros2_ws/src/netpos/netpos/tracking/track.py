@@ -27,6 +27,7 @@ from netpos.messages.values import (
     RsuMeasurement,
     TrackState,
     TrackStatus,
+    Velocity,
 )
 from netpos.tracking import estimates, output
 from netpos.tracking.batch import Batch, Source, batch_of, mostly_accepted, velocity_inflation
@@ -47,6 +48,7 @@ from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sectors import Sectors
 from netpos.tracking.sequencer import Epoch, Item
 from netpos.tracking.smoothing import FixedLag, Posterior
+from netpos.tracking.steadiness import Steadiness
 
 _IMU_HOLE_S = 0.05
 _LEVEL_MAX_M = 1e6
@@ -77,6 +79,7 @@ class _State:
     initialiser: Initialiser
     blockage: Blockage
     phase_start: PhaseStart
+    steadiness: Steadiness
     segment: int = 0
     estimate: Estimate | None = None
     own: OwnNoise | None = None
@@ -104,6 +107,7 @@ class _State:
         twin.nis_window = self.nis_window.copy()
         twin.rejected = self.rejected.copy()
         twin.velocity_ns = self.velocity_ns.copy()
+        twin.steadiness = self.steadiness.copy()
         return twin
 
 
@@ -141,6 +145,7 @@ class Track:
             Initialiser(self._config),
             Blockage.of(self._config),
             PhaseStart(self._config),
+            Steadiness(self._config),
         )
 
     @property
@@ -298,7 +303,7 @@ class Track:
     def _update(self, stamp_ns: int, batch: Batch) -> tuple[float, int, tuple[str, ...]]:
         state = self._state
         state.estimate = with_sectors(self._config, state.estimate, batch.rows)
-        estimate = self._prepare(stamp_ns)
+        estimate = self._prepare(stamp_ns, batch.items)
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
         state.blockage.expect(batch)
         nis, dof, accepted = estimate.step(
@@ -325,8 +330,9 @@ class Track:
             self._forget()
         return nis, dof, sources
 
-    def _prepare(self, stamp_ns: int) -> Estimate:
-        """The estimate with the biases heard of and the IMU up to ``stamp_ns``, not yet moved."""
+    def _prepare(self, stamp_ns: int, items: tuple[Source, ...] = ()) -> Estimate:
+        """The estimate with the biases heard of, the IMU up to ``stamp_ns`` and what velocities
+        say of its motion, not yet moved."""
         estimate = self._state.estimate
         assert estimate is not None
         if estimate.mean.size < self._state.biases.first + len(self._state.biases.sd):
@@ -335,6 +341,10 @@ class Track:
             yaw, speed, uncovered_s = self.imu.increments(estimate.stamp_ns, stamp_ns)
             blind = uncovered_s > _IMU_HOLE_S
             estimate.drive(yaw, speed, _BLIND_GYRO if blind else self._config.gyro_noise_density)
+        velocities = [item for item in items if isinstance(item, Velocity)]
+        density = self._state.steadiness.density(stamp_ns, velocities)
+        if density is not None:
+            estimate.shake(density)
         return estimate
 
     def _note_fit(

@@ -141,6 +141,21 @@ def follow(
     runs, bends = _geometry(xy, corner_radius_m, pauses)
     stops = [i for i in range(len(xy)) if pauses[i] > 0]
     breaks = sorted({0, len(xy) - 1, *stops})
+    pieces, clock = _walk(runs, bends, breaks, pauses, speed_mps, acceleration_mps2)
+    sharp = any(abs(bends[i]) > _STRAIGHT_RAD and pauses[i] == 0 for i in range(len(xy)))
+    abrupt = bool(stops) and acceleration_mps2 is None
+    return Motion(pieces, clock, smooth=not (sharp or abrupt), hills=hills)
+
+
+def _walk(
+    runs: list[list[_Segment]],
+    bends: list[float],
+    breaks: list[int],
+    pauses: list[float],
+    speed: float,
+    acceleration: float | None,
+) -> tuple[list[_Piece], float]:
+    """Pieces from break to break, where the motion begins, stands or ends, and their duration."""
     pieces: list[_Piece] = []
     clock = 0.0
     for a, b in itertools.pairwise(breaks):
@@ -150,17 +165,15 @@ def follow(
             clock = _stand(pieces, clock, (first.x, first.y, first.yaw), 0.0, pauses[0])
         phases = _phases(
             sum(s.length for s in segments),
-            speed_mps,
-            acceleration_mps2,
+            speed,
+            acceleration,
             ramp_up=pauses[a] > 0,
             ramp_down=pauses[b] > 0,
         )
         clock = _travel(pieces, clock, segments, phases)
         if pauses[b] > 0:
             clock = _stand(pieces, clock, _end(segments[-1]), bends[b], pauses[b])
-    sharp = any(abs(bends[i]) > _STRAIGHT_RAD and pauses[i] == 0 for i in range(len(xy)))
-    abrupt = bool(stops) and acceleration_mps2 is None
-    return Motion(pieces, clock, smooth=not (sharp or abrupt), hills=hills)
+    return pieces, clock
 
 
 def _check(

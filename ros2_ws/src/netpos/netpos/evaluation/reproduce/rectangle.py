@@ -12,24 +12,23 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from netpos.evaluation.bounds import bound_covariances
 from netpos.evaluation.reproduce.experiment import VUE
 from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
 from netpos.evaluation.reproduce.steps import (
     StepErrors,
-    reported_velocity,
+    reported,
     steps_of,
     velocity_rows,
 )
 from netpos.filters.measurement import GROUP
 from netpos.filters.motion import NO_BIAS
-from netpos.messages.values import Array, Velocity
+from netpos.messages.values import Array
 from netpos.radio.noise import generator
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.schema import RectangleRoute
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.models import motions_of, pose_state
 from netpos.tracking.phase_start import PhaseStart
+from netpos.tracking.steadiness import Steadiness
 
 Ints = npt.NDArray[np.int64]
 
@@ -98,7 +97,6 @@ class Setup:
         self.stamps_ns = beacons.stamp_ns
         self.times_s = (beacons.stamp_ns - beacons.stamp_ns[0]) / NS
         self.truth: Array = beacons.position[:, :2]
-        self.velocity: Array = beacons.velocity
         route = scenario.devices[0].route
         assert isinstance(route, RectangleRoute)
         points = route.waypoints(generator(0, ""))
@@ -123,14 +121,17 @@ class Setup:
         mean, cov = np.full((n, 6), np.nan), np.full((n, 6, 6), np.nan)
         decided, nis, dof = np.zeros(n, dtype=bool), np.zeros(n), np.zeros(n)
         start, estimate, rejected, last_ns = PhaseStart(self.config), None, 0, 0
+        steadiness = Steadiness(self.config)
         for k, stamp in enumerate(self.stamps_ns.tolist()):
             own = rows[k] if self.heard[k] else _alone(rows[k, 2:])
+            velocity = reported(stamp, own[-2:])
+            density = steadiness.density(stamp, [velocity])
             if estimate is None:
-                velocity = np.round(reported_velocity(own[-2:]), 12)  # equal within a step
-                item = Velocity(stamp_ns=stamp, vue_id=VUE, velocity=velocity, cov=np.eye(2))
-                start.hear(item)
+                start.hear(velocity)
                 estimate = start.add(stamp, own, np.zeros(len(own)))
             else:
+                if density is not None:
+                    estimate.shake(density)
                 unheard_s = (stamp - last_ns) / NS
                 nis[k], dof[k], taken = estimate.step(stamp, unheard_s, rejected, own, NO_BIAS)
                 rejected = 0 if 2 * taken.sum() >= taken.size else rejected + 1
@@ -138,25 +139,6 @@ class Setup:
             if estimate is not None:
                 mean[k], cov[k], decided[k] = estimate.mean, estimate.cov, estimate.decided
         return Walked(self.times_s, self.truth, mean, cov, decided, nis, dof)
-
-    def bound_rmse_m(self) -> float:
-        """Posterior Cramér-Rao bound of the position RMSE under the tracker's own motion model,
-        the sector known, from the second epoch on."""
-        rows, n = self.rows(1), len(self.times_s)
-        truth = np.zeros((n, 6))
-        truth[:, :2], truth[:, 2:4] = self.truth, self.velocity
-        prior = pose_state(self.config, np.zeros(2), np.eye(2) * 100.0)[1]
-        bound = bound_covariances(
-            self.stamps_ns,
-            np.arange(n + 1) * 4,
-            rows.reshape(n * 4, -1),
-            truth,
-            prior,
-            self.config.device_height_m,
-            motions_of(self.config),
-            NO_BIAS,
-        )
-        return float(np.sqrt(np.mean(np.trace(bound[1:, :2, :2], axis1=1, axis2=2))))
 
 
 def _alone(rows: Array) -> Array:

@@ -11,7 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from netpos.evaluation.reproduce.frame import Work
-from netpos.evaluation.reproduce.steps import StepErrors, Steps, reported_velocity, velocity_rows
+from netpos.evaluation.reproduce.steps import (
+    StepErrors,
+    Steps,
+    reported,
+    reported_velocity,
+    velocity_rows,
+)
 from netpos.filters.measurement import (
     GATE_VARIANCE,
     VALUE,
@@ -27,6 +33,7 @@ from netpos.scenario import load_scenario
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.models import pose_state
 from netpos.tracking.sectors import Sectors
+from netpos.tracking.steadiness import Steadiness
 from netpos.tracking.step_heading import choose_sector
 from netpos.world.frames import quaternion_from_yaw
 
@@ -144,8 +151,13 @@ class Setup:
         first = pose_state(self.config, np.zeros(2), np.eye(2))
         bank = Sectors.begin(self.config, NS, rows[0], 1, first)
         assert bank is not None
+        steadiness = Steadiness(self.config)
         for k in range(1, len(rows)):
-            bank.step(NS + round(self.times_s[k] * NS), INTERVAL_S, 0, rows[k], NO_BIAS)
+            stamp_ns = NS + round(self.times_s[k] * NS)
+            density = steadiness.density(stamp_ns, [reported(stamp_ns, rows[k, 2:])])
+            if density is not None:
+                bank.shake(density)
+            bank.step(stamp_ns, INTERVAL_S, 0, rows[k], NO_BIAS)
             s = int(step[k])  # the last epoch of the step stays
             right[s], decided[s] = bank.sector == turns[k], bank.decided
             claimed[s] = bank.probabilities.max()

@@ -20,7 +20,7 @@ from netpos.filters.measurement import (
     linear_rows,
 )
 from netpos.inertial.pdr_output import step_velocity
-from netpos.messages.values import Array
+from netpos.messages.values import Array, Velocity
 
 Ints = npt.NDArray[np.int64]
 
@@ -97,3 +97,12 @@ def reported_velocity(rows: Array) -> Array:
     """The velocity (2,) m/s behind two decorrelated rows (2, ROW_WIDTH)."""
     H = rows[:, ORIGIN + 2 : ORIGIN + 4]
     return np.asarray(np.linalg.solve(H, rows[:, VALUE]), dtype=np.float64)
+
+
+def reported(stamp_ns: int, rows: Array) -> Velocity:
+    """The message behind two decorrelated rows (2, ROW_WIDTH): equal within a step, its covariance
+    that of a single value."""
+    H = rows[:, ORIGIN + 2 : ORIGIN + 4]
+    value: Array = np.round(reported_velocity(rows), 12)
+    cov = np.asarray(np.linalg.inv(H.T @ H), dtype=np.float64)
+    return Velocity(stamp_ns=stamp_ns, vue_id="", velocity=value, cov=cov)

@@ -18,6 +18,7 @@ from netpos.evaluation.reproduce.sector_choice import (
     setup_of,
 )
 from netpos.evaluation.reproduce.waist_chain import run_chain
+from netpos.evaluation.reproduce.walk_bound import known_instants_rmse_m
 
 SEED = 7000
 
@@ -37,6 +38,20 @@ def test_a_long_baseline_is_more_than_twice_as_good(
     assert short.rmse_m > 2.0 * long.rmse_m
     assert long.lost == short.lost == 0
     assert 1.0 < long.nees.mean < 2.5
+
+
+def test_a_run_of_equal_steps_keeps_its_speed(
+    walks: dict[rectangle.Case, petukhov.Figures],
+) -> None:
+    """The same without looking at steadiness is a tenth worse, and both stay above the bound."""
+    free = rectangle.Case(
+        name="free", wavelengths=4.0, tracker=(("steady_accel_density_mps2_sqrthz", 0.0),)
+    )
+    with Work(6, SEED, 1) as work:
+        worse = petukhov._figures(work, free)
+    assert walks[petukhov.LONG].rmse_m < 0.93 * worse.rmse_m
+    bound = known_instants_rmse_m(rectangle.setup_of(petukhov.LONG), petukhov.DECIDED_S)
+    assert bound < walks[petukhov.LONG].rmse_m
 
 
 def test_the_paper_s_scheme_knows_too_much_of_itself(
