@@ -6,6 +6,8 @@ from __future__ import annotations
 import math
 from enum import IntEnum
 
+import numpy as np
+
 from netpos.filters.compile import kernel, leaf
 from netpos.filters.ekf import group_nis
 from netpos.filters.measurement import (
@@ -37,22 +39,57 @@ class Robust(IntEnum):
 
 
 @leaf
-def _unblock(
-    mean: Array, cov: Array, row: Array, height_m: float, prior: float, excess_m: float, h: Array
+def unblock(
+    row: Array, innovation: float, spread: float, noise: float, prior: float, excess_m: float
 ) -> None:
     """Replace a range or time by the measurement equivalent to the mixture of a direct and a
-    blocked path; its column BLOCKED, the prior where it is > 0, becomes the posterior."""
-    innovation = innovation_row(row, mean, height_m, h)
-    spread = innovation_variance(row, mean, cov, height_m, row[VARIANCE], h)
-    measurement_var = row[VARIANCE] + curvature_variance(row, mean, cov, height_m)
+    blocked path; its column BLOCKED, the prior where it is > 0, becomes the posterior.
+
+    spread : variance of the innovation; noise : of the row, with what linearising leaves out
+    """
     prior = row[BLOCKED] if row[BLOCKED] > 0.0 else prior
     row[BLOCKED], shift, variance = nlos_mixture_exponential(
-        innovation, spread, measurement_var, prior, excess_m
+        innovation, spread, noise, prior, excess_m
     )
     row[VALUE] -= shift
-    added = max(min(variance, _LARGEST_VAR) - measurement_var, 0.0)
+    added = max(min(variance, _LARGEST_VAR) - noise, 0.0)
     row[VARIANCE] += added
     row[GATE_VARIANCE] += added
+
+
+@leaf
+def may_be_late(row: Array) -> bool:
+    """Whether a blocked path makes the row late."""
+    return int(row[KIND]) == Kind.TOA or int(row[KIND]) == Kind.RANGE
+
+
+@kernel
+def weigh(
+    cov: Array,
+    rows: Array,
+    innovation: Array,
+    H: Array,
+    bend: Array,
+    robust: int,
+    parameter: float,
+) -> None:
+    """Widen, in place, groups of ``rows`` (m, ROW_WIDTH) by how badly they fit: innovation (m,),
+    Jacobian H (m, n), variance ``bend`` (m,) of what linearising leaves out."""
+    m, start = rows.shape[0], 0
+    while start < m:
+        stop = start + 1
+        while stop < m and rows[stop, GROUP] == rows[start, GROUP]:
+            stop += 1
+        variance = rows[start:stop, GATE_VARIANCE] + bend[start:stop]
+        d2 = group_nis(cov, innovation[start:stop], H[start:stop], variance)
+        if robust == Robust.HUBER:
+            factor = huber_factor(d2, stop - start, parameter)
+        else:
+            factor = student_t_factor(d2, stop - start, parameter)
+        if math.isfinite(factor):
+            rows[start:stop, VARIANCE] *= factor
+            rows[start:stop, GATE_VARIANCE] *= factor
+        start = stop
 
 
 @kernel
@@ -68,29 +105,19 @@ def condition(
     work: Array,
 ) -> None:
     """Re-weight ``rows`` (m, ROW_WIDTH) in place, as seen from the prior mean (n,), cov (n, n)."""
-    m = rows.shape[0]
+    m, h = rows.shape[0], work[0]
     if nlos_probability > 0.0:
         for i in range(m):
-            kind = int(rows[i, KIND])
-            if kind == Kind.TOA or kind == Kind.RANGE:
-                _unblock(mean, cov, rows[i], height_m, nlos_probability, nlos_excess_m, work[0])
+            row = rows[i]
+            if may_be_late(row):
+                innovation = innovation_row(row, mean, height_m, h)
+                spread = innovation_variance(row, mean, cov, height_m, row[VARIANCE], h)
+                noise = row[VARIANCE] + curvature_variance(row, mean, cov, height_m)
+                unblock(row, innovation, spread, noise, nlos_probability, nlos_excess_m)
     if robust == Robust.NONE:
         return
-    innovation, H = linearise(rows, mean, height_m)
-    start = 0
-    while start < m:
-        stop = start + 1
-        while stop < m and rows[stop, GROUP] == rows[start, GROUP]:
-            stop += 1
-        variance = rows[start:stop, GATE_VARIANCE].copy()
-        for i in range(start, stop):
-            variance[i - start] += curvature_variance(rows[i], mean, cov, height_m)
-        d2 = group_nis(cov, innovation[start:stop], H[start:stop], variance)
-        if robust == Robust.HUBER:
-            factor = huber_factor(d2, stop - start, parameter)
-        else:
-            factor = student_t_factor(d2, stop - start, parameter)
-        if math.isfinite(factor):
-            rows[start:stop, VARIANCE] *= factor
-            rows[start:stop, GATE_VARIANCE] *= factor
-        start = stop
+    innovations, H = linearise(rows, mean, height_m)
+    bend = np.empty(m)
+    for i in range(m):
+        bend[i] = curvature_variance(rows[i], mean, cov, height_m)
+    weigh(cov, rows, innovations, H, bend, robust, parameter)

@@ -1,4 +1,9 @@
-"""Closed-loop error-state filter of a strapdown system, 15 states (deng2022:eq.7, 8).
+"""Closed-loop error-state filter of a strapdown system, 15 states (deng2022:eq.7, 8) and more.
+
+The states of ``inertial.strapdown`` may be followed by those of slow errors: offset and drift of
+the device's clock [m, m/s], then biases of the RSUs, first-order Gauss-Markov. With n states in
+all ``cov`` is (n, n) and ``nav`` (n + 1,): the entry i of the error state, i >= ERR, is the entry
+i + 1 of ``nav``. n is ERR where there are none.
 
 ``advance`` moves the navigation state by the IMU and its covariance with it, ``correct`` fuses the
 rows of one epoch: sequential scalar updates, linearised again at their own result (an iterated
@@ -25,11 +30,13 @@ from netpos.filters.measurement import (
     VALUE,
     VARIANCE,
 )
-from netpos.filters.space import SpaceKind, bend_variance, innovation_at
+from netpos.filters.motion import add_walk
+from netpos.filters.space import CLOCK, SpaceKind, innovation_at, linearise_in_space
 from netpos.inertial.strapdown import (
     ACCEL_BIAS,
     ERR,
     GYRO_BIAS,
+    NAV,
     QUATERNION,
     VELOCITY,
     Earth,
@@ -85,23 +92,49 @@ class Constraints(NamedTuple):
 UNCONSTRAINED = Constraints(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
+class SlowErrors(NamedTuple):
+    """How what follows the states of the strapdown system moves: white and random-walk frequency
+    noise of the clock [m/sqrt(s), m/s/sqrt(s)], biases (2, k) stationary sd and time constant."""
+
+    clock_white: float
+    clock_walk: float
+    biases: Array
+
+
+NO_SLOW_ERRORS = SlowErrors(0.0, 0.0, np.zeros((2, 0)))
+
+
+class Sensors(NamedTuple):
+    """What the filter takes to be true of IMU, earth, vehicle, clock and RSUs."""
+
+    noise: InertialNoise
+    earth: Earth
+    constraints: Constraints
+    slow: SlowErrors = NO_SLOW_ERRORS
+
+
+class Imu(NamedTuple):
+    """Samples in base_link: stamps_ns (n,) increasing, rates (n, 6) angular velocity and specific
+    force; a sample holds from the stamp before it to its own."""
+
+    stamps_ns: Stamps
+    rates: Array
+
+
 @kernel
 def correct(
     nav: Array, cov: Array, rows: Array, gate_nis: Array, accepted: Array
 ) -> tuple[float, int]:
-    """Fuse ``rows`` (m, ROW_WIDTH) into ``nav`` (NAV,) and ``cov`` (ERR, ERR), in place.
+    """Fuse ``rows`` (m, ROW_WIDTH) into ``nav`` (n + 1,) and ``cov`` (n, n), in place.
 
     gate_nis : as of ``gate.gate_groups``; accepted : (groups,) filled with 1 or 0
     Returns the NIS of the accepted rows together and their number.
     """
-    m = rows.shape[0]
-    C, H, innovation, variance = np.empty((3, 3)), np.empty((m, ERR)), np.empty(m), np.empty(m)
-    S = np.empty((m, m))
-    rotation_of(nav[QUATERNION:ACCEL_BIAS], C)
+    m, n = rows.shape[0], cov.shape[0]
+    C, variance, S = np.empty((3, 3)), np.empty(m), np.empty((m, m))
+    innovation, H, bends = linearise_in_space(rows, nav, cov)
     for i in range(m):
-        innovation[i] = innovation_at(rows[i], nav, C, H[i])
-    for i in range(m):
-        bend = bend_variance(rows[i], nav, cov)
+        bend = bends[i]
         variance[i] = rows[i, VARIANCE] + bend
         projected = _times(cov, H[i])
         for j in range(m):
@@ -111,7 +144,7 @@ def correct(
     index, nis = select_rows(rows, innovation, S, gate_nis, accepted)
     if index.size == 0:
         return 0.0, 0
-    prior, error = nav.copy(), np.zeros(ERR)
+    prior, error = nav.copy(), np.zeros(n)
     posterior = cov
     for _ in range(ITERATIONS):
         step, posterior = _sequential(cov, rows, index, variance, H, innovation, error)
@@ -141,10 +174,11 @@ def _dot(a: Array, b: Array) -> float:
 @kernel
 def _times(P: Array, h: Array) -> Array:
     """P h, h mostly zeros."""
-    out = np.zeros(ERR)
-    for k in range(ERR):
+    n = h.size
+    out = np.zeros(n)
+    for k in range(n):
         if h[k] != 0.0:
-            for i in range(ERR):
+            for i in range(n):
                 out[i] += P[i, k] * h[k]
     return out
 
@@ -160,15 +194,16 @@ def _sequential(
     error: Array,
 ) -> tuple[Array, Array]:
     """Error and covariance after the rows ``index`` one by one, linearised about ``error``."""
-    P, step = cov.copy(), np.zeros(ERR)
+    n = cov.shape[0]
+    P, step = cov.copy(), np.zeros(n)
     for i in index:
         h = H[i]
         gain = _times(P, h)
         s = _dot(h, gain) + variance[i]
         residual = innovation[i] + _dot(h, error) - _dot(h, step)
-        for a in range(ERR):
+        for a in range(n):
             step[a] += gain[a] / s * residual
-            for b in range(ERR):
+            for b in range(n):
                 P[a, b] -= gain[a] * gain[b] / s
     return step, P
 
@@ -180,17 +215,9 @@ def doubt_standstill(memory: Array) -> None:
 
 
 @kernel
-def _hold(
-    nav: Array,
-    cov: Array,
-    memory: Array,
-    constraints: Constraints,
-    noise: InertialNoise,
-    chunk: Array,
-    dt: float,
-) -> None:
-    """Apply the constraints after a chunk of length ``dt``; chunk (6,): its mean rate and specific
-    force as measured."""
+def _stands(nav: Array, memory: Array, constraints: Constraints, chunk: Array) -> bool:
+    """Whether the vehicle stands after a chunk (6,) of mean rate and specific force; ``memory``
+    is brought up to date."""
     turning, pushed = 0.0, 0.0
     for i in range(3):
         turning += (chunk[i] - nav[GYRO_BIAS + i]) ** 2
@@ -206,68 +233,54 @@ def _hold(
     for i in range(3):
         memory[REST_FORCE + i] += weight * (chunk[3 + i] - memory[REST_FORCE + i])
     speed = math.sqrt(nav[VELOCITY] ** 2 + nav[VELOCITY + 1] ** 2 + nav[VELOCITY + 2] ** 2)
-    standing = (
-        constraints.standstill_sd_mps > 0.0
-        and memory[QUIET] >= _QUIET_CHUNKS
-        and speed < _CREEP_MPS
-    )
+    quiet = memory[QUIET] >= _QUIET_CHUNKS and speed < _CREEP_MPS
+    return bool(constraints.standstill_sd_mps > 0.0 and quiet)
+
+
+@kernel
+def hold(nav: Array, cov: Array, memory: Array, sensors: Sensors, chunk: Array) -> None:
+    """Apply the constraints after a ``chunk`` (7,) as of ``predict_chunk``, in place."""
+    constraints = sensors.constraints
+    standing = _stands(nav, memory, constraints, chunk)
     still_sd = constraints.standstill_sd_mps if standing else 0.0
     sds = (still_sd, constraints.sideways_sd_mps, constraints.upwards_sd_mps)
+    rate_var = sensors.noise.gyro_density_radps_sqrthz**2 / chunk[6]
     rows = np.zeros((6, ROW_WIDTH))
     m = 0
-    for i in range(3):
-        sd = still_sd if standing else sds[i]
-        if sd > 0.0:
-            row = rows[m]
-            row[KIND], row[GROUP] = _BODY_VELOCITY, m
-            row[VARIANCE] = row[GATE_VARIANCE] = sd * sd
-            row[ORIGIN + i] = 1.0
-            m += 1
-    if standing:
-        for i in range(3):
-            row = rows[m]
-            row[KIND], row[GROUP] = _BODY_RATE, m
-            row[VALUE] = chunk[i]
-            row[VARIANCE] = row[GATE_VARIANCE] = noise.gyro_density_radps_sqrthz**2 / dt
-            row[ORIGIN + i] = 1.0
-            m += 1
+    for i in range(6 if standing else 3):
+        speed_sd = still_sd if standing else sds[i % 3]
+        variance = speed_sd * speed_sd if i < 3 else rate_var
+        if i < 3 and speed_sd == 0.0:
+            continue
+        row = rows[m]
+        row[KIND], row[GROUP] = _BODY_VELOCITY if i < 3 else _BODY_RATE, m
+        row[VALUE] = 0.0 if i < 3 else chunk[i - 3]
+        row[VARIANCE] = row[GATE_VARIANCE] = variance
+        row[ORIGIN + i % 3] = 1.0
+        m += 1
     if m > 0:
         correct(nav, cov, rows[:m], _CONSTRAINT_GATE, np.empty(m))
 
 
 @kernel
-def advance(
+def _integrate(
     nav: Array,
-    cov: Array,
     memory: Array,
     from_ns: int,
     to_ns: int,
-    stamps_ns: Stamps,
-    rates: Array,
-    noise: InertialNoise,
+    imu: Imu,
     earth: Earth,
-    constraints: Constraints,
-) -> float:
-    """Move ``nav``, ``cov`` and ``memory`` (MEMORY,) from ``from_ns`` to ``to_ns``, in place.
-
-    stamps_ns : (n,) increasing, rates : (n, 6) angular velocity and specific force; a sample holds
-        from the stamp before it to its own
-    Returns the time [s] without samples, in which the last one is held and trusted as ``BLIND``.
-    """
-    dark = InertialNoise(
-        BLIND[0],
-        BLIND[1],
-        noise.accel_bias_sd_mps2,
-        noise.gyro_bias_sd_radps,
-        noise.bias_correlation_time_s,
-    )
-    n, now, blind_s = stamps_ns.size, from_ns, 0.0
+    gained: Array,
+    chunk: Array,
+) -> tuple[int, float]:
+    """Mechanise to the first sample ``CHUNK_S`` after ``from_ns``, or to ``to_ns``: where that is,
+    and the time [s] without samples. gained (3,) and chunk (7,) begin with 0."""
+    stamps_ns, rates = imu
+    n, now, span, blind_s = stamps_ns.size, from_ns, 0.0, 0.0
     k = int(np.searchsorted(stamps_ns, from_ns, side="right"))
-    before, after = np.empty((3, 3)), np.empty((3, 3))
-    increment, gained, chunk = np.empty(6), np.zeros(3), np.zeros(6)
-    span, blind = 0.0, False
-    rotation_of(nav[QUATERNION:ACCEL_BIAS], before)
-    while now < to_ns:
+    increment, up = np.empty(6), np.empty((3, 3))
+    rotation_of(nav[QUATERNION:ACCEL_BIAS], up)
+    while now < to_ns and span < CHUNK_S - 1e-9:
         end = to_ns
         hole = n == 0 or k >= n or (k > 0 and (stamps_ns[k] - stamps_ns[k - 1]) * 1e-9 > HOLE_S)
         hole = hole or (k == 0 and (stamps_ns[0] - now) * 1e-9 > HOLE_S)
@@ -277,32 +290,105 @@ def advance(
             end = min(end, now + _CHUNK_NS)
         dt = (end - now) * 1e-9
         if n == 0:
-            increment[:3] = nav[GYRO_BIAS:] * dt
+            increment[:3] = nav[GYRO_BIAS : GYRO_BIAS + 3] * dt
             for i in range(3):
-                level = nav[ACCEL_BIAS + i] + before[2, i] * earth.gravity_mps2
+                level = nav[ACCEL_BIAS + i] + up[2, i] * earth.gravity_mps2
                 increment[3 + i] = level * dt
         else:
             increment[:] = rates[k if k < n else n - 1] * dt
-        chunk += increment
+        chunk[:6] += increment
         mechanise(nav, increment, dt, memory[:LAST], earth, gained)
         if hole:
             memory[:LAST] = 0.0
             blind_s += dt
-            blind = True
         span += dt
         now = end
         if k < n and now >= stamps_ns[k]:
             k += 1
-        if span >= CHUNK_S - 1e-9 or now >= to_ns:
-            rotation_of(nav[QUATERNION:ACCEL_BIAS], after)
-            mean = 0.5 * (before + after)
-            Phi = transition(gained, mean, span, noise.bias_correlation_time_s, earth)
-            propagate(cov, Phi, span, dark if blind else noise)
-            decay_biases(nav, span, noise.bias_correlation_time_s)
-            if not blind:
-                _hold(nav, cov, memory, constraints, noise, chunk / span, span)
-            rotation_of(nav[QUATERNION:ACCEL_BIAS], before)
-            gained[:] = 0.0
-            chunk[:] = 0.0
-            span, blind = 0.0, False
+    chunk[:6] /= span
+    chunk[6] = span
+    return now, blind_s
+
+
+@kernel
+def _slow_transition(nav: Array, dt: float, slow: SlowErrors, Phi: Array) -> None:
+    """Move the slow errors of ``nav`` over ``dt`` [s] and fill in their part of ``Phi``."""
+    if nav.size <= NAV:
+        return
+    Phi[CLOCK, CLOCK + 1] = dt
+    nav[CLOCK + 1] += dt * nav[CLOCK + 2]
+    for i in range(slow.biases.shape[1]):
+        fade = math.exp(-dt / slow.biases[1, i])
+        Phi[CLOCK + 2 + i, CLOCK + 2 + i] = fade
+        nav[CLOCK + 3 + i] *= fade
+
+
+@kernel
+def _add_slow_noise(cov: Array, dt: float, slow: SlowErrors) -> None:
+    """Add the noise of the slow errors over ``dt`` [s] to ``cov`` (n, n), in place."""
+    if cov.shape[0] <= ERR:
+        return
+    cov[CLOCK, CLOCK] += slow.clock_white**2 * dt
+    add_walk(CLOCK, CLOCK + 1, dt, slow.clock_walk**2, cov)
+    for i in range(slow.biases.shape[1]):
+        k = CLOCK + 2 + i
+        cov[k, k] += slow.biases[0, i] ** 2 * (1.0 - math.exp(-2.0 * dt / slow.biases[1, i]))
+
+
+@kernel
+def predict_chunk(
+    nav: Array,
+    cov: Array,
+    memory: Array,
+    from_ns: int,
+    to_ns: int,
+    imu: Imu,
+    sensors: Sensors,
+    Phi: Array,
+    chunk: Array,
+) -> tuple[int, float]:
+    """Move ``nav``, ``cov`` and ``memory`` (MEMORY,) on by one chunk, at most to ``to_ns`` >
+    ``from_ns``, in place, without constraints.
+
+    Phi : (n, n) filled with the transition of the error state
+    chunk : (7,) filled with the mean rate and specific force as measured, and the length [s]
+    Returns its end and the time [s] in it without samples, in which the last one is held and
+    trusted as ``BLIND``.
+    """
+    noise, earth = sensors.noise, sensors.earth
+    before, after, gained = np.empty((3, 3)), np.empty((3, 3)), np.zeros(3)
+    rotation_of(nav[QUATERNION:ACCEL_BIAS], before)
+    chunk[:] = 0.0
+    now, blind_s = _integrate(nav, memory, from_ns, to_ns, imu, earth, gained, chunk)
+    rotation_of(nav[QUATERNION:ACCEL_BIAS], after)
+    span, tau = chunk[6], noise.bias_correlation_time_s
+    Phi[:] = np.eye(cov.shape[0])
+    Phi[:ERR, :ERR] = transition(gained, 0.5 * (before + after), span, tau, earth)
+    _slow_transition(nav, span, sensors.slow, Phi)
+    taken = noise
+    if blind_s > 0.0:
+        taken = InertialNoise(
+            BLIND[0], BLIND[1], noise.accel_bias_sd_mps2, noise.gyro_bias_sd_radps, tau
+        )
+    propagate(cov, Phi, span, taken)
+    _add_slow_noise(cov, span, sensors.slow)
+    decay_biases(nav, span, tau)
+    return now, blind_s
+
+
+@kernel
+def advance(
+    nav: Array, cov: Array, memory: Array, from_ns: int, to_ns: int, imu: Imu, sensors: Sensors
+) -> float:
+    """Move ``nav``, ``cov`` and ``memory`` (MEMORY,) from ``from_ns`` to ``to_ns``, in place.
+
+    Returns the time [s] without samples.
+    """
+    n, now, blind_s = cov.shape[0], from_ns, 0.0
+    Phi, chunk = np.empty((n, n)), np.empty(7)
+    while now < to_ns:
+        now, dark_s = predict_chunk(nav, cov, memory, now, to_ns, imu, sensors, Phi, chunk)
+        blind_s += dark_s
+        if dark_s == 0.0:
+            hold(nav, cov, memory, sensors, chunk)
     return blind_s

@@ -260,7 +260,7 @@ def add_noise(mean: Array, dt: float, motion: Array, bias: Array, cov: Array) ->
     if model == Model.CONSTANT_TURN:
         cov[6, 6] += motion[Parameter.TURN_RATE] ** 2 * dt
     elif model == Model.RIGID_BODY:
-        _add_walk(6, 7, dt, motion[Parameter.TURN_RATE] ** 2, cov)
+        add_walk(6, 7, dt, motion[Parameter.TURN_RATE] ** 2, cov)
     elif model == Model.INERTIAL:
         _add_inertial(mean, dt, motion, cov)
     elif model == Model.CONSTANT_VELOCITY or model == Model.STATIONARY:
@@ -327,11 +327,11 @@ def _add_clock(dt: float, motion: Array, cov: Array) -> None:
         cov[5, 5] += motion[Parameter.DRIFT_STEP] ** 2
         return
     cov[4, 4] += motion[Parameter.OFFSET_DENSITY] ** 2 * dt
-    _add_walk(4, 5, dt, motion[Parameter.DRIFT_DENSITY] ** 2, cov)
+    add_walk(4, 5, dt, motion[Parameter.DRIFT_DENSITY] ** 2, cov)
 
 
 @leaf
-def _add_walk(value: int, rate: int, dt: float, q: float, cov: Array) -> None:
+def add_walk(value: int, rate: int, dt: float, q: float, cov: Array) -> None:
     """Noise of a value whose rate does a random walk of density ``q``."""
     cov[value, value] += q * dt**3 / 3.0
     cov[value, rate] += q * dt**2 / 2.0

@@ -4,6 +4,9 @@ deng2022:eq.2-6: z - f(r0) = H x + noise, x = (H' P H)^-1 H' P z, again from r0 
 small. Weights are 1 / sigma^2, angles in radians and their residuals wrapped. Ranges alone leave
 the height open where all stations stand at about one height: the normal matrix then loses its
 rank on the way, and the fix is refused rather than given.
+
+Times of arrival share a clock offset nobody knows: a fourth unknown, eliminated from the normal
+equations (its Schur complement), so that only their differences count.
 """
 
 from __future__ import annotations
@@ -41,7 +44,7 @@ class FixStatus(IntEnum):
     """Why a fix is one, or none."""
 
     CONVERGED = 0
-    TOO_FEW = 1  # fewer than three quantities
+    TOO_FEW = 1  # fewer quantities than unknowns
     GEOMETRY = 2  # the measurements leave a direction open
     NOT_CONVERGED = 3
 
@@ -80,15 +83,21 @@ def _invert(A: Array, out: Array) -> bool:
 
 @leaf
 def _normal_equations(rows: Array, at: Array, A: Array, b: Array) -> float:
-    """A = H' P H (3, 3) and b = H' P (z - f) (3,) at the position ``at``; returns the cost."""
+    """A = H' P H (3, 3) and b = H' P (z - f) (3,) at the position ``at``, the clock of the times
+    of arrival eliminated; returns the cost."""
     A[:] = 0.0
     b[:] = 0.0
     cost = 0.0
+    clock, late, reference = 0.0, 0.0, 0.0  # times count from the first: nothing cancels
+    c0, c1, c2 = 0.0, 0.0, 0.0
     for i in range(rows.shape[0]):
         value, g0, g1, g2 = value_at(rows[i], at[0], at[1], at[2])
         residual = rows[i, VALUE] - value
         if is_angle(rows[i]):
             residual = wrap(residual)
+        if int(rows[i, KIND]) == Kind.TOA:
+            reference = residual if clock == 0.0 else reference
+            residual -= reference
         weight = 1.0 / rows[i, VARIANCE]
         g = (g0, g1, g2)
         cost += weight * residual * residual
@@ -96,6 +105,17 @@ def _normal_equations(rows: Array, at: Array, A: Array, b: Array) -> float:
             b[r] += weight * residual * g[r]
             for c in range(3):
                 A[r, c] += weight * g[r] * g[c]
+        if int(rows[i, KIND]) == Kind.TOA:
+            clock += weight
+            late += weight * residual
+            c0, c1, c2 = c0 + weight * g0, c1 + weight * g1, c2 + weight * g2
+    if clock > 0.0:
+        u = (c0, c1, c2)
+        cost -= late * late / clock
+        for r in range(3):
+            b[r] -= u[r] * late / clock
+            for c in range(3):
+                A[r, c] -= u[r] * u[c] / clock
     return cost
 
 
@@ -105,7 +125,11 @@ def fix_position(rows: Array, start: Array) -> Fix:
     raises."""
     at = start.copy()
     A, b, cov = np.empty((3, 3)), np.empty(3), np.zeros((3, 3))
-    if rows.shape[0] < 3:
+    unknowns = 3
+    for i in range(rows.shape[0]):
+        if int(rows[i, KIND]) == Kind.TOA:
+            unknowns = 4
+    if rows.shape[0] < unknowns:
         return Fix(at, cov, _TOO_FEW, 0)
     cost = _normal_equations(rows, at, A, b)
     for iteration in range(1, MAX_ITERATIONS + 1):
@@ -133,7 +157,7 @@ def fix_position(rows: Array, start: Array) -> Fix:
 
 @kernel
 def start_of(rows: Array, height_m: float) -> Array:
-    """Where to start a fix (3,): along the angles of the nearest station that has them, else
+    """Where to start a fix (3,): along angles and range of the nearest station that has both, else
     between the stations at the height ``height_m``."""
     start = np.zeros(3)
     nearest, count = math.inf, 0
@@ -152,7 +176,7 @@ def start_of(rows: Array, height_m: float) -> Array:
             rows[i, ORIGIN] == rows[i - 2, ORIGIN]
             and rows[i, ORIGIN + 1] == rows[i - 2, ORIGIN + 1]
         )
-        ranged = int(rows[i, KIND]) == Kind.RANGE or int(rows[i, KIND]) == Kind.TOA
+        ranged = int(rows[i, KIND]) == Kind.RANGE
         if not (angles and same and ranged and rows[i, VALUE] < nearest):
             continue
         nearest = rows[i, VALUE]

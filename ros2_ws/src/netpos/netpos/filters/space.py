@@ -7,6 +7,9 @@ a = p + C lever and d = a - origin. Rows of the kinds here hold a direction u in
     BODY_VELOCITY  u . C' v           non-holonomic and zero-velocity constraints
     BODY_RATE      u . gyro bias      a gyro at rest shows nothing else
 
+A TOA is a range plus the clock's offset where the state has one; the biases an RSU's rows name
+are added (``error_state`` tells the order of the states).
+
 With the error state of ``inertial.strapdown`` and r = C lever the Jacobian of a function of a
 with gradient g is [g, 0, r x g, 0, 0].
 """
@@ -18,7 +21,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from netpos.filters.compile import leaf
+from netpos.filters.compile import kernel, leaf
 from netpos.filters.measurement import (
     BIAS,
     COMMON,
@@ -36,8 +39,20 @@ from netpos.filters.measurement import (
     is_angle,
     wrap,
 )
-from netpos.inertial.strapdown import ATTITUDE_ERR, GYRO_BIAS, GYRO_BIAS_ERR, VELOCITY
+from netpos.inertial.strapdown import (
+    ACCEL_BIAS,
+    ATTITUDE_ERR,
+    ERR,
+    GYRO_BIAS,
+    GYRO_BIAS_ERR,
+    QUATERNION,
+    VELOCITY,
+    rotation_of,
+)
 from netpos.messages.values import Array
+
+CLOCK = ERR
+"""Index of the clock's offset in an error state that has more than ERR entries."""
 
 
 class SpaceKind(IntEnum):
@@ -65,9 +80,9 @@ def value_at(row: Array, x: float, y: float, z: float) -> tuple[float, float, fl
 
 @leaf
 def innovation_at(row: Array, nav: Array, C: Array, h: Array) -> float:
-    """Measured minus predicted value, wrapped where it is an angle; fills ``h`` (ERR,).
+    """Measured minus predicted value, wrapped where it is an angle; fills ``h`` (n,).
 
-    nav : (NAV,), C : (3, 3) its rotation matrix
+    nav : (n + 1,), C : (3, 3) its rotation matrix
     """
     h[:] = 0.0
     kind = int(row[KIND])
@@ -97,6 +112,14 @@ def innovation_at(row: Array, nav: Array, C: Array, h: Array) -> float:
     h[ATTITUDE_ERR] = ry * h[2] - rz * h[1]
     h[ATTITUDE_ERR + 1] = rz * h[0] - rx * h[2]
     h[ATTITUDE_ERR + 2] = rx * h[1] - ry * h[0]
+    if kind == Kind.TOA and h.size > CLOCK:
+        h[CLOCK] = 1.0
+        value += nav[CLOCK + 1]
+    for column in (BIAS, COMMON):
+        index = int(row[column])
+        if index > CLOCK:
+            h[index] = 1.0
+            value += nav[index + 1]
     difference = row[VALUE] - value
     return float(wrap(difference)) if is_angle(row) else float(difference)
 
@@ -128,6 +151,20 @@ def bend_variance(row: Array, nav: Array, cov: Array) -> float:
         plane = cov[0, 0] ** 2 + 2.0 * cov[0, 1] ** 2 + cov[1, 1] ** 2
         return float(0.5 * plane / (rho2 * rho2))
     return float(0.5 * square / (r2 * r2))
+
+
+@kernel
+def linearise_in_space(rows: Array, nav: Array, cov: Array) -> tuple[Array, Array, Array]:
+    """Innovations (m,), Jacobian H (m, n) and ``bend_variance`` (m,) of ``rows`` (m, ROW_WIDTH) at
+    nav (n + 1,), cov (n, n)."""
+    m = rows.shape[0]
+    innovation, H, bend = np.empty(m), np.empty((m, cov.shape[0])), np.empty(m)
+    C = np.empty((3, 3))
+    rotation_of(nav[QUATERNION:ACCEL_BIAS], C)
+    for i in range(m):
+        innovation[i] = innovation_at(rows[i], nav, C, H[i])
+        bend[i] = bend_variance(rows[i], nav, cov)
+    return innovation, H, bend
 
 
 def direction_rows(

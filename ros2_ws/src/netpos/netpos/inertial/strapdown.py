@@ -206,27 +206,28 @@ def transition(gained: Array, C: Array, dt: float, time_s: float, earth: Earth) 
 
 @njit(cache=True, error_model="numpy")
 def propagate(cov: Array, Phi: Array, dt: float, noise: InertialNoise) -> None:
-    """cov (ERR, ERR) = Phi (cov + Q dt / 2) Phi' + Q dt / 2, in place and symmetric."""
-    half = np.empty(ERR)
+    """cov (n, n) = Phi (cov + Q dt / 2) Phi' + Q dt / 2, in place and symmetric; Phi (n, n).
+    States beyond the first ERR get no noise."""
+    n = cov.shape[0]
+    half = np.zeros(n)
     rate = 2.0 / noise.bias_correlation_time_s
-    half[:VELOCITY] = 0.0
     half[VELOCITY:ATTITUDE_ERR] = 0.5 * dt * noise.accel_density_mps2_sqrthz**2
     half[ATTITUDE_ERR:ACCEL_BIAS_ERR] = 0.5 * dt * noise.gyro_density_radps_sqrthz**2
     half[ACCEL_BIAS_ERR:GYRO_BIAS_ERR] = 0.5 * dt * rate * noise.accel_bias_sd_mps2**2
-    half[GYRO_BIAS_ERR:] = 0.5 * dt * rate * noise.gyro_bias_sd_radps**2
-    moved = np.zeros((ERR, ERR))
-    for i in range(ERR):
+    half[GYRO_BIAS_ERR:ERR] = 0.5 * dt * rate * noise.gyro_bias_sd_radps**2
+    moved = np.zeros((n, n))
+    for i in range(n):
         cov[i, i] += half[i]
-    for i in range(ERR):
-        for k in range(ERR):
+    for i in range(n):
+        for k in range(n):
             phi = Phi[i, k]
             if phi != 0.0:
-                for j in range(ERR):
+                for j in range(n):
                     moved[i, j] += phi * cov[k, j]
-    for i in range(ERR):
+    for i in range(n):
         for j in range(i + 1):
             total = half[i] if i == j else 0.0
-            for k in range(ERR):
+            for k in range(n):
                 if Phi[j, k] != 0.0:
                     total += moved[i, k] * Phi[j, k]
             cov[i, j] = cov[j, i] = total
@@ -234,9 +235,10 @@ def propagate(cov: Array, Phi: Array, dt: float, noise: InertialNoise) -> None:
 
 @njit(cache=True, error_model="numpy")
 def inject(nav: Array, error: Array) -> None:
-    """Closed loop: take the estimated ``error`` (ERR,) into ``nav``, in place."""
+    """Closed loop: take the estimated ``error`` (n,) into ``nav`` (n + 1,), in place; n >= ERR,
+    entries beyond the first ERR are plain sums."""
     for i in range(6):
         nav[i] += error[i]
     rotate(nav[QUATERNION:ACCEL_BIAS], error[ATTITUDE_ERR:ACCEL_BIAS_ERR], True)
-    for i in range(6):
-        nav[ACCEL_BIAS + i] += error[ACCEL_BIAS_ERR + i]
+    for i in range(ACCEL_BIAS_ERR, error.size):
+        nav[i + 1] += error[i]

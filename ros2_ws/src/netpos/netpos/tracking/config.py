@@ -225,6 +225,12 @@ class TrackerConfig:
         0.25, 0.0, 10.0, "longest wait for measurements still missing at an epoch; 0: do not wait"
     )
 
+    odometry_rate_hz: float = _real(
+        0.0,
+        0.0,
+        1000.0,
+        "strapdown: odometry at multiples of its inverse, too, by the IMU; 0: at epochs only",
+    )
     history_s: float = _real(
         1.0, 0.0, 60.0, "how late a measurement may come and still be applied in order"
     )
@@ -282,10 +288,10 @@ class TrackerConfig:
                 "motion_model strapdown has its own error-state filter; leave filter at iekf and"
                 f" backend at compiled, got {self.filter!r} and {self.backend!r}"
             )
-        if self.robust != "none" or self.nlos_probability > 0.0 or self.fixed_lag_s > 0.0:
+        if self.fixed_lag_s > 0.0:
             raise ValueError(
-                "motion_model strapdown has neither robust updates nor a smoother; leave robust at"
-                " none, nlos_probability and fixed_lag_s at 0"
+                "motion_model strapdown is smoothed afterwards only (replay --smooth); leave"
+                f" fixed_lag_s at 0, got {self.fixed_lag_s}"
             )
 
     @property

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,12 +18,13 @@ from netpos.filters.measurement import (
     innovation_variance,
 )
 from netpos.messages.values import Array, RsuMeasurement
-from netpos.tracking.batch import Batch
+from netpos.tracking.batch import Batch, Source
 from netpos.tracking.health import RsuHealth
 from netpos.tracking.rsus import Rsu
 
-_KIND_NAMES = tuple(kind.name for kind in Kind)
-_LINEAR = Kind.LINEAR.name
+AnySource = TypeVar("AnySource", bound=Source)
+# What is told of: a position fix has rows along no axis anyone can name.
+_KIND_NAMES = {int(kind): kind.name for kind in Kind if kind is not Kind.LINEAR}
 
 
 @kernel
@@ -44,6 +47,33 @@ def widen(fits: Array, rows: Array, rsu: Rsu) -> None:
         fit[1] = math.hypot(fit[1], rsu.bias_sd(Kind(int(row[KIND]))))
 
 
+def without_isolated(
+    health: RsuHealth, stamp_ns: int, items: Sequence[AnySource]
+) -> tuple[list[AnySource], list[RsuMeasurement]]:
+    """What may be fused, and what comes from an isolated RSU and is only looked at."""
+    used: list[AnySource] = []
+    watched: list[RsuMeasurement] = []
+    for item in items:
+        if isinstance(item, RsuMeasurement) and health.isolated(item.rsu_id, stamp_ns):
+            watched.append(item)
+        else:
+            used.append(item)
+    return used, watched
+
+
+def with_refused(
+    batch: Batch, accepted: Array, gate: Array, nis: float, dof: int
+) -> tuple[float, int]:
+    """``nis`` of ``dof`` accepted rows of an epoch with those it refused, as at their gate."""
+    if dof < len(batch.rows):
+        sizes = np.bincount(batch.rows[:, GROUP].astype(int), minlength=len(accepted))
+        for size, taken in zip(sizes.tolist(), accepted, strict=True):
+            if not taken:
+                nis += float(gate[min(size, gate.size - 1)])
+                dof += size
+    return nis, dof
+
+
 def observe(
     health: RsuHealth, vue_id: str, stamp_ns: int, batch: Batch, fits: Array, accepted: Array
 ) -> None:
@@ -52,8 +82,18 @@ def observe(
     found: list[dict[str, tuple[float, float]]] = [{} for _ in batch.items]
     kinds, groups = batch.rows[:, KIND].tolist(), batch.rows[:, GROUP].tolist()
     for kind, group, (innovation, sd) in zip(kinds, groups, fits.tolist(), strict=True):
-        found[int(group)][_KIND_NAMES[int(kind)]] = (innovation, sd)
+        if kind in _KIND_NAMES:
+            found[int(group)][_KIND_NAMES[kind]] = (innovation, sd)
     for item, taken, innovations in zip(batch.items, accepted, found, strict=True):
         if isinstance(item, RsuMeasurement):
-            innovations.pop(_LINEAR, None)
             health.observe(item.rsu_id, vue_id, stamp_ns, bool(taken), innovations)
+
+
+def observe_isolated(
+    health: RsuHealth, vue_id: str, stamp_ns: int, batch: Batch, fits: Array, rsu: Rsu, gate: Array
+) -> None:
+    """Tell ``health`` how what the isolated ``rsu`` alone says, ``batch``, fitted without being
+    fused; its rows have no bias states."""
+    widen(fits, batch.rows, rsu)
+    fitting = bool(((fits[:, 0] / fits[:, 1]) ** 2 <= gate[1]).all())
+    observe(health, vue_id, stamp_ns, batch, fits, np.array([fitting]))

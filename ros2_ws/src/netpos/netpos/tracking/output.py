@@ -88,14 +88,15 @@ def with_yaw_rate(odometry: Odometry, mean: Array, cov: Array, heading: int) -> 
 
 
 def clock_state(stamp_ns: int, vue_id: str, mean: Array, cov: Array) -> ClockState:
-    """Clock state in seconds and seconds per second."""
+    """Clock state in seconds and seconds per second of offset and drift in metres: mean (2,), cov
+    (2, 2)."""
     c = SPEED_OF_LIGHT_MPS
     return ClockState(
         stamp_ns=stamp_ns,
         vue_id=vue_id,
-        offset_s=float(mean[4]) / c,
-        drift=float(mean[5]) / c,
-        cov=cov[4:6, 4:6] / (c * c),
+        offset_s=float(mean[0]) / c,
+        drift=float(mean[1]) / c,
+        cov=cov / (c * c),
     )
 
 

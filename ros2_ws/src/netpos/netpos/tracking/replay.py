@@ -33,7 +33,6 @@ from netpos.tracking.settings import (
     TrackerSettings,
     bag_settings,
 )
-from netpos.tracking.smoothing import Smoother
 from netpos.tracking.track import TrackOutput
 from netpos.tracking.tracker import Tracker
 
@@ -90,8 +89,8 @@ def replay_bag(
                     write_output(out, output)
                 if progress is not None:
                     progress(done)
-            for vue_id, posteriors in tracker.posteriors().items() if smooth else ():
-                _write_smoothed(out, vue_id, Smoother(vue_id, config).interval(posteriors))
+            for vue_id, odometry in tracker.smoothed().items() if smooth else ():
+                _write_smoothed(out, vue_id, odometry)
         return ReplaySummary(epochs, {v: dict(c) for v, c in tracker.rejected().items()})
 
 

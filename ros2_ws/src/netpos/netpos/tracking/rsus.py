@@ -6,7 +6,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from netpos.filters.measurement import UNCOUPLED, Coupling, Kind, rsu_axes, scalar_values
+from netpos.filters.measurement import (
+    BIAS,
+    COMMON,
+    UNCOUPLED,
+    Coupling,
+    Kind,
+    rsu_axes,
+    scalar_values,
+)
 from netpos.filters.motion import N_CORE
 from netpos.messages.values import AngleConvention, Array, RsuInfo, RsuMeasurement
 
@@ -103,6 +111,16 @@ class BiasStates:
             if info.noise_correlation_time_s > 0.0:
                 inflation[kind] = self._inflation(info, kind, m.stamp_ns)
         return Coupling(bias, common, inflation)
+
+    def noise_of(self, rows: Array) -> Array:
+        """(m,) variance the biases add to ``rows`` (m, ROW_WIDTH) for who has no states for
+        them."""
+        variance = np.zeros(len(rows))
+        for column in (BIAS, COMMON):
+            for i, index in enumerate(rows[:, column].astype(int)):
+                if index >= 0:
+                    variance[i] += self.sd[index - self.first] ** 2
+        return variance
 
     def accepted(self, rsu: Rsu, m: RsuMeasurement) -> None:
         """Note that ``m`` was fused: correlated noise is counted from here."""

@@ -87,18 +87,23 @@ class Sequencer:
         history_ns: int = 0,
         future_ns: int = 1 << 62,
         live_ns: int = _LIVE_NS,
+        tick_ns: int = 0,
     ) -> None:
         """``needs_pose``: nothing is complete before an initial pose, so that it is waited for.
 
         ``history_ns``: how much older than the newest applied epoch an item may be.
         ``future_ns``: a stamp this far ahead of all others counts once a second one confirms it.
         ``live_ns``: a channel this far behind the newest stamp is not waited for.
+        ``tick_ns``: an epoch, without items if need be, at every multiple of it that the IMU
+        reaches; 0: none.
         """
         self._hold_ns = hold_ns
         self._needs_pose = needs_pose
         self._history_ns = history_ns
         self._future_ns = future_ns
-        self._live_ns = live_ns
+        # Between measurements of one a second, and their way here, ticks wait for them.
+        self._live_ns = live_ns + (hold_ns if tick_ns > 0 else 0)
+        self._tick_ns = tick_ns
         self._pending: dict[int, Epoch] = {}
         self._applied: dict[int, Epoch] = {}
         self._late: list[tuple[int, Item]] = []
@@ -123,6 +128,7 @@ class Sequencer:
         key = channel_and_source(item)
         in_past = stamp <= self._released_ns and not isinstance(item, InitialPose)
         if in_past and self._history_ns > 0:
+            self.mark(key[0], stamp)  # first heard of late, it is waited for from now on
             return self._add_late(stamp, key, item)
         epoch = self._pending.get(stamp)
         if self._last_of.get(key) == stamp or (epoch is not None and key in epoch.items):
@@ -140,7 +146,17 @@ class Sequencer:
 
     def mark(self, channel: str, stamp_ns: int) -> None:
         """Note that a channel has reached a stamp."""
+        if channel == IMU and self._tick_ns > 0:
+            self._tick(self._watermark.get(channel, stamp_ns), stamp_ns)
         self._watermark[channel] = max(stamp_ns, self._watermark.get(channel, stamp_ns))
+
+    def _tick(self, from_ns: int, to_ns: int) -> None:
+        """Have epochs at the multiples of the tick after ``from_ns``, none older than a second."""
+        first = max(from_ns, to_ns - self._live_ns, self._released_ns) // self._tick_ns + 1
+        for count in range(first, to_ns // self._tick_ns + 1):
+            stamp = count * self._tick_ns
+            if stamp not in self._pending:
+                self._pending[stamp] = Epoch(stamp)
 
     def take_late(self) -> list[tuple[int, Item]]:
         """Late items and their stamps, oldest first, to be merged into epochs applied before."""

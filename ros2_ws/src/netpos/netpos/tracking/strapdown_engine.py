@@ -8,11 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netpos.filters.compile import kernel
-from netpos.filters.error_state import MEMORY, Constraints, advance, correct, doubt_standstill
+from netpos.filters.error_state import (
+    MEMORY,
+    Imu,
+    Sensors,
+    advance,
+    correct,
+    doubt_standstill,
+)
 from netpos.filters.measurement import GROUP, KIND, ORIGIN, ROW_WIDTH, VALUE, VARIANCE
 from netpos.filters.position_fix import fix_position, start_of
 from netpos.filters.space import SpaceKind
-from netpos.inertial.strapdown import ERR, NAV, Earth, InertialNoise
+from netpos.inertial.strapdown import ERR, NAV
 from netpos.messages.values import Array
 
 Ints = NDArray[np.int64]
@@ -27,23 +34,8 @@ class Epochs(NamedTuple):
     rows: Array  # (M, ROW_WIDTH)
 
 
-class Imu(NamedTuple):
-    """Samples in base_link: stamps_ns (n,), rates (n, 6) angular velocity and specific force."""
-
-    stamps_ns: Ints
-    rates: Array
-
-
-class Sensors(NamedTuple):
-    """What the filter takes to be true of IMU, earth and vehicle."""
-
-    noise: InertialNoise
-    earth: Earth
-    constraints: Constraints
-
-
 class Drive(NamedTuple):
-    """After each of N epochs: nav (N, NAV), cov (N, ERR, ERR), nis and the rows behind it (N,)."""
+    """After each of N epochs: nav (N, n + 1), cov (N, n, n), nis and the rows behind it (N,)."""
 
     nav: Array
     cov: Array
@@ -61,25 +53,14 @@ def drive(
     sensors: Sensors,
     gate_nis: Array,
 ) -> Drive:
-    """Filter a drive from ``nav`` (NAV,) and ``cov`` (ERR, ERR) at ``start_ns``."""
+    """Filter a drive from ``nav`` (n + 1,) and ``cov`` (n, n) at ``start_ns``."""
     n = epochs.stamps_ns.size
-    navs, covs = np.empty((n, NAV)), np.empty((n, ERR, ERR))
+    navs, covs = np.empty((n, nav.size)), np.empty((n, cov.shape[0], cov.shape[0]))
     nis, dof = np.zeros(n), np.zeros(n, np.int64)
     state, P, memory, now = nav.copy(), cov.copy(), np.zeros(MEMORY), start_ns
     for i in range(n):
         stamp = epochs.stamps_ns[i]
-        advance(
-            state,
-            P,
-            memory,
-            now,
-            stamp,
-            imu.stamps_ns,
-            imu.rates,
-            sensors.noise,
-            sensors.earth,
-            sensors.constraints,
-        )
+        advance(state, P, memory, now, stamp, imu, sensors)
         now = stamp
         rows = epochs.rows[epochs.row_start[i] : epochs.row_start[i + 1]]
         if rows.shape[0] > 0:
@@ -125,8 +106,8 @@ def compile_kernels(sensors: Sensors) -> None:
     """Compile, or load, what a track calls epoch by epoch, before its first measurement."""
     nav, cov, memory = np.zeros(NAV), np.eye(ERR), np.zeros(MEMORY)
     nav[9] = 1.0
-    stamps, rates = np.array([10_000_000], dtype=np.int64), np.zeros((1, 6))
-    advance(nav, cov, memory, 0, 10_000_000, stamps, rates, *sensors)
+    imu = Imu(np.array([10_000_000], dtype=np.int64), np.zeros((1, 6)))
+    advance(nav, cov, memory, 0, 10_000_000, imu, sensors)
     rows = np.zeros((3, ROW_WIDTH))
     rows[:, KIND], rows[:, VARIANCE] = _PLACE, 1.0
     rows[:, ORIGIN : ORIGIN + 3] = np.eye(3)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.linalg import block_diag
 
-from netpos.filters.error_state import Constraints
+from netpos.filters.error_state import Constraints, Sensors, SlowErrors
+from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.filters.space import CLOCK
 from netpos.inertial.strapdown import (
     ERR,
     NAV,
@@ -19,7 +22,6 @@ from netpos.inertial.strapdown import (
 )
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.strapdown_engine import Sensors
 
 
 def sensors_of(config: TrackerConfig) -> Sensors:
@@ -41,6 +43,11 @@ def sensors_of(config: TrackerConfig) -> Sensors:
             config.still_force_mps2,
             config.still_rate_radps,
         ),
+        slow=SlowErrors(
+            SPEED_OF_LIGHT_MPS * config.clock_white_density,
+            SPEED_OF_LIGHT_MPS * config.clock_walk_density,
+            np.zeros((2, 0)),
+        ),
     )
 
 
@@ -50,6 +57,22 @@ def nav_of(position: Array, velocity: Array, quaternion: Array) -> Array:
     nav[POSITION:VELOCITY], nav[VELOCITY:QUATERNION] = position, velocity
     nav[QUATERNION : QUATERNION + 4] = quaternion
     return nav
+
+
+def with_clock(config: TrackerConfig, nav: Array, cov: Array) -> tuple[Array, Array]:
+    """A start nav (NAV,), cov (ERR, ERR) with the clock of which nothing has been heard."""
+    c = SPEED_OF_LIGHT_MPS
+    sd = np.array([c * config.clock_offset_sd_s, c * config.clock_drift_sd])
+    return np.append(nav, [0.0, c * config.clock_drift_mean]), block_diag(cov, np.diag(sd**2))
+
+
+def grown_in_space(nav: Array, cov: Array, sd: Array) -> tuple[Array, Array]:
+    """State with a clock, nav (n + 1,), cov (n, n), and those of the biases of standard deviations
+    ``sd`` (k,), in the order of the states, that it lacks."""
+    new = sd[len(cov) - CLOCK - 2 :]
+    if not new.size:
+        return nav, cov
+    return np.append(nav, np.zeros(new.size)), block_diag(cov, np.diag(new**2))
 
 
 def start_sd(

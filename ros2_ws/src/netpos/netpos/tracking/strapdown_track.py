@@ -1,7 +1,9 @@
 """One device in space: the strapdown filter behind the interface of ``track.Track``.
 
-Every range and angle is an update of the error-state filter (tight coupling), position fixes are
-the loose one. There is no clock state: a TOA is refused, a two-way range is not.
+Every range, time and angle is an update of the error-state filter (tight coupling), position
+fixes are the loose one. Its states are followed by the device's clock and by the biases RSUs
+declare. Between epochs the odometry may be given out at a rate of its own: the estimate moved by
+the IMU, which leaves the track as it is.
 """
 
 from __future__ import annotations
@@ -12,38 +14,34 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from netpos.filters.error_state import MEMORY, advance, correct, doubt_standstill
-from netpos.filters.measurement import GATE_VARIANCE, KIND, VARIANCE, Kind, rsu_rows
-from netpos.filters.space import SpaceKind, direction_rows, place_rows
-from netpos.messages.values import (
-    Array,
-    Field,
-    GroundSpeed,
-    InitialPose,
-    Odometry,
-    RsuMeasurement,
-    TrackStatus,
-)
+from netpos.filters.error_state import MEMORY, Imu, Sensors, advance, correct, doubt_standstill
+from netpos.filters.measurement import GROUP, KIND, VARIANCE, Kind
+from netpos.filters.space import CLOCK, SpaceKind
+from netpos.filters.space_conditioning import condition_in_space
+from netpos.messages.values import Array, InitialPose, Odometry, RsuMeasurement, TrackStatus
 from netpos.tracking import output
-from netpos.tracking.config import TrackerConfig
+from netpos.tracking.batch import Batch, mostly_accepted
+from netpos.tracking.blockage import Blockage
+from netpos.tracking.config import ROBUST, TrackerConfig
+from netpos.tracking.fit import observe, observe_isolated, with_refused, without_isolated
+from netpos.tracking.health import RsuHealth
 from netpos.tracking.history import History, merge
 from netpos.tracking.models import gate_thresholds
 from netpos.tracking.protection import NisWindow, protection_level
-from netpos.tracking.rsus import Rsu
+from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sequencer import Epoch, Item
-from netpos.tracking.smoothing import Posterior
 from netpos.tracking.strapdown_engine import compile_kernels
-from netpos.tracking.strapdown_models import sensors_of
+from netpos.tracking.strapdown_models import grown_in_space, sensors_of, with_clock
+from netpos.tracking.strapdown_output import odometry_of
+from netpos.tracking.strapdown_rows import Source, batch_in_space, fits_in_space, usable
+from netpos.tracking.strapdown_smoothing import Recorder
 from netpos.tracking.strapdown_start import SampleBuffer, StrapdownStart
 from netpos.tracking.track import TrackOutput
 
-_SCALARS = Field.AZIMUTH | Field.ELEVATION | Field.RANGE
 _POSE_VAR_MIN = 1e-4  # an initial pose may leave the height's variance at 0
 _RATE_WINDOW_NS = 50_000_000
-_GYRO_MEAN_S = 0.01  # of one sample of a usual IMU
-_SPEED = int(SpaceKind.BODY_VELOCITY)
+_FIRST_BIAS = CLOCK + 2
 
 
 @dataclass(slots=True)
@@ -53,14 +51,20 @@ class _Estimate:
     cov: Array
     memory: Array
 
+    def copy(self) -> _Estimate:
+        return _Estimate(self.stamp_ns, self.nav.copy(), self.cov.copy(), self.memory.copy())
+
 
 @dataclass(slots=True)
 class _State:
     """All of a track that changes with an epoch."""
 
     start: StrapdownStart
+    blockage: Blockage
+    biases: BiasStates = field(default_factory=lambda: BiasStates(_FIRST_BIAS))
     estimate: _Estimate | None = None
     posed: bool = False
+    has_clock: bool = False
     nis_window: NisWindow = field(default_factory=NisWindow)
     rejected_in_row: int = 0
     last_accepted_ns: int = 0
@@ -72,20 +76,12 @@ class _State:
         if self.estimate is None:
             twin.start = self.start.copy()
         else:
-            e = self.estimate
-            twin.estimate = _Estimate(e.stamp_ns, e.nav.copy(), e.cov.copy(), e.memory.copy())
+            twin.estimate = self.estimate.copy()
+        twin.biases = self.biases.copy()
+        twin.blockage = self.blockage.copy()
         twin.nis_window = self.nis_window.copy()
         twin.rejected = self.rejected.copy()
         return twin
-
-
-@dataclass(frozen=True, slots=True)
-class _Block:
-    """Rows of one item; ``lever`` (3,) of its antenna, ``source`` who sent it."""
-
-    rows: Array
-    lever: Array
-    source: str
 
 
 def warm_up(config: TrackerConfig) -> None:
@@ -93,22 +89,48 @@ def warm_up(config: TrackerConfig) -> None:
     compile_kernels(sensors_of(config))
 
 
+def track_of(
+    vue_id: str,
+    config: TrackerConfig,
+    rsus: Mapping[str, Rsu],
+    health: RsuHealth,
+    *,
+    record: bool,
+) -> StrapdownTrack:
+    """A new track; ``record``: for a smoother."""
+    track = StrapdownTrack(vue_id, config, rsus, health)
+    track.recorder = Recorder() if record else None
+    return track
+
+
 class StrapdownTrack:
     """Estimator of one device in space. Epochs come in stamp order; time is theirs."""
 
-    def __init__(self, vue_id: str, config: TrackerConfig, rsus: Mapping[str, Rsu]) -> None:
+    def __init__(
+        self,
+        vue_id: str,
+        config: TrackerConfig,
+        rsus: Mapping[str, Rsu],
+        health: RsuHealth | None = None,
+    ) -> None:
         self._vue_id = vue_id
         self._config = config
         self._rsus = rsus
+        self._health = health or RsuHealth()
         self._sensors = sensors_of(config)
         self._gate = gate_thresholds(config.gate_probability)
+        self._gyro = config.gyro_noise_density
+        self._robust = ROBUST.index(config.robust)
         self._history: History[_State] = History(int(config.history_s * 1e9))
-        self.posteriors: list[Posterior] | None = None
-        """Always None: there is no smoother."""
+        self.recorder: Recorder | None = None
+        """Where what a smoother needs is kept; None: nowhere."""
         self.imu = SampleBuffer()
         self.refused: Counter[str] = Counter()
         """Measurements refused at the door, by reason."""
-        self._state = _State(StrapdownStart(config))
+        self._state = self._fresh()
+
+    def _fresh(self) -> _State:
+        return _State(StrapdownStart(self._config), Blockage.of(self._config))
 
     @property
     def rejected(self) -> Counter[str]:
@@ -123,87 +145,96 @@ class StrapdownTrack:
 
     def _forget(self) -> None:
         old = self._state
-        self._state = _State(StrapdownStart(self._config))
+        self._state = self._fresh()
         self._state.accepted, self._state.rejected = old.accepted, old.rejected
 
     def step(self, epoch: Epoch) -> TrackOutput:
-        """Apply one epoch and report."""
+        """Apply one epoch and report; one without items is only reported of."""
         self._history.remember(epoch, self._state)
-        blocks: list[_Block] = []
+        if not epoch.items:
+            return self._between(epoch.stamp_ns)
+        items: list[Source] = []
         for item in epoch.sorted():
             if isinstance(item, InitialPose):
                 self._start_from_pose(epoch.stamp_ns, item)
+            elif usable(item):
+                items.append(item)  # type: ignore[arg-type]
             else:
-                block = self._block(item, len(blocks))
-                if block is not None:
-                    blocks.append(block)
+                self._state.rejected["unsupported_fields"] += 1
         estimate = self._state.estimate
         if estimate is not None:
             silent_s = (epoch.stamp_ns - self._state.last_accepted_ns) * 1e-9
             if silent_s > self._config.max_gap_s:
                 self._forget()
-        nis, dof = 0.0, 0
-        sources: tuple[str, ...] = ()
-        if self._state.estimate is None:
-            sources = self._try_start(epoch.stamp_ns, blocks)
-        else:
-            self._advance(epoch.stamp_ns)
-            if blocks:
-                nis, dof, sources = self._update(epoch.stamp_ns, blocks)
-        return self._report(epoch.stamp_ns, nis, dof, sources)
+        nis, dof, sources = self._apply(epoch.stamp_ns, items)
+        self._record()
+        return self._report(self._state.estimate, epoch.stamp_ns, nis, dof, sources)
+
+    def _between(self, stamp_ns: int) -> TrackOutput:
+        """Report of an instant between epochs; nothing changes."""
+        estimate = self._state.estimate
+        if estimate is not None:
+            estimate = estimate.copy()
+            self._advance(estimate, stamp_ns, None)
+        return self._report(estimate, stamp_ns, 0.0, 0, ())
 
     def revise(self, late: list[tuple[int, Item]]) -> tuple[list[Epoch], TrackOutput]:
         """Go back to the oldest of the late items and apply all epochs since then once more; the
         epochs that are new, and the report of the newest."""
         epochs, state = self._history.go_back(late[0][0])
         self._state = state or self._state
+        if self.recorder is not None:
+            estimate = self._state.estimate
+            self.recorder.go_back(estimate.stamp_ns if estimate else epochs[0].stamp_ns - 1)
         made = [merge(epochs, stamp_ns, item) for stamp_ns, item in late]
+        self._health.rewind(self._vue_id, epochs[0].stamp_ns)
         results = [self.step(epoch) for epoch in epochs]
         return [epoch for epoch in made if epoch is not None], replace(results[-1], revised=True)
 
     # measurements
 
-    def _block(self, item: Item, group: int) -> _Block | None:
-        if isinstance(item, GroundSpeed):
-            ahead, value = np.array([[1.0, 0.0, 0.0]]), np.array([item.speed_mps])
-            variance = np.array([item.speed_var])
-            rows = direction_rows(SpaceKind.BODY_VELOCITY, ahead, value, variance, group)
-            return _Block(rows, np.zeros(3), item.source)
-        if not isinstance(item, RsuMeasurement):
-            self._state.rejected["unsupported_fields"] += 1
-            return None
-        blocks = []
-        if item.fields & _SCALARS:
-            rsu = self._rsus[item.rsu_id]
-            scalars = replace(item, fields=item.fields & _SCALARS)
-            rows = rsu_rows(scalars, rsu.info, rsu.axes, group)
-            if not rsu.plain:
-                _widen(rows, rsu)
-            blocks.append(rows)
-        if item.fields & Field.POSITION:
-            blocks.append(place_rows(item.position, item.position_cov, item.lever_arm, group))
-        if not blocks:
-            self._state.rejected["toa_without_clock"] += 1
-            return None
-        return _Block(np.vstack(blocks), np.array(item.lever_arm), item.rsu_id)
+    def _apply(self, stamp_ns: int, items: list[Source]) -> tuple[float, int, tuple[str, ...]]:
+        watched: list[RsuMeasurement] = []
+        if self._config.isolate_rsus:
+            items, watched = without_isolated(self._health, stamp_ns, items)
+            self._state.rejected.update(["isolated_rsu"] * len(watched))
+        batch = batch_in_space(items, self._rsus, self._state.biases) if items else None
+        estimate = self._state.estimate
+        if estimate is None:
+            return 0.0, 0, self._try_start(stamp_ns, batch) if batch else ()
+        self._grow(estimate)
+        self._advance(estimate, stamp_ns, self.recorder)
+        for item in watched:
+            alone = batch_in_space([item], self._rsus, None)
+            fits, rsu = fits_in_space(alone.rows, estimate.nav, estimate.cov), item.rsu_id
+            observe_isolated(
+                self._health, self._vue_id, stamp_ns, alone, fits, self._rsus[rsu], self._gate
+            )
+        return self._update(stamp_ns, estimate, batch) if batch else (0.0, 0, ())
 
-    def _update(self, stamp_ns: int, blocks: list[_Block]) -> tuple[float, int, tuple[str, ...]]:
-        state = self._state
-        assert state.estimate is not None
-        rows = np.vstack([block.rows for block in blocks])
-        accepted = np.zeros(len(blocks))
-        nis, dof = correct(state.estimate.nav, state.estimate.cov, rows, self._gate, accepted)
-        refused = int(len(blocks) - accepted.sum())
+    def _update(
+        self, stamp_ns: int, estimate: _Estimate, batch: Batch
+    ) -> tuple[float, int, tuple[str, ...]]:
+        state, nav, cov = self._state, estimate.nav, estimate.cov
+        state.blockage.expect(batch)
+        self._condition(batch, nav, cov)
+        state.blockage.learn(batch)
+        fits = fits_in_space(batch.rows, nav, cov)
+        accepted = np.zeros(len(batch.items))
+        nis, dof = correct(nav, cov, batch.rows, self._gate, accepted)
+        refused = int(len(batch.items) - accepted.sum())
         if refused:
             state.rejected["gate"] += refused
-        self._note_fit(nis, dof, blocks, accepted)
+        state.nis_window.add(*with_refused(batch, accepted, self._gate, nis, dof))
+        if self._config.isolate_rsus:
+            observe(self._health, self._vue_id, stamp_ns, batch, fits, accepted)
+        sources: tuple[str, ...] = ()
         if dof > 0:
-            state.last_accepted_ns = stamp_ns
+            sources = self._note_accepted(stamp_ns, batch, accepted)
+            state.has_clock |= bool((batch.rows[:, KIND] == Kind.TOA).any())
         else:
-            doubt_standstill(state.estimate.memory)
-        sources = tuple(b.source for b, taken in zip(blocks, accepted, strict=True) if taken)
-        state.accepted += len(sources)
-        if 2 * len(sources) >= len(blocks):
+            doubt_standstill(estimate.memory)
+        if mostly_accepted(batch, accepted):
             state.rejected_in_row = 0
             return nis, dof, sources
         state.rejected_in_row += 1
@@ -212,14 +243,26 @@ class StrapdownTrack:
             self._forget()
         return nis, dof, sources
 
-    def _note_fit(self, nis: float, dof: int, blocks: list[_Block], accepted: Array) -> None:
-        """Tell the protection level how the epoch fitted, what was refused as at its gate."""
-        for block, taken in zip(blocks, accepted, strict=True):
+    def _condition(self, batch: Batch, nav: Array, cov: Array) -> None:
+        """Re-weight the rows of an epoch as the robust options say."""
+        cfg = self._config
+        if self._robust or cfg.nlos_probability > 0.0:
+            condition_in_space(
+                nav, cov, batch.rows, self._robust, cfg.robust_parameter, cfg.nlos_probability,
+                cfg.nlos_mean_excess_m,
+            )  # fmt: skip
+
+    def _note_accepted(self, stamp_ns: int, batch: Batch, accepted: Array) -> tuple[str, ...]:
+        state, sources = self._state, []
+        for item, taken in zip(batch.items, accepted, strict=True):
             if not taken:
-                size = len(block.rows)
-                nis += float(self._gate[min(size, self._gate.size - 1)])
-                dof += size
-        self._state.nis_window.add(nis, dof)
+                continue
+            if isinstance(item, RsuMeasurement):
+                state.biases.accepted(self._rsus[item.rsu_id], item)
+            sources.append(item.rsu_id if isinstance(item, RsuMeasurement) else item.source)
+        state.accepted += len(sources)
+        state.last_accepted_ns = stamp_ns
+        return tuple(sources)
 
     # start and motion
 
@@ -229,55 +272,106 @@ class StrapdownTrack:
         cov = pose.cov + np.diag([0.0, 0.0, _POSE_VAR_MIN if pose.cov[2, 2] == 0.0 else 0.0])
         self._state.start.add_fix(stamp_ns, pose.position.copy(), cov, np.zeros(3))
 
-    def _try_start(self, stamp_ns: int, blocks: list[_Block]) -> tuple[str, ...]:
+    def _try_start(self, stamp_ns: int, batch: Batch) -> tuple[str, ...]:
         state = self._state
         if self._config.require_initial_pose and not state.posed and not state.accepted:
-            state.rejected["no_initial_pose"] += len(blocks)
+            state.rejected["no_initial_pose"] += len(batch.items)
             return ()
-        ranged = [block for block in blocks if (block.rows[:, KIND] != _SPEED).all()]
-        if not ranged:
+        rsus = [item for item in batch.items if isinstance(item, RsuMeasurement)]
+        if not rsus:
             return ()
-        rows = np.vstack([block.rows for block in ranged])
-        state.start.add_rows(stamp_ns, rows, ranged[0].lever)
+        rows = batch.rows[batch.rows[:, KIND] != SpaceKind.BODY_VELOCITY]
+        rows[:, VARIANCE] += state.biases.noise_of(rows)
+        state.start.add_rows(stamp_ns, rows, np.array(rsus[0].lever_arm))
         found = state.start.solve(self.imu)
         if found is None or found[0] != stamp_ns:
             return ()
-        state.estimate = _Estimate(*found, np.zeros(MEMORY))
-        state.last_accepted_ns = stamp_ns
-        state.accepted += len(ranged)
-        return tuple(block.source for block in ranged)
+        nav, cov = with_clock(self._config, *found[1:])
+        state.estimate = _Estimate(stamp_ns, nav, cov, np.zeros(MEMORY))
+        self._grow(state.estimate)
+        self._set_clock(state.estimate, rows)
+        if self.recorder is not None:
+            self.recorder.begin(stamp_ns, state.estimate.nav, state.estimate.cov)
+        return self._note_accepted(stamp_ns, batch, np.ones(len(batch.items)))
 
-    def _advance(self, stamp_ns: int) -> None:
-        estimate = self._state.estimate
-        if estimate is None or stamp_ns <= estimate.stamp_ns:
+    def _set_clock(self, estimate: _Estimate, rows: Array) -> None:
+        """Read the clock's offset off one time of arrival: the place is in the start already."""
+        times = rows[rows[:, KIND] == Kind.TOA][:1].copy()
+        if len(times):
+            self._state.has_clock = True
+            times[:, GROUP] = 0
+            if self._config.nlos_probability > 0.0:
+                times[:, VARIANCE] += self._config.nlos_mean_excess_m**2
+            correct(estimate.nav, estimate.cov, times, np.full(2, np.inf), np.zeros(1))
+
+    def _grow(self, estimate: _Estimate) -> None:
+        sd = np.array(self._state.biases.sd)
+        estimate.nav, estimate.cov = grown_in_space(estimate.nav, estimate.cov, sd)
+
+    def _advance(self, estimate: _Estimate, stamp_ns: int, recorder: Recorder | None) -> None:
+        """Move ``estimate`` to ``stamp_ns``; it has states for all biases heard of."""
+        if stamp_ns <= estimate.stamp_ns:
             return
-        stamps, rates = self.imu.between(estimate.stamp_ns, stamp_ns)
-        advance(
-            estimate.nav,
-            estimate.cov,
-            estimate.memory,
-            estimate.stamp_ns,
-            stamp_ns,
-            stamps,
-            rates,
-            self._sensors.noise,
-            self._sensors.earth,
-            self._sensors.constraints,
-        )
+        imu = Imu(*self.imu.between(estimate.stamp_ns, stamp_ns))
+        move = advance if recorder is None else recorder.advance
+        span = (estimate.stamp_ns, stamp_ns)
+        move(estimate.nav, estimate.cov, estimate.memory, *span, imu, self._sensors_now())
         estimate.stamp_ns = stamp_ns
+
+    def _sensors_now(self) -> Sensors:
+        slow = self._sensors.slow._replace(biases=self._state.biases.arrays())
+        return self._sensors._replace(slow=slow)
 
     # output
 
+    def _record(self) -> None:
+        estimate = self._state.estimate
+        if self.recorder is not None and estimate is not None:
+            rate, sd = self._rate(estimate.stamp_ns), np.array(self._state.biases.sd)
+            self.recorder.note(estimate.nav, estimate.cov, rate, sd)
+
+    def _rate(self, stamp_ns: int) -> Array | None:
+        """(3,) angular velocity as the newest sample has it."""
+        _, rates = self.imu.between(stamp_ns - _RATE_WINDOW_NS, stamp_ns)
+        return np.asarray(rates[-1, :3]) if len(rates) else None
+
+    def smoothed(self) -> list[Odometry]:
+        """Odometry of all epochs recorded, given all measurements."""
+        if self.recorder is None:
+            return []
+        return [
+            odometry_of(i.stamp_ns, self._vue_id, i.nav, i.cov, i.rate, self._gyro)
+            for i in self.recorder.smoothed()
+        ]
+
     def _report(
-        self, stamp_ns: int, nis: float, dof: int, sources: tuple[str, ...]
+        self,
+        estimate: _Estimate | None,
+        stamp_ns: int,
+        nis: float,
+        dof: int,
+        sources: tuple[str, ...],
     ) -> TrackOutput:
-        state, estimate = self._state, self._state.estimate
+        state = self._state
         position_sd, level, heard_ns = 0.0, -1.0, None
+        odometry, clock = None, None
         if estimate is not None:
             heard_ns = state.last_accepted_ns
             position_sd = output.largest_sd(estimate.cov)
             risk, inflation = self._config.integrity_risk, state.nis_window.inflation()
             level = protection_level(estimate.cov[:2, :2], risk, inflation)
+            odometry = odometry_of(
+                stamp_ns,
+                self._vue_id,
+                estimate.nav,
+                estimate.cov,
+                self._rate(stamp_ns),
+                self._gyro,
+            )
+            if state.has_clock:
+                there = slice(CLOCK, CLOCK + 2)
+                mean, cov = estimate.nav[CLOCK + 1 : CLOCK + 3], estimate.cov[there, there]
+                clock = output.clock_state(stamp_ns, self._vue_id, mean, cov)
         status = TrackStatus(
             stamp_ns=stamp_ns,
             vue_id=self._vue_id,
@@ -291,49 +385,4 @@ class StrapdownTrack:
             position_sd_m=position_sd,
             protection_level_m=level,
         )
-        odometry = None if estimate is None else self._odometry(estimate)
-        return TrackOutput(odometry, None, status)
-
-    def _odometry(self, estimate: _Estimate) -> Odometry:
-        stamp = estimate.stamp_ns
-        _, rates = self.imu.between(stamp - _RATE_WINDOW_NS, stamp)
-        rate = rates[-1, :3] - estimate.nav[13:] if len(rates) else np.zeros(3)
-        return odometry_of(stamp, self._vue_id, estimate.nav, estimate.cov, rate,
-                           self._config.gyro_noise_density)  # fmt: skip
-
-
-def _widen(rows: Array, rsu: Rsu) -> None:
-    """Slow errors an RSU declares count as noise here: there are no states for them."""
-    for row in rows:
-        kind = Kind(int(row[KIND]))
-        common = rsu.info.common_range_bias_sd_m if kind is Kind.RANGE else 0.0
-        extra = rsu.bias_sd(kind) ** 2 + common**2
-        row[VARIANCE] += extra
-        row[GATE_VARIANCE] += extra
-
-
-def odometry_of(
-    stamp_ns: int, vue_id: str, nav: Array, cov: Array, rate: Array, gyro_density: float
-) -> Odometry:
-    """Odometry of a navigation state (NAV,): pose in map, twist in base_link.
-
-    cov : (ERR, ERR); rate : (3,) angular velocity in base_link [rad/s], gyro_density : its noise
-    """
-    C = Rotation.from_quat(nav[6:10]).as_matrix()
-    v = nav[3:6]
-    cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-    pose = np.r_[0:3, 6:9]
-    J = np.hstack([C.T, C.T @ cross])  # of C' v for errors of velocity and attitude
-    twist_cov = np.zeros((6, 6))
-    twist_cov[:3, :3] = J @ cov[3:9, 3:9] @ J.T
-    twist_cov[3:, 3:] = cov[12:, 12:] + gyro_density**2 / _GYRO_MEAN_S * np.eye(3)
-    return Odometry(
-        stamp_ns=stamp_ns,
-        vue_id=vue_id,
-        position=nav[:3].copy(),
-        quaternion=nav[6:10].copy(),
-        linear_velocity=C.T @ v,
-        angular_velocity=rate,
-        pose_cov=cov[np.ix_(pose, pose)],
-        twist_cov=(twist_cov + twist_cov.T) / 2.0,
-    )
+        return TrackOutput(odometry, clock, status)

@@ -11,9 +11,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from netpos.filters.measurement import (
-    BIAS,
-    COMMON,
-    GROUP,
     KIND,
     VARIANCE,
     Kind,
@@ -33,9 +30,14 @@ from netpos.tracking import estimates, output
 from netpos.tracking.batch import Batch, Source, batch_of, mostly_accepted, velocity_inflation
 from netpos.tracking.blockage import Blockage
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.engine import GATE_SIZE
 from netpos.tracking.estimates import Estimate
-from netpos.tracking.fit import observe, row_fits, widen
+from netpos.tracking.fit import (
+    observe,
+    observe_isolated,
+    row_fits,
+    with_refused,
+    without_isolated,
+)
 from netpos.tracking.health import RsuHealth
 from netpos.tracking.history import History, merge
 from netpos.tracking.imu_buffer import ImuBuffer
@@ -47,7 +49,7 @@ from netpos.tracking.protection import NisWindow, protection_level, unnoticed_sh
 from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sectors import Sectors
 from netpos.tracking.sequencer import Epoch, Item
-from netpos.tracking.smoothing import FixedLag, Posterior
+from netpos.tracking.smoothing import FixedLag, Posterior, Smoother
 from netpos.tracking.steadiness import Steadiness
 
 _IMU_HOLE_S = 0.05
@@ -210,6 +212,10 @@ class Track:
             return result
         return replace(result, smoothed=tuple(self._fixed_lag.add(posterior)))
 
+    def smoothed(self) -> list[Odometry]:
+        """Odometry of every posterior kept, given all measurements."""
+        return Smoother(self._vue_id, self._config).interval(self.posteriors or [])
+
     def revise(self, late: list[tuple[int, Item]]) -> tuple[list[Epoch], TrackOutput]:
         """Go back to the oldest of the late items and apply all epochs since then once more.
 
@@ -239,14 +245,9 @@ class Track:
         """What may be fused, and what comes from an isolated RSU and is only looked at."""
         if not self._config.isolate_rsus:
             return items, []
-        used: list[Source] = []
-        watched = []
-        for item in items:
-            if isinstance(item, RsuMeasurement) and self._health.isolated(item.rsu_id, stamp_ns):
-                watched.append(item)
-                self._state.rejected["isolated_rsu"] += 1
-            else:
-                used.append(item)
+        used, watched = without_isolated(self._health, stamp_ns, items)
+        if watched:
+            self._state.rejected["isolated_rsu"] += len(watched)
         return used, watched
 
     def _batch(self, items: list[Source]) -> Batch:
@@ -274,11 +275,7 @@ class Track:
             state.rejected["no_initial_pose"] += len(batch.items)
             return ()
         heard = tuple(self._rsus[i.rsu_id] for i in batch.items if isinstance(i, RsuMeasurement))
-        bias_var = np.zeros(len(batch.rows))
-        for column in (BIAS, COMMON):
-            for i, index in enumerate(batch.rows[:, column].astype(int)):
-                if index >= 0:
-                    bias_var[i] += state.biases.sd[index - state.biases.first] ** 2
+        bias_var = state.biases.noise_of(batch.rows)
         if state.phase_start.heard(batch):
             state.estimate = state.phase_start.add(stamp_ns, batch.rows, bias_var)
             started = np.full(len(batch.items), state.estimate is not None)
@@ -352,12 +349,7 @@ class Track:
     ) -> None:
         """Tell the protection level and the health of the RSUs how the epoch fitted."""
         state = self._state
-        if dof < len(batch.rows):
-            sizes = np.bincount(batch.rows[:, GROUP].astype(int), minlength=len(accepted))
-            for size, taken in zip(sizes.tolist(), accepted, strict=True):
-                if not taken:
-                    nis += float(self._gate[min(size, GATE_SIZE - 1)])
-                    dof += size
+        nis, dof = with_refused(batch, accepted, self._gate, nis, dof)
         if math.isfinite(nis):
             state.nis_window.add(nis, dof)
         assert state.estimate is not None
@@ -378,9 +370,8 @@ class Track:
         for item in watched:
             batch = batch_of([item], self._rsus, None, self._heading)
             fits = row_fits(mean, cov, batch.rows, self._config.device_height_m)
-            widen(fits, batch.rows, self._rsus[item.rsu_id])
-            fitting = bool(((fits[:, 0] / fits[:, 1]) ** 2 <= self._gate[1]).all())
-            observe(self._health, self._vue_id, stamp_ns, batch, fits, np.array([fitting]))
+            rsu = self._rsus[item.rsu_id]
+            observe_isolated(self._health, self._vue_id, stamp_ns, batch, fits, rsu, self._gate)
 
     def _note_accepted(self, stamp_ns: int, batch: Batch, accepted: Array) -> tuple[str, ...]:
         state = self._state
@@ -441,7 +432,7 @@ class Track:
             odometry = output.with_yaw_rate(odometry, mean, cov, self._heading)
         clock = None
         if state.has_clock:
-            clock = output.clock_state(stamp_ns, self._vue_id, mean, cov)
+            clock = output.clock_state(stamp_ns, self._vue_id, mean[4:6], cov[4:6, 4:6])
         track = None
         if self._secondary is not None:
             track = self._secondary.track(state.own, state.segment, estimate, state.bias)

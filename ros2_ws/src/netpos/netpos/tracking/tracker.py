@@ -12,6 +12,7 @@ from netpos.messages.values import (
     GroundSpeed,
     ImuSample,
     InitialPose,
+    Odometry,
     RsuInfo,
     RsuMeasurement,
     Velocity,
@@ -21,7 +22,7 @@ from netpos.tracking.config import TrackerConfig
 from netpos.tracking.health import HealthConfig, RsuHealth, RsuReport
 from netpos.tracking.rsus import Rsu
 from netpos.tracking.sequencer import IMU, Epoch, Item, Sequencer
-from netpos.tracking.smoothing import Posterior, check_smoothable
+from netpos.tracking.smoothing import check_smoothable
 from netpos.tracking.track import Track, TrackOutput
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ class Tracker:
     def __init__(
         self, config: TrackerConfig | None = None, *, keep_posteriors: bool = False
     ) -> None:
-        """``keep_posteriors``: for ``posteriors``, the memory of a whole recording.
+        """``keep_posteriors``: for ``smoothed``, the memory of a whole recording.
 
         Raises ``ValueError`` where they are wanted of a tracker that cannot be smoothed.
         """
@@ -131,9 +132,10 @@ class Tracker:
         """Refused and rejected measurements by device and reason."""
         return {vue: track.rejected for vue, track in self._tracks.items()}
 
-    def posteriors(self) -> dict[str, list[Posterior]]:
-        """What the tracks knew after every epoch, by device, where they were asked to keep it."""
-        return {vue: track.posteriors or [] for vue, track in self._tracks.items()}
+    def smoothed(self) -> dict[str, list[Odometry]]:
+        """Odometry of every epoch given all measurements, by device; of a tracker that keeps
+        posteriors."""
+        return {vue: track.smoothed() for vue, track in self._tracks.items()}
 
     def rsu_reports(self) -> list[RsuReport]:
         """Health of the RSUs as of the newest measurement."""
@@ -180,18 +182,23 @@ class Tracker:
     def _sequencer(self, vue_id: str) -> Sequencer:
         if vue_id not in self._sequencers:
             self.track(vue_id)
+            strapdown = self._config.motion_model == "strapdown"
+            rate_hz = self._config.odometry_rate_hz if strapdown else 0.0
             self._sequencers[vue_id] = Sequencer(
                 int(self._config.hold_s * 1e9),
                 self._config.require_initial_pose,
                 int(self._config.history_s * 1e9),
                 int(self._config.max_future_s * 1e9),
+                tick_ns=round(1e9 / rate_hz) if rate_hz > 0.0 else 0,
             )
         return self._sequencers[vue_id]
 
     def track(self, vue_id: str) -> Track | StrapdownTrack:
         """Track of a device, new where there is none."""
         if vue_id not in self._tracks and self._config.motion_model == "strapdown":
-            self._tracks[vue_id] = _strapdown().StrapdownTrack(vue_id, self._config, self._rsus)
+            self._tracks[vue_id] = _strapdown().track_of(
+                vue_id, self._config, self._rsus, self._health, record=self._keep_posteriors
+            )
         elif vue_id not in self._tracks:
             track = Track(vue_id, self._config, self._rsus, self._health)
             track.posteriors = [] if self._keep_posteriors else None

@@ -8,6 +8,9 @@ from netpos.filters.error_state import (
     MEMORY,
     UNCONSTRAINED,
     Constraints,
+    Imu,
+    Sensors,
+    SlowErrors,
     advance,
     correct,
     doubt_standstill,
@@ -142,7 +145,13 @@ def test_advance_is_the_same_however_it_is_cut() -> None:
     for cuts in ([3_000_000_000], [777_000_000, 1_500_000_000, 3_000_000_000]):
         nav, cov, memory, now = moving(5.0), 1e-4 * np.eye(ERR), np.zeros(MEMORY), 0
         for end in cuts:
-            args = (memory, now, end, stamps, rates, NOISE, still_earth(), UNCONSTRAINED)
+            args = (
+                memory,
+                now,
+                end,
+                Imu(stamps, rates),
+                Sensors(NOISE, still_earth(), UNCONSTRAINED),
+            )
             assert advance(nav, cov, *args) == 0.0
             now = end
         ends.append((nav, cov))
@@ -163,8 +172,8 @@ def test_a_hole_of_the_imu_is_counted_and_opens_the_covariance(missing: str) -> 
     for mask in (np.ones(300, dtype=bool), keep):
         nav, cov = moving(5.0), 1e-8 * np.eye(ERR)
         blind = advance(
-            nav, cov, np.zeros(MEMORY), 0, 3 * 10**9, stamps[mask], rates[mask], NOISE,
-            still_earth(), UNCONSTRAINED,
+            nav, cov, np.zeros(MEMORY), 0, 3 * 10**9, Imu(stamps[mask], rates[mask]),
+            Sensors(NOISE, still_earth(), UNCONSTRAINED),
         )  # fmt: skip
         np.testing.assert_allclose(nav[:6], [15.0, 0, 0, 5.0, 0, 0], atol=1e-6)
         sds.append((blind, np.sqrt(cov[3, 3])))
@@ -180,7 +189,15 @@ def test_a_vehicle_does_not_slip() -> None:
     nav, cov = moving(10.0), np.diag([0.01] * 6 + [1e-4, 1e-4, 0.01] + [1e-6] * 6)
     nav[6:10] = Rotation.from_euler("z", 0.1).as_quat()
     held = Constraints(0.1, 0.1, 0.0, 0.0, 0.0)
-    advance(nav, cov, np.zeros(MEMORY), 0, 10**10, stamps, rates, NOISE, still_earth(), held)
+    advance(
+        nav,
+        cov,
+        np.zeros(MEMORY),
+        0,
+        10**10,
+        Imu(stamps, rates),
+        Sensors(NOISE, still_earth(), held),
+    )
     C = Rotation.from_quat(nav[6:10])
     assert abs(C.inv().apply(nav[3:6])[1]) < 0.02
     assert abs(C.as_euler("ZYX")[0]) < 0.02
@@ -197,7 +214,15 @@ def test_standstill_shows_the_gyro_bias(quiet: bool, standing: bool) -> None:
     noise = NOISE._replace(gyro_bias_sd_radps=0.01)
     rest = Constraints(0.0, 0.0, 0.02, 0.5, 0.1)
     nav = moving(0.0)
-    advance(nav, cov, np.zeros(MEMORY), 0, 10**10, stamps, rates, noise, still_earth(), rest)
+    advance(
+        nav,
+        cov,
+        np.zeros(MEMORY),
+        0,
+        10**10,
+        Imu(stamps, rates),
+        Sensors(noise, still_earth(), rest),
+    )
     known = np.abs(nav[GYRO_BIAS:] - [0.002, -0.001, 0.003]).max() < 5e-4
     assert known is np.bool_(standing)
     assert (np.sqrt(cov[3, 3]) < 0.01) is np.bool_(standing)
@@ -209,7 +234,15 @@ def test_a_quiet_cruise_is_no_standstill(sd: float) -> None:
     stamps, rates = level(500)
     nav, cov = moving(15.0), np.diag([0.01] * 3 + [sd**2] * 3 + [1e-8] * 9)
     rest = Constraints(0.0, 0.0, 0.02, 0.5, 0.1)
-    advance(nav, cov, np.zeros(MEMORY), 0, 5 * 10**9, stamps, rates, NOISE, still_earth(), rest)
+    advance(
+        nav,
+        cov,
+        np.zeros(MEMORY),
+        0,
+        5 * 10**9,
+        Imu(stamps, rates),
+        Sensors(NOISE, still_earth(), rest),
+    )
     assert nav[3] == pytest.approx(15.0, abs=1e-6)
 
 
@@ -219,7 +252,15 @@ def test_setting_off_gently_ends_a_standstill() -> None:
     rates[500:, 3] = 0.3
     nav, cov = moving(0.0), np.diag([0.01] * 3 + [1.0] * 3 + [1e-8] * 9)
     rest = Constraints(0.0, 0.0, 0.02, 0.2, 0.05)
-    advance(nav, cov, np.zeros(MEMORY), 0, 7 * 10**9, stamps, rates, NOISE, still_earth(), rest)
+    advance(
+        nav,
+        cov,
+        np.zeros(MEMORY),
+        0,
+        7 * 10**9,
+        Imu(stamps, rates),
+        Sensors(NOISE, still_earth(), rest),
+    )
     assert nav[3] == pytest.approx(0.6, abs=0.05)
 
 
@@ -230,7 +271,9 @@ def test_a_doubted_standstill_is_not_held() -> None:
         nav, cov, memory = moving(0.0), np.diag([1.0] * 6 + [1e-8] * 9), np.zeros(MEMORY)
         if doubted:
             doubt_standstill(memory)
-        advance(nav, cov, memory, 0, 8 * 10**9, stamps, rates, NOISE, still_earth(), rest)
+        advance(
+            nav, cov, memory, 0, 8 * 10**9, Imu(stamps, rates), Sensors(NOISE, still_earth(), rest)
+        )
         sds.append(np.sqrt(cov[3, 3]))
     assert sds[0] < 0.02
     assert sds[1] > 0.9
@@ -242,7 +285,13 @@ def test_the_attitude_is_that_of_the_middle_of_a_chunk() -> None:
     nav, cov = moving(0.0), np.diag([0.0] * 9 + [1.0, 0.0, 0.0] + [0.0] * 3)
     quiet = InertialNoise(0.0, 0.0, 0.0, 0.0, 1e9)
     advance(
-        nav, cov, np.zeros(MEMORY), 0, 10**8, stamps, rates, quiet, still_earth(), UNCONSTRAINED
+        nav,
+        cov,
+        np.zeros(MEMORY),
+        0,
+        10**8,
+        Imu(stamps, rates),
+        Sensors(quiet, still_earth(), UNCONSTRAINED),
     )
     assert np.arctan2(-cov[4, 9], -cov[3, 9]) == pytest.approx(0.1, abs=2e-3)
 
@@ -253,8 +302,8 @@ def test_estimated_biases_fade_with_their_time() -> None:
     nav[10:] = 0.1, 0.2, 0.3, 0.01, 0.02, 0.03
     known = nav[10:].copy()
     advance(
-        nav, np.eye(ERR), np.zeros(MEMORY), 0, 10**10, stamps, rates, NOISE, still_earth(),
-        UNCONSTRAINED,
+        nav, np.eye(ERR), np.zeros(MEMORY), 0, 10**10, Imu(stamps, rates),
+        Sensors(NOISE, still_earth(), UNCONSTRAINED),
     )  # fmt: skip
     np.testing.assert_allclose(nav[10:], np.exp(-0.1) * known, rtol=1e-9)
 
@@ -266,3 +315,28 @@ def test_constraint_rows_follow_their_covariance() -> None:
     correct(nav, cov, rows, OPEN, np.zeros(1))
     np.testing.assert_allclose(nav[3:6], 4.0 / 5.0, rtol=1e-6)
     np.testing.assert_allclose(np.diag(cov)[3:6], 4.0 / 5.0, rtol=1e-6)
+
+
+def test_slow_errors_move_as_their_models_say_and_leave_the_rest_alone() -> None:
+    """Clock and one bias over 10 s against closed forms; the core is the same to the bit."""
+    stamps, rates = level(1000, 0.1)
+    rates[:, 3] = 0.2
+    slow = SlowErrors(0.5, 0.2, np.array([[2.0], [30.0]]))
+    cov = np.diag([1.0] * 3 + [0.1] * 3 + [1e-4] * 3 + [1e-3] * 6 + [9.0, 4.0, 0.25])
+    nav = np.append(moving(5.0), [100.0, 7.0, 1.5])
+    core, core_cov = moving(5.0), cov[:ERR, :ERR].copy()
+    for x, P in ((nav, cov), (core, core_cov)):
+        sensors = Sensors(NOISE, still_earth(), Constraints(0.1, 0.1, 0.0, 0.0, 0.0), slow)
+        advance(x, P, np.zeros(MEMORY), 0, 10**10, Imu(stamps, rates), sensors)
+    np.testing.assert_array_equal(nav[:NAV], core)
+    np.testing.assert_array_equal(cov[:ERR, :ERR], core_cov)
+    np.testing.assert_allclose(nav[NAV:], [170.0, 7.0, 1.5 * np.exp(-10 / 30)], rtol=1e-12)
+    q, t = 0.2**2, 10.0
+    clock = [
+        [9.0 + 4.0 * t**2 + 0.25 * t + q * t**3 / 3, 4.0 * t + q * t**2 / 2],
+        [4.0 * t + q * t**2 / 2, 4.0 + q * t],
+    ]
+    np.testing.assert_allclose(cov[ERR : ERR + 2, ERR : ERR + 2], clock, rtol=1e-9)
+    fade = np.exp(-2 * t / 30.0)
+    assert cov[ERR + 2, ERR + 2] == pytest.approx(0.25 * fade + 4.0 * (1 - fade), rel=1e-9)
+    np.testing.assert_array_equal(cov[:ERR, ERR:], 0.0)

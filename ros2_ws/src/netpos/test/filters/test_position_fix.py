@@ -6,9 +6,18 @@ import math
 
 import numpy as np
 import pytest
-from netpos.filters.measurement import ROW_WIDTH, VALUE, VARIANCE, rsu_axes, rsu_rows
+from netpos.filters.measurement import (
+    KIND,
+    ROW_WIDTH,
+    VALUE,
+    VARIANCE,
+    Kind,
+    rsu_axes,
+    rsu_rows,
+)
+from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.filters.position_fix import FixStatus, fix_position, start_of
-from netpos.filters.space import place_rows
+from netpos.filters.space import place_rows, value_at
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -43,12 +52,17 @@ def rows_at(
             elevation_var=SD["elevation"] ** 2,
             range_m=float(np.linalg.norm(d)) + noise[2],
             range_var=1.0,
+            toa_s=(float(np.linalg.norm(d)) + noise[2] + CLOCK_M) / SPEED_OF_LIGHT_MPS,
+            toa_var=SPEED_OF_LIGHT_MPS**-2,
         )
         blocks.append(rsu_rows(m, info, rsu_axes(info), i))
     return np.vstack(blocks)
 
 
+CLOCK_M = 20_000.0
+"""Offset of the device's clock, which nobody knows."""
 ALL = Field.AZIMUTH | Field.ELEVATION | Field.RANGE
+TIMES = Field.AZIMUTH | Field.ELEVATION | Field.TOA
 CORNERS = np.array([[0.0, 0, 8], [100, 0, 12], [0, 100, 6], [100, 100, 14], [200, 0, 9]])
 PLACE = np.array([35.0, 60.0, 1.5])
 
@@ -59,6 +73,44 @@ def test_without_noise_the_fix_is_the_place(fields: Field, n: int) -> None:
     fix = fix_position(rows, start_of(rows, 0.0))
     assert fix.status == FixStatus.CONVERGED
     np.testing.assert_allclose(fix.position, PLACE, atol=1e-4)
+
+
+def test_the_clock_of_times_of_arrival_is_a_fourth_unknown() -> None:
+    """SciPy's least squares with the clock among its unknowns: place, and covariance of it."""
+    rng = np.random.default_rng(9)
+    for _ in range(10):
+        place = rng.uniform([0, 0, 0], [100, 100, 3])
+        rows = rows_at(place, CORNERS[:4], TIMES, rng)
+
+        def residuals(x: Array, rows: Array = rows) -> Array:
+            values = []
+            for row in rows:
+                value = value_at(row, *x[:3])[0] + (x[3] if row[KIND] == Kind.TOA else 0.0)
+                difference = row[VALUE] - value
+                if row[KIND] != Kind.TOA:
+                    difference = math.remainder(difference, math.tau)
+                values.append(difference / math.sqrt(row[VARIANCE]))
+            return np.array(values)
+
+        found = least_squares(residuals, [*place, CLOCK_M], xtol=1e-15, ftol=1e-15)
+        fix = fix_position(rows, start_of(rows, 0.0))
+        assert fix.status == FixStatus.CONVERGED
+        np.testing.assert_allclose(fix.position, found.x[:3], atol=2e-2)
+        expected = np.linalg.inv(found.jac.T @ found.jac)[:3, :3]
+        np.testing.assert_allclose(fix.cov, expected, rtol=2e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(("fields", "n"), [(TIMES, 4), (TIMES, 2), (Field.TOA, 5)])
+def test_without_noise_times_give_the_place(fields: Field, n: int) -> None:
+    rows = rows_at(PLACE, CORNERS[:n], fields, None, Rotation.from_euler("ZYX", [2.0, 0.1, 0.2]))
+    fix = fix_position(rows, start_of(rows, 0.0))
+    assert fix.status == FixStatus.CONVERGED
+    np.testing.assert_allclose(fix.position, PLACE, atol=1e-3)
+
+
+def test_one_station_without_a_clock_gives_no_fix() -> None:
+    rows = rows_at(PLACE, CORNERS[:1], TIMES, None)
+    assert fix_position(rows, start_of(rows, 0.0)).status == FixStatus.TOO_FEW
 
 
 def test_fix_is_the_weighted_least_squares_of_scipy() -> None:

@@ -7,6 +7,8 @@ import math
 import numpy as np
 import pytest
 from netpos.filters.measurement import (
+    BIAS,
+    COMMON,
     KIND,
     LEVER,
     ORIGIN,
@@ -17,6 +19,7 @@ from netpos.filters.measurement import (
     rsu_rows,
 )
 from netpos.filters.space import (
+    CLOCK,
     SpaceKind,
     bend_variance,
     direction_rows,
@@ -75,7 +78,7 @@ def all_rows(rng: np.random.Generator) -> Array:
 
 
 def innovation(row: Array, nav: Array) -> tuple[float, Array]:
-    C, h = np.empty((3, 3)), np.empty(ERR)
+    C, h = np.empty((3, 3)), np.empty(nav.size - 1)
     rotation_of(nav[6:10], C)
     return innovation_at(row, nav, C, h), h
 
@@ -98,6 +101,32 @@ def test_jacobians_are_central_differences() -> None:
             kinds.add(int(row[KIND]))
     assert kinds == {0, 1, 2, 3, 6, 7, *map(int, SpaceKind)}
     assert not set(SpaceKind) & set(Kind)
+
+
+def test_clock_and_biases_are_states_of_their_own() -> None:
+    """A TOA counts the clock's offset, every row of an RSU the biases it names; Jacobians are
+    central differences in all states. Core states are no biases."""
+    rng = np.random.default_rng(4)
+    slow = np.array([250.0, 3.0, 0.3, -0.2])  # offset, drift, own bias, the network's
+    nav = np.append(state(rng), slow)
+    n = nav.size - 1
+    for row in all_rows(rng):
+        row[[BIAS, COMMON]] = 0, 1
+        plain = innovation(row, nav[:NAV])[0]
+        row[[BIAS, COMMON]] = CLOCK + 2, CLOCK + 3
+        value, h = innovation(row, nav)
+        from_rsu = int(row[KIND]) not in (SpaceKind.BODY_VELOCITY, SpaceKind.BODY_RATE)
+        clock = slow[0] if row[KIND] == Kind.TOA else 0.0
+        expected = clock + (slow[2] + slow[3] if from_rsu else 0.0)
+        assert math.remainder(plain - value - expected, math.tau) == pytest.approx(0.0, abs=1e-9)
+        for j in range(n):
+            ends = []
+            for sign in (1.0, -1.0):
+                moved = nav.copy()
+                inject(moved, sign * 1e-5 * np.eye(n)[j])
+                ends.append(innovation(row, moved)[0])
+            slope = -math.remainder(ends[0] - ends[1], math.tau) / 2e-5
+            assert h[j] == pytest.approx(slope, abs=2e-6), (row[KIND], j)
 
 
 def test_values_are_those_of_the_geometry() -> None:

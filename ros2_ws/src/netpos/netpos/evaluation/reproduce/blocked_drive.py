@@ -12,7 +12,7 @@ from netpos.evaluation.consistency import MeanTest, chi2_mean_bounds, effective_
 from netpos.evaluation.metrics import NS
 from netpos.evaluation.reproduce.frame import Work
 from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
-from netpos.filters.error_state import UNCONSTRAINED
+from netpos.filters.error_state import UNCONSTRAINED, Imu
 from netpos.filters.measurement import LEVER
 from netpos.filters.position_fix import FixStatus
 from netpos.filters.space import place_rows
@@ -21,7 +21,7 @@ from netpos.radio.noise import generator
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.models import gate_thresholds
-from netpos.tracking.strapdown_engine import Drive, Epochs, Fixes, Imu, drive, fix_each
+from netpos.tracking.strapdown_engine import Drive, Epochs, Fixes, drive, fix_each
 from netpos.tracking.strapdown_models import nav_of, sensors_of, start_sd
 
 VUE = "vue_1"

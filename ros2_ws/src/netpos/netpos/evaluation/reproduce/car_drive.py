@@ -22,7 +22,7 @@ from netpos.evaluation.reproduce.blocked_drive import (
     ned,
 )
 from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
-from netpos.filters.error_state import UNCONSTRAINED
+from netpos.filters.error_state import UNCONSTRAINED, Imu, Sensors
 from netpos.filters.measurement import LEVER
 from netpos.filters.space import place_rows
 from netpos.messages.values import Array
@@ -30,7 +30,7 @@ from netpos.scenario.along_path import FIELDS
 from netpos.scenario.recorded_drive import VUE, station_drive
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.models import gate_thresholds
-from netpos.tracking.strapdown_engine import Drive, Epochs, Imu, Sensors, drive, fix_each
+from netpos.tracking.strapdown_engine import Drive, Epochs, drive, fix_each
 from netpos.tracking.strapdown_models import sensors_of
 from netpos.tracking.strapdown_start import SampleBuffer, StrapdownStart
 

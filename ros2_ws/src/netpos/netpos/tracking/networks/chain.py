@@ -6,12 +6,11 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from netpos.messages.values import ImuSample, RsuInfo
+from netpos.messages.values import ImuSample, Odometry, RsuInfo
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.networks.config import FusionConfig
 from netpos.tracking.networks.tertiary import TrackFusion
 from netpos.tracking.sequencer import Item
-from netpos.tracking.smoothing import Posterior
 from netpos.tracking.track import TrackOutput
 from netpos.tracking.tracker import Tracker
 
@@ -63,6 +62,6 @@ class Chain:
             total["fusion"] = Counter(self.fusion.rejected())
         return total
 
-    def posteriors(self) -> dict[str, list[Posterior]]:
+    def smoothed(self) -> dict[str, list[Odometry]]:
         """None: what several networks have fused is not smoothed."""
         return {}
