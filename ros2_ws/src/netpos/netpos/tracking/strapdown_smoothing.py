@@ -17,11 +17,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from netpos.filters.error_state import Imu, Sensors, hold, predict_chunk
+from netpos.filters.error_state import (
+    MEMORY,
+    Imu,
+    Sensors,
+    correct,
+    doubt_standstill,
+    hold,
+    predict_chunk,
+)
 from netpos.filters.factor import factor, solve_factored
+from netpos.filters.measurement import GROUP
 from netpos.filters.space import CLOCK
 from netpos.inertial.strapdown import ACCEL_BIAS, ATTITUDE_ERR, QUATERNION, inject
 from netpos.messages.values import Array
+from netpos.tracking.strapdown_engine import Epochs
 from netpos.tracking.strapdown_models import grown_in_space
 
 
@@ -137,3 +147,29 @@ def smooth(instants: Sequence[Instant], bias_sd: Array) -> Iterator[Instant]:
             _step_back(instant, later, later.nav, later.cov, bias_sd)
         yield instant
         later = instant
+
+
+def smoothed_drive(
+    start_ns: int,
+    nav: Array,
+    cov: Array,
+    imu: Imu,
+    epochs: Epochs,
+    sensors: Sensors,
+    gate_nis: Array,
+) -> tuple[Array, Array]:
+    """``strapdown_engine.drive`` given all measurements: nav (N, n + 1) and cov (N, n, n) of every
+    epoch after ``start_ns``."""
+    recorder, memory, now = Recorder(), np.zeros(MEMORY), start_ns
+    nav, cov = nav.copy(), cov.copy()
+    recorder.begin(start_ns, nav, cov)
+    for i, stamp in enumerate(epochs.stamps_ns.tolist()):
+        recorder.advance(nav, cov, memory, now, stamp, imu, sensors)
+        rows, now = epochs.rows[epochs.row_start[i] : epochs.row_start[i + 1]], stamp
+        if len(rows):
+            _, used = correct(nav, cov, rows, gate_nis, np.zeros(int(rows[-1, GROUP]) + 1))
+            if used == 0:
+                doubt_standstill(memory)
+        recorder.note(nav, cov, None, sensors.slow.biases[0])
+    found = recorder.smoothed()
+    return np.array([i.nav for i in found]), np.array([i.cov for i in found])

@@ -151,11 +151,17 @@ class Outages:
 
 
 def outages(variant: str) -> Outages:
+    """``outages_with`` what the filter takes to be true."""
+    known = recording()
+    assert known is not None
+    return outages_with(_variants(known.sensors)[variant])
+
+
+def outages_with(sensors: Sensors) -> Outages:
     """RTK aids the filter, and is withheld for 30 s, again and again, each time from the aided
     state."""
     known = recording()
     assert known is not None
-    sensors = _variants(known.sensors)[variant]
     used = (known.drive.rtk_ns > known.start[0]) & (known.drive.rtk_ns <= known.imu.stamps_ns[-1])
     stamps, antenna = known.drive.rtk_ns[used], known.drive.antenna[used]
     cov = np.tile(np.diag(np.square(RTK_SD_M)), (len(stamps), 1, 1))

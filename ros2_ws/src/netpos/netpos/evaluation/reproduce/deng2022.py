@@ -20,6 +20,8 @@ from netpos.evaluation.reproduce.blocked_drive import (
     FIX,
     FIX_HEIGHT,
     LOOSE,
+    LOOSE_DIAGONAL,
+    LOOSE_FIXED,
     TIGHT,
     VEHICLE,
     Case,
@@ -27,6 +29,7 @@ from netpos.evaluation.reproduce.blocked_drive import (
     over_seeds,
     run,
 )
+from netpos.evaluation.reproduce.drive_bounds import bounds, in_outages
 from netpos.evaluation.reproduce.drive_pictures import drive_errors, outage_curves
 from netpos.evaluation.reproduce.frame import (
     Outcome,
@@ -44,8 +47,21 @@ RUNS = 100
 OPEN_TOA = Case(name="4-8 stations, TOA", quantities=("range",), fewest=4, nearest=8)
 OPEN = Case(name="4-8 stations, TOA/AOD", quantities=ALL_ANGLES, fewest=4, nearest=8)
 BLOCKED = Case(name="1-2 stations, TOA/AOD", quantities=ALL_ANGLES, fewest=1, nearest=2)
-OUTAGES = Case(
-    name="10 s outages, 4-8 stations", quantities=ALL_ANGLES, fewest=4, nearest=8, outages=True
+OUTAGES, LONG_OUTAGES = (
+    Case(
+        name=f"{seconds} s outages, 4-8 stations",
+        quantities=ALL_ANGLES,
+        fewest=4,
+        nearest=8,
+        outage_s=seconds,
+    )
+    for seconds in (10, 30)
+)
+ONE_WAY = Case(
+    name="1-2 stations, one-way TOA/AOD, clock unknown",
+    quantities=("azimuth", "elevation", "toa"),
+    fewest=1,
+    nearest=2,
 )
 
 Cell = tuple[float, float, float, float]
@@ -79,6 +95,9 @@ def reproduce(work: Work) -> Outcome:
         *(row for case, fix, ins in TABLES for row in _table(case, tallies[case], fix, ins)),
         *_blocked(tallies[BLOCKED]),
         *_outages(outages),
+        *_bounds(work, tallies[BLOCKED]),
+        *_smoothed(work),
+        *_one_way(over_seeds(work, ONE_WAY)),
         *_real(work),
     ]
     absent = f"no recording {car_drive.RECORDING}: set NETPOS_DATA; its rows are empty"
@@ -117,7 +136,12 @@ def _blocked(tallies: dict[str, Tally]) -> Iterator[Row]:
     plane = {name: float(np.hypot(*tally.rms_m[:2])) for name, tally in tallies.items()}
     paper = float(np.hypot(*TABLES[2][2][1:3]))
     for variant in (TIGHT, VEHICLE):
-        for what, loose in (("our loose", plane[LOOSE]), ("the paper's loose", paper)):
+        for what, loose in (
+            ("our loose", plane[LOOSE]),
+            ("the paper's loose", paper),
+            (f"our {LOOSE_DIAGONAL}", plane[LOOSE_DIAGONAL]),
+            (f"our {LOOSE_FIXED}", plane[LOOSE_FIXED]),
+        ):
             ratio = plane[variant] / loose
             label = f"Blocked, horizontal RMS, {variant}, over {what}"
             yield required(label, "1", ratio, ratio <= TIGHT_OVER_LOOSE_MAX)
@@ -131,6 +155,45 @@ def _outages(tallies: dict[str, Tally]) -> Iterator[Row]:
         yield at_most(f"{label}: RMS, horizontal", "m", float(rms[0]), OUTAGE_LIMIT_M)
         yield at_most(f"{label}: RMS, 3-D", "m", float(rms[1]), OUTAGE_LIMIT_M)
         yield at_most(f"{label}: median, 3-D", "m", float(median[1]), OUTAGE_LIMIT_M)
+
+
+def _bounds(work: Work, blocked: dict[str, Tally]) -> Iterator[Row]:
+    """The posterior Cramér-Rao bound of what misses its target."""
+    loose = float(np.hypot(*blocked[LOOSE].rms_m[:2]))
+    for case in (OPEN, BLOCKED, OUTAGES):
+        for variant, found in bounds(work, case).items():
+            label = f"Bound, {case.name}, SINS, {variant}"
+            for axis, ours in zip(_AXES, found.rms_m.tolist(), strict=True):
+                yield shown(f"{label}: RMS {axis}", "m", ours)
+            plane = float(np.hypot(*found.rms_m[:2]))
+            if case == BLOCKED:
+                yield shown(f"{label}: horizontal RMS over our loose", "1", plane / loose)
+            if case == OUTAGES:
+                end = float(np.hypot(*found.end_rms_m[:2]))
+                yield shown(f"{label}: after 10 s, RMS, horizontal", "m", end)
+
+
+def _smoothed(work: Work) -> Iterator[Row]:
+    """Errors inside the outages, as the filter had them and given what came later."""
+    for case in (OUTAGES, LONG_OUTAGES):
+        for variant, found in in_outages(work, case).items():
+            plane = float(np.hypot(*found.rms_m[:2]))
+            yield shown(f"Inside {case.name}, SINS, {variant}: RMS, horizontal", "m", plane)
+
+
+def _one_way(tallies: dict[str, Tally]) -> Iterator[Row]:
+    """Times of arrival by a clock of which nothing is known at the start."""
+    for variant in (TIGHT, VEHICLE):
+        tally, label = tallies[variant], f"{ONE_WAY.name}, SINS, {variant}"
+        for axis, ours in zip(_AXES, tally.rms_m, strict=True):
+            yield shown(f"{label}: RMS {axis}", "m", ours)
+        error, said = tally.clock_ns
+        yield shown(f"{label}: RMS clock offset", "ns", error)
+        yield shown(f"{label}: clock offset sd as stated", "ns", said)
+        test = tally.nees_test(3)
+        careful = test.mean <= test.bounds[1]
+        ok = careful if variant == VEHICLE else test.consistent
+        yield required(f"{label}: NEES of position (expected 3)", "1", test.mean, ok)
 
 
 def _real(work: Work) -> Iterator[Row]:
