@@ -14,7 +14,7 @@ def main() -> None:
     except ScenarioError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
-    print("\n".join(vue for vue, device in scenario.each_device if device.walks))
+    print("\n".join(scenario.walkers))
 
 
 if __name__ == "__main__":

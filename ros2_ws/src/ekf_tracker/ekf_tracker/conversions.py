@@ -7,7 +7,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from netpos.messages.network_tracks import network_track_to_msg
-from netpos.messages.values import TrackState, TrackStatus
+from netpos.messages.values import StepCalibration, TrackState, TrackStatus
 from netpos.tracking.health import RsuReport, RsuState
 from netpos_node import CODEC
 
@@ -72,6 +72,17 @@ def _rsu(tracker: str, report: RsuReport) -> Any:
     )
 
 
+def _steps(steps: StepCalibration) -> dict[str, str]:
+    """What of a person's steps is estimated."""
+    said = {}
+    if steps.length_factor_sd:
+        said["step_length_factor"] = f"{steps.length_factor:.3f} +- {steps.length_factor_sd:.3f}"
+    if steps.heading_offset_sd_rad:
+        offset, sd = steps.heading_offset_rad, steps.heading_offset_sd_rad
+        said["step_heading_offset_rad"] = f"{offset:.3f} +- {sd:.3f}"
+    return said
+
+
 def _device(tracker: str, status: TrackStatus) -> Any:
     values = {
         "position_sd_m": f"{status.position_sd_m:.3f}",
@@ -79,6 +90,7 @@ def _device(tracker: str, status: TrackStatus) -> Any:
         "nis": f"{status.nis:.3f}",
         "nis_dof": str(status.nis_dof),
         "accepted": str(status.accepted),
+        **_steps(status.steps),
         **{f"rejected: {reason}": str(n) for reason, n in sorted(status.rejected.items())},
     }
     return DiagnosticStatus(

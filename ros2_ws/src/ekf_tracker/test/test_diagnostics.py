@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from ekf_tracker.conversions import diagnostics_to_msg
-from netpos.messages.values import TrackState, TrackStatus
+from netpos.messages.values import StepCalibration, TrackState, TrackStatus
 from netpos.tracking.health import RsuReport, RsuState
 
 T0 = 1_000_000_000
@@ -51,6 +51,24 @@ def test_diagnostics_of_a_device(state: TrackState, level: bytes) -> None:
         "rejected: late": "2",
     }
     assert (rsus.level, rsus.message) == (DiagnosticStatus.OK, "2 RSUs known")
+
+
+def test_diagnostics_of_what_is_known_of_the_steps() -> None:
+    both = StepCalibration(
+        length_factor=1.08,
+        length_factor_sd=0.02,
+        heading_offset_rad=-0.1,
+        heading_offset_sd_rad=0.03,
+    )
+    for steps, said in (
+        (both, {"length_factor": "1.080 +- 0.020", "heading_offset_rad": "-0.100 +- 0.030"}),
+        (replace(both, heading_offset_sd_rad=0.0), {"length_factor": "1.080 +- 0.020"}),
+        (StepCalibration(), {}),
+    ):
+        of_device = replace(status(TrackState.TRACKING, T0), steps=steps)
+        values = diagnostics_to_msg([of_device], 1).status[0].values
+        found = {v.key.removeprefix("step_"): v.value for v in values if "step_" in v.key}
+        assert found == said
 
 
 def test_diagnostics_stamp_and_missing_rsus() -> None:

@@ -18,6 +18,7 @@ from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration, PythonExpression
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
+from netpos.scenario import load_scenario
 from netpos.tracking.settings import settings_from
 
 FLUSH_S = 1.0  # the last messages are under way when the simulator ends
@@ -44,8 +45,23 @@ def _trackers(context):
     ]
 
 
+def _dead_reckoning(context):
+    """A node for everybody who walks; it waits to be heard, the simulator for it."""
+    name = LaunchConfiguration("scenario").perform(context)
+    recorded = LaunchConfiguration("bag").perform(context) != ""
+    return [
+        Node(
+            package="pdr_node",
+            executable="pdr_node",
+            name=f"pdr_{vue}",
+            parameters=[{"scenario": name, "vue": vue, "subscribers": 1 + recorded}],
+        )
+        for vue in load_scenario(name).walkers
+    ]
+
+
 def generate_launch_description() -> LaunchDescription:
-    """Describe recorder, tracker, RSUs and device; the device's end shuts the rest down."""
+    """Describe recorder, tracker, dead reckoning, RSUs, device; its end shuts the rest down."""
     scenario = {"scenario": ParameterValue(LaunchConfiguration("scenario"), value_type=str)}
     seed = {"seed": ParameterValue(LaunchConfiguration("seed"), value_type=int)}
     rate = {"rate": ParameterValue(LaunchConfiguration("rate"), value_type=float)}
@@ -66,6 +82,7 @@ def generate_launch_description() -> LaunchDescription:
                 condition=IfCondition(PythonExpression(["'", bag, "' != ''"])),
             ),
             OpaqueFunction(function=_trackers),
+            OpaqueFunction(function=_dead_reckoning),
             Node(package="rsu_sensor", executable="rsu_sensor", parameters=[scenario, seed]),
             vue_sim,
             RegisterEventHandler(

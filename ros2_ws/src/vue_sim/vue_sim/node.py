@@ -76,12 +76,11 @@ class VueSimNode(Node):
     def _wait_for_subscribers(self) -> None:
         """Until all beacons are heard and for a while nobody new has subscribed to anything."""
         settings = self._settings
-        walkers = {vue for vue, device in settings.scenario.each_device if device.walks}
         inputs = {
             topic: settings.subscribers
             for topic in self._pubs
             if split(topic)[1] in _INPUTS
-            or (split(topic)[0] in walkers and split(topic)[1] in _STEPS_INPUTS)
+            or (split(topic)[0] in settings.scenario.walkers and split(topic)[1] in _STEPS_INPUTS)
         }
         unheard = wait_until_heard(
             self._pubs, inputs, settings.wait_for_subscribers_s, settings.settle_s

@@ -13,7 +13,8 @@ array a compiled kernel can take:
     blocked; 0: the option's)
 
 For ``LINEAR`` rows the first six entries of ORIGIN and AXES hold H of the six core states; the
-position in it is that of the antenna.
+position in it is that of the antenna. BIAS and COMMON of a ``STEP_VELOCITY`` are the person's
+length factor and heading offset.
 With d = p - origin and u = axes d:
 
     AZIMUTH    atan2(u_y, u_x)                          fokin2020:eq.13, 42
@@ -25,6 +26,7 @@ With d = p - origin and u = axes d:
     COSINE_Z   u_z / |u|
     PHASE      a d / |d|, known but for whole turns     petukhov:eq.5
     UNWRAPPED_PHASE   the same with its whole turns (a sector of ambiguity has been chosen)
+    STEP_VELOCITY     LINEAR of the velocity a person's dead reckoning reports (``step_velocity``)
 
 For both phases the first three entries of AXES hold a: 2 pi L / lambda times the unit vector of
 the array from slave to master, in map. Range and TOA of such an array count from its master, L/2
@@ -42,6 +44,7 @@ import numpy as np
 
 from netpos.filters.compile import kernel, leaf
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.filters.step_velocity import curvature, reported
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 
 
@@ -58,19 +61,11 @@ class Kind(IntEnum):
     COSINE_Z = 7
     PHASE = 8
     UNWRAPPED_PHASE = 9
+    STEP_VELOCITY = 10
 
 
-KIND, VALUE, VARIANCE, GATE_VARIANCE, BIAS, COMMON, GROUP, ORIGIN, AXES = (
-    0,
-    1,
-    2,
-    3,
-    4,
-    5,
-    6,
-    7,
-    10,
-)
+KIND, VALUE, VARIANCE, GATE_VARIANCE, BIAS, COMMON, GROUP, ORIGIN = range(8)
+AXES = 10
 HEADING, LEVER, BLOCKED = 19, 20, 23
 # Plain integers: arithmetic of flags costs ten times as much.
 _AZIMUTH, _ELEVATION, _TOA = int(Field.AZIMUTH), int(Field.ELEVATION), int(Field.TOA)
@@ -196,6 +191,9 @@ def predict_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
             lx, ly = _turned_lever(row, mean)
             value += h[0] * lx + h[1] * ly
             h[int(row[HEADING])] = h[1] * lx - h[0] * ly
+    elif kind == Kind.STEP_VELOCITY:
+        gx, gy = row[ORIGIN + 2], row[ORIGIN + 3]
+        return float(reported(gx, gy, mean, int(row[BIAS]), int(row[COMMON]), h))
     elif kind == Kind.SPEED:
         value = math.sqrt(mean[2] * mean[2] + mean[3] * mean[3])
         h[2] = mean[2] / max(value, 1e-6)
@@ -229,6 +227,9 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
     kind = int(row[KIND])
     if kind == Kind.LINEAR or kind == Kind.SPEED:
         return 0.0
+    if kind == Kind.STEP_VELOCITY:
+        gx, gy = row[ORIGIN + 2], row[ORIGIN + 3]
+        return float(curvature(gx, gy, mean, cov, int(row[BIAS]), int(row[COMMON])))
     dx = mean[0] - row[ORIGIN]
     dy = mean[1] - row[ORIGIN + 1]
     if row[HEADING] >= 0.0:

@@ -58,9 +58,9 @@ CLOCK = ERR
 class SpaceKind(IntEnum):
     """What a row measures that a planar filter does not take; numbered on from ``Kind``."""
 
-    PLACE = 10
-    BODY_VELOCITY = 11
-    BODY_RATE = 12
+    PLACE = 11
+    BODY_VELOCITY = 12
+    BODY_RATE = 13
 
 
 @leaf

@@ -264,4 +264,8 @@ class CdrCodec:
             value.sources,
             value.position_sd_m,
             value.protection_level_m,
+            value.steps.length_factor,
+            value.steps.length_factor_sd,
+            value.steps.heading_offset_rad,
+            value.steps.heading_offset_sd_rad,
         )

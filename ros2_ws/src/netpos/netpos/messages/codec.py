@@ -39,6 +39,7 @@ from netpos.messages.values import (
     RsuInfo,
     RsuMeasurement,
     Step,
+    StepCalibration,
     TrackState,
     TrackStatus,
     Velocity,
@@ -241,6 +242,10 @@ class Codec:
             sources=list(status.sources),
             position_sd=float(status.position_sd_m),
             protection_level=float(status.protection_level_m),
+            step_length_factor=float(status.steps.length_factor),
+            step_length_factor_sd=float(status.steps.length_factor_sd),
+            step_heading_offset=float(status.steps.heading_offset_rad),
+            step_heading_offset_sd=float(status.steps.heading_offset_sd_rad),
         )
 
     @staticmethod
@@ -259,6 +264,7 @@ class Codec:
             sources=tuple(msg.sources),
             position_sd_m=float(msg.position_sd),
             protection_level_m=float(msg.protection_level),
+            steps=_step_calibration(msg),
         )
 
     def step_to_msg(self, step: Step) -> Any:
@@ -421,3 +427,15 @@ class Codec:
             transform=transform,
         )
         return self._resolve("tf2_msgs/msg/TFMessage")(transforms=[stamped])
+
+
+def _step_calibration(msg: Any) -> StepCalibration:
+    """What a netpos_msgs/TrackStatus says of the steps; recordings may be older than that."""
+    if not hasattr(msg, "step_length_factor"):
+        return StepCalibration()
+    return StepCalibration(
+        length_factor=float(msg.step_length_factor),
+        length_factor_sd=float(msg.step_length_factor_sd),
+        heading_offset_rad=float(msg.step_heading_offset),
+        heading_offset_sd_rad=float(msg.step_heading_offset_sd),
+    )

@@ -175,6 +175,17 @@ class ClockState:
     cov: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepCalibration:
+    """What a track has learned of a person's steps: true over reported length, angle from
+    reported to true heading; sd 0: not estimated."""
+
+    length_factor: float = 1.0
+    length_factor_sd: float = 0.0
+    heading_offset_rad: float = 0.0
+    heading_offset_sd_rad: float = 0.0
+
+
 @dataclass(slots=True, kw_only=True)
 class TrackStatus:
     """Health of one track at one epoch; counts since start."""
@@ -190,6 +201,7 @@ class TrackStatus:
     sources: tuple[str, ...] = ()
     position_sd_m: float = 0.0
     protection_level_m: float = -1.0
+    steps: StepCalibration = StepCalibration()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

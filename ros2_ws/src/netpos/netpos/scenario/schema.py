@@ -275,6 +275,11 @@ class Scenario(Section):
         return tuple(zip(self.vue_ids, settings, strict=True))
 
     @property
+    def walkers(self) -> tuple[str, ...]:
+        """Names of the devices that dead reckoning follows."""
+        return tuple(vue for vue, device in self.each_device if device.walks)
+
+    @property
     def duration_s(self) -> float:
         """Time from the first stamp to the end of the last device's run [s]."""
         longest = max(device.motion(self.seed, vue).duration_s for vue, device in self.each_device)

@@ -7,7 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netpos.filters.measurement import UNCOUPLED, VARIANCE, linear_rows, rsu_rows, speed_row
+from netpos.filters.measurement import (
+    BIAS,
+    COMMON,
+    KIND,
+    UNCOUPLED,
+    VARIANCE,
+    Kind,
+    linear_rows,
+    linearise,
+    rsu_rows,
+    speed_row,
+)
 from netpos.messages.values import Array, GroundSpeed, RsuMeasurement, Velocity
 from netpos.tracking.rsus import BiasStates, Rsu
 
@@ -21,6 +32,16 @@ class Batch:
 
     rows: Array
     items: tuple[Source, ...]
+
+    def slow_variance(self, biases: BiasStates) -> Array:
+        """Variance (m,) that the slow errors add to each row before there are states of them."""
+        mean = np.zeros(biases.first + len(biases.sd))
+        for item in self.items:
+            if isinstance(item, Velocity):
+                mean[2:4] = item.velocity  # the faster, the more a factor changes
+        _, H = linearise(self.rows, mean, 0.0)
+        variance: Array = np.square(H[:, biases.first :]) @ np.square(biases.sd)
+        return variance
 
 
 def batch_of(
@@ -45,6 +66,9 @@ def batch_of(
         elif isinstance(item, Velocity):
             rows = linear_rows(item.velocity, item.cov, _VELOCITY_H, group)
             rows[:, VARIANCE] *= (inflation or {}).get(item.source, 1.0)
+            states = (-1, -1) if biases is None else biases.of_steps(item.source)
+            if max(states) >= 0:
+                rows[:, KIND], rows[:, BIAS], rows[:, COMMON] = Kind.STEP_VELOCITY, *states
             blocks.append(rows)
         else:
             blocks.append(speed_row(item.speed_mps, item.speed_var, group))

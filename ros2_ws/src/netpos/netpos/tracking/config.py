@@ -197,6 +197,23 @@ class TrackerConfig:
         "velocities in map: power spectral density at 0 of their errors over their variance (the"
         " duration of a step where one error lasts a step); 0: white",
     )
+    step_length_factor_sd: float = _real(
+        0.0,
+        0.0,
+        1.0,
+        "velocities in map: sd of the logarithm of true over reported length of all steps of the"
+        " person, estimated on the way, over what their covariance holds; 0: not estimated",
+    )
+    step_heading_offset_sd_rad: float = _real(
+        0.0,
+        0.0,
+        1.0,
+        "velocities in map: sd of the angle from reported to true heading of all steps, estimated"
+        " on the way, over what their covariance holds; 0: not estimated",
+    )
+    step_error_time_s: float = _real(
+        3600.0, 1.0, 1e6, "correlation time of both (first-order Markov)"
+    )
     isolate_rsus: bool = field(
         default=True, metadata={"text": "refuse an RSU that at least two others contradict"}
     )
@@ -272,6 +289,11 @@ class TrackerConfig:
             raise ValueError(
                 f"motion_model interacting takes filter ekf or iekf, not {self.filter!r}"
             )
+        if self.filter == "kf" and self.calibrates_steps:
+            raise ValueError(
+                "filter kf is linear; leave step_length_factor_sd and step_heading_offset_sd_rad"
+                " at 0 or take another filter"
+            )
 
     def _check_steady(self) -> None:
         several = self.motion_model in ("interacting", "constant_acceleration")
@@ -293,11 +315,21 @@ class TrackerConfig:
                 "motion_model strapdown is smoothed afterwards only (replay --smooth); leave"
                 f" fixed_lag_s at 0, got {self.fixed_lag_s}"
             )
+        if self.calibrates_steps:
+            raise ValueError(
+                "motion_model strapdown takes no step velocities; leave step_length_factor_sd and"
+                " step_heading_offset_sd_rad at 0"
+            )
 
     @property
     def use_imu(self) -> bool:
         """Whether the device's IMU is an input."""
         return self.motion_model in ("inertial", "strapdown")
+
+    @property
+    def calibrates_steps(self) -> bool:
+        """Whether what is wrong with all steps of a person is estimated."""
+        return self.step_length_factor_sd > 0.0 or self.step_heading_offset_sd_rad > 0.0
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> TrackerConfig:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import copy
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from netpos.filters.measurement import (
-    BIAS,
-    COMMON,
     UNCOUPLED,
     Coupling,
     Kind,
@@ -16,7 +16,13 @@ from netpos.filters.measurement import (
     scalar_values,
 )
 from netpos.filters.motion import N_CORE
-from netpos.messages.values import AngleConvention, Array, RsuInfo, RsuMeasurement
+from netpos.messages.values import (
+    AngleConvention,
+    Array,
+    RsuInfo,
+    RsuMeasurement,
+    StepCalibration,
+)
 
 _RANGES = (Kind.TOA, Kind.RANGE)
 _AZIMUTHS = (Kind.AZIMUTH, Kind.COSINE_Y)
@@ -71,12 +77,24 @@ class Rsu:
         return bool(self.axes[0] * dx + self.axes[1] * dy >= 0.0)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepErrors:
+    """What is wrong with all steps of a person alike: sd of the logarithm of true over reported
+    length, and of the angle from reported to true heading [rad]; 0: nothing. ``tau_s``:
+    correlation time of both."""
+
+    length_sd: float = 0.0
+    heading_sd_rad: float = 0.0
+    tau_s: float = 0.0
+
+
 @dataclass(slots=True)
 class BiasStates:
-    """State entries for the slow sensor errors of one track, added when an RSU is first heard;
-    the first has the index ``first``."""
+    """State entries for the slow sensor errors of one track, added when an RSU, or a source of
+    step velocities, is first heard; the first has the index ``first``."""
 
     first: int = N_CORE
+    steps: StepErrors = StepErrors()
     sd: list[float] = field(default_factory=list)
     tau_s: list[float] = field(default_factory=list)
     _slots: dict[tuple[str, str], int] = field(default_factory=dict)
@@ -84,9 +102,10 @@ class BiasStates:
 
     def copy(self) -> BiasStates:
         """An independent copy."""
-        return BiasStates(
-            self.first, self.sd.copy(), self.tau_s.copy(), self._slots.copy(), self._last_ns.copy()
-        )
+        twin = copy.copy(self)
+        twin.sd, twin.tau_s = self.sd.copy(), self.tau_s.copy()
+        twin._slots, twin._last_ns = self._slots.copy(), self._last_ns.copy()
+        return twin
 
     def arrays(self) -> Array:
         """(2, k): standard deviation and time constant of each."""
@@ -112,15 +131,33 @@ class BiasStates:
                 inflation[kind] = self._inflation(info, kind, m.stamp_ns)
         return Coupling(bias, common, inflation)
 
-    def noise_of(self, rows: Array) -> Array:
-        """(m,) variance the biases add to ``rows`` (m, ROW_WIDTH) for who has no states for
-        them."""
-        variance = np.zeros(len(rows))
-        for column in (BIAS, COMMON):
-            for i, index in enumerate(rows[:, column].astype(int)):
-                if index >= 0:
-                    variance[i] += self.sd[index - self.first] ** 2
-        return variance
+    def of_steps(self, source: str) -> tuple[int, int]:
+        """State indices of the length factor and the heading offset of a source of step
+        velocities, -1 for what is not estimated; new ones are appended."""
+        length, heading = self.steps.length_sd, self.steps.heading_sd_rad
+        return (
+            self._slot((source, "length"), length, self.steps.tau_s) if length > 0.0 else -1,
+            self._slot((source, "heading"), heading, self.steps.tau_s) if heading > 0.0 else -1,
+        )
+
+    def step_calibration(self, mean: Array, cov: Array) -> StepCalibration:
+        """What a state (n,) with covariance (n, n) says of the first source of step velocities
+        heard."""
+        factor, factor_sd, offset, offset_sd = 1.0, 0.0, 0.0, 0.0
+        places = {name: i for (_, name), i in reversed(self._slots.items()) if i < mean.size}
+        if "length" in places:
+            i = places["length"]
+            factor = math.exp(mean[i])
+            factor_sd = factor * math.sqrt(cov[i, i])
+        if "heading" in places:
+            i = places["heading"]
+            offset, offset_sd = float(mean[i]), math.sqrt(cov[i, i])
+        return StepCalibration(
+            length_factor=factor,
+            length_factor_sd=factor_sd,
+            heading_offset_rad=offset,
+            heading_offset_sd_rad=offset_sd,
+        )
 
     def accepted(self, rsu: Rsu, m: RsuMeasurement) -> None:
         """Note that ``m`` was fused: correlated noise is counted from here."""

@@ -281,7 +281,7 @@ class StrapdownTrack:
         if not rsus:
             return ()
         rows = batch.rows[batch.rows[:, KIND] != SpaceKind.BODY_VELOCITY]
-        rows[:, VARIANCE] += state.biases.noise_of(rows)
+        rows[:, VARIANCE] += replace(batch, rows=rows).slow_variance(state.biases)
         state.start.add_rows(stamp_ns, rows, np.array(rsus[0].lever_arm))
         found = state.start.solve(self.imu)
         if found is None or found[0] != stamp_ns:

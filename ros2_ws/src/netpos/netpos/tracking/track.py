@@ -10,11 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from netpos.filters.measurement import (
-    KIND,
-    VARIANCE,
-    Kind,
-)
+from netpos.filters.measurement import KIND, VARIANCE, Kind
 from netpos.messages.values import (
     Array,
     ClockState,
@@ -22,6 +18,7 @@ from netpos.messages.values import (
     NetworkTrack,
     Odometry,
     RsuMeasurement,
+    StepCalibration,
     TrackState,
     TrackStatus,
     Velocity,
@@ -42,7 +39,13 @@ from netpos.tracking.health import RsuHealth
 from netpos.tracking.history import History, merge
 from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser, with_heading
-from netpos.tracking.models import gate_thresholds, heading_index, initial_extra_sd, pose_state
+from netpos.tracking.models import (
+    gate_thresholds,
+    heading_index,
+    initial_extra_sd,
+    pose_state,
+    step_errors,
+)
 from netpos.tracking.networks.secondary import OwnNoise, Secondary
 from netpos.tracking.phase_start import PhaseStart, corrections, with_sectors
 from netpos.tracking.protection import NisWindow, protection_level, unnoticed_shift
@@ -141,9 +144,8 @@ class Track:
         self._state = self._fresh()
 
     def _fresh(self) -> _State:
-        first = 6 + self._extra_sd.size
         return _State(
-            BiasStates(first),
+            BiasStates(6 + self._extra_sd.size, step_errors(self._config)),
             Initialiser(self._config),
             Blockage.of(self._config),
             PhaseStart(self._config),
@@ -275,7 +277,7 @@ class Track:
             state.rejected["no_initial_pose"] += len(batch.items)
             return ()
         heard = tuple(self._rsus[i.rsu_id] for i in batch.items if isinstance(i, RsuMeasurement))
-        bias_var = state.biases.noise_of(batch.rows)
+        bias_var = batch.slow_variance(state.biases)
         if state.phase_start.heard(batch):
             state.estimate = state.phase_start.add(stamp_ns, batch.rows, bias_var)
             started = np.full(len(batch.items), state.estimate is not None)
@@ -399,10 +401,12 @@ class Track:
         self._predict(stamp_ns)
         state = self._state
         estimate = state.estimate
-        position_sd, level = 0.0, -1.0
+        position_sd, level, steps = 0.0, -1.0, StepCalibration()
         if estimate is not None:
             mean, cov = estimate.mean, estimate.cov
             position_sd = output.largest_sd(cov)
+            if self._config.calibrates_steps:
+                steps = state.biases.step_calibration(mean, cov)
             risk, inflation = self._config.integrity_risk, state.nis_window.inflation()
             level = protection_level(cov[:2, :2], risk, inflation)
             unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
@@ -422,6 +426,7 @@ class Track:
             sources=sources,
             position_sd_m=position_sd,
             protection_level_m=level,
+            steps=steps,
         )
         if estimate is None:
             return TrackOutput(None, None, status, network=self._config.network)

@@ -69,6 +69,10 @@ def random_row(rng: np.random.Generator, kind: Kind, heading: int = -1) -> Array
 
 def closed_form(row: Array, x: Array, height_m: float) -> float:
     """h written with SciPy and NumPy only."""
+    if row[KIND] == Kind.STEP_VELOCITY:
+        turn = Rotation.from_euler("z", x[8])
+        reported = turn.inv().apply([x[2], x[3], 0.0])[:2] / np.exp(x[6])
+        return float(row[ORIGIN + 2 : ORIGIN + 4] @ reported)
     d = np.array([x[0], x[1], height_m]) - row[ORIGIN:AXES]
     if row[HEADING] >= 0:
         turn = Rotation.from_euler("z", x[int(row[HEADING])])

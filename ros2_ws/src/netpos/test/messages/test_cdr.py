@@ -19,6 +19,7 @@ from netpos.messages.values import (
     ImuSample,
     Odometry,
     RsuMeasurement,
+    StepCalibration,
     TrackState,
     TrackStatus,
 )
@@ -88,6 +89,13 @@ statuses = st.builds(
     sources=st.lists(texts, max_size=4).map(tuple),
     position_sd_m=doubles,
     protection_level_m=doubles,
+    steps=st.builds(
+        StepCalibration,
+        length_factor=doubles,
+        length_factor_sd=doubles,
+        heading_offset_rad=doubles,
+        heading_offset_sd_rad=doubles,
+    ),
 )
 
 
@@ -232,7 +240,7 @@ def test_types_are_flattened_to_their_fields() -> None:
     assert list(flat_items("netpos_msgs/msg/ClockState")) == [*header, "d", "d", "4d"]
     assert list(flat_items("netpos_msgs/msg/Beacon")) == [*header, "string", "I", *"dddd"]
     status = list(flat_items("netpos_msgs/msg/TrackStatus"))
-    assert status == [*header, *"BdIIQQ", "string[]", "Q[]", "string[]", "d", "d"]
+    assert status == [*header, *"BdIIQQ", "string[]", "Q[]", "string[]", *"dddddd"]
     with pytest.raises(BagError, match="transforms cannot be laid out"):
         list(flat_items("tf2_msgs/msg/TFMessage"))
 

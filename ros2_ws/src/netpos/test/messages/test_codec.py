@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from netpos.messages.values import (
     RsuInfo,
     RsuMeasurement,
     Step,
+    StepCalibration,
     TrackState,
     TrackStatus,
     Velocity,
@@ -118,6 +120,12 @@ STATUS = TrackStatus(
     sources=("rsu_1", "step_velocity"),
     position_sd_m=0.25,
     protection_level_m=4.5,
+    steps=StepCalibration(
+        length_factor=1.1,
+        length_factor_sd=0.02,
+        heading_offset_rad=-0.3,
+        heading_offset_sd_rad=0.04,
+    ),
 )
 ODOMETRY = Odometry(
     stamp_ns=STAMP,
@@ -232,6 +240,14 @@ def test_step_message() -> None:
     assert [stamp_ns(t) - STAMP for t in (msg.start, msg.end, msg.header.stamp)] == [1, 2, 3]
     assert (msg.count, msg.length, msg.length_var) == (12, 0.7, 0.01)
     assert (msg.heading, msg.heading_var, msg.cadence) == (-1.5, 0.02, 1.9)
+
+
+def test_a_status_of_before_steps_were_calibrated() -> None:
+    """A recording of then holds the fields there were."""
+    msg = codec().track_status_to_msg(STATUS)
+    old = SimpleNamespace(**{k: v for k, v in vars(msg).items() if not k.startswith("step_")})
+    expected = replace(STATUS, steps=StepCalibration())
+    assert_same(expected, codec().track_status_from_msg(old))
 
 
 def test_transform_is_the_pose_of_the_odometry() -> None:

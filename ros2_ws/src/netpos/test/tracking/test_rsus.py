@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 
 ALL = Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE
 
+OTHERS = (Kind.LINEAR, Kind.SPEED, Kind.STEP_VELOCITY)  # no RSU measures them
+
 
 def info(rsu_id: str = "a", **change: object) -> RsuInfo:
     values: dict[str, object] = {"rsu_id": rsu_id, "position": np.zeros(3)}
@@ -35,7 +37,7 @@ def measured(fields: Field = ALL, stamp_ns: int = 1) -> RsuMeasurement:
 
 def test_bias_sd_by_kind() -> None:
     rsu = biased()
-    assert {kind: rsu.bias_sd(kind) for kind in Kind if kind not in (Kind.LINEAR, Kind.SPEED)} == {
+    assert {kind: rsu.bias_sd(kind) for kind in Kind if kind not in OTHERS} == {
         Kind.AZIMUTH: 0.01,
         Kind.COSINE_Y: 0.01,
         Kind.ELEVATION: 0.02,

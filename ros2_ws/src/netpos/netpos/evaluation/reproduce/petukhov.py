@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from netpos.evaluation.consistency import MeanTest, chi2_mean_bounds, effective_size, nees
+from netpos.evaluation.reproduce import person, rectangle
 from netpos.evaluation.reproduce import petukhov_pictures as pictures
-from netpos.evaluation.reproduce import rectangle
 from netpos.evaluation.reproduce.frame import (
     Outcome,
     Row,
@@ -82,6 +82,7 @@ def warm_up() -> None:
         rectangle.setup_of(case).run(0)
     run_chain(0)
     run_chain(0, TIGHT)
+    person.walk(0, person.ESTIMATED)
 
 
 def reproduce(work: Work) -> Outcome:
@@ -102,6 +103,7 @@ def reproduce(work: Work) -> Outcome:
         *_beyond(walked),
         *_sectors(found),
         *_chains(chains),
+        *person.rows(work),
     ]
     return Outcome(rows=tuple(rows), draw=partial(_draw, work.seed, walked, found))
 

@@ -37,6 +37,15 @@ class StepErrors:
     rest_sd_mps: float = 0.05
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Person:
+    """What is wrong with all steps of a person alike: true over reported length, angle from
+    reported to true heading."""
+
+    length_factor: float = 1.0
+    heading_offset_rad: float = 0.0
+
+
 @dataclass(frozen=True, slots=True)
 class Steps:
     """Steps (n,) of a walk: start and end [s], length [m], heading [rad]."""
@@ -64,7 +73,12 @@ def steps_of(points: Array, pauses_s: Array, speed_mps: float, step_m: float) ->
 
 
 def velocity_rows(
-    times_s: Array, steps: Steps, errors: StepErrors, rng: np.random.Generator, tau_s: float
+    times_s: Array,
+    steps: Steps,
+    errors: StepErrors,
+    rng: np.random.Generator,
+    tau_s: float,
+    person: Person = Person(),
 ) -> tuple[Array, Ints]:
     """Rows (n, 2, ROW_WIDTH) of the velocities reported at times (n,), group 1, and the step each
     belongs to (n,), -1 at rest.
@@ -79,9 +93,9 @@ def velocity_rows(
     rows[:] = still
     for s in np.unique(step[step >= 0]).tolist():
         value, cov = step_velocity(
-            steps.length_m[s] + errors.length_sd_m * noise[s, 0],
+            steps.length_m[s] / person.length_factor + errors.length_sd_m * noise[s, 0],
             steps.end_s[s] - steps.start_s[s],
-            steps.heading_rad[s] + errors.heading_sd_rad * noise[s, 1],
+            steps.heading_rad[s] - person.heading_offset_rad + errors.heading_sd_rad * noise[s, 1],
             errors.length_sd_m,
             errors.heading_sd_rad,
         )

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from netpos.evaluation.reproduce.steps import (
+    Person,
     StepErrors,
     reported_velocity,
     steps_of,
@@ -69,3 +70,13 @@ def test_errors_that_last_weigh_less() -> None:
     np.testing.assert_allclose(rows[:, 0, VARIANCE], [1.0, 6.0, 1.5, 1.0])
     np.testing.assert_array_equal(rows[..., GATE_VARIANCE], 1.0)
     assert math.isfinite(rows.sum())
+
+
+def test_a_person_with_longer_steps_is_reported_slower() -> None:
+    """True steps 25 % longer than reported and 0.2 rad to the left of the reported heading."""
+    steps = steps_of(np.array([[0.0, 0.0], [6.0, 0.0]]), np.zeros(1), 1.0, 0.6)
+    exact = StepErrors(length_sd_m=1e-9, heading_sd_rad=1e-9)
+    person = Person(length_factor=1.25, heading_offset_rad=0.2)
+    rows, _ = velocity_rows(np.array([0.3]), steps, exact, np.random.default_rng(0), 0.0, person)
+    expected = 0.8 * np.array([math.cos(0.2), -math.sin(0.2)])
+    np.testing.assert_allclose(reported_velocity(rows[0]), expected, atol=1e-6)

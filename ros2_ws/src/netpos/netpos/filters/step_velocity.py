@@ -1,0 +1,58 @@
+"""The velocity dead reckoning reports of a person whose steps are longer than its model says and
+whose heading is turned against the map:
+
+    u = exp(-k) R(-a) v
+
+v the true velocity in map, k the logarithm of true over modelled step length, a the angle from
+reported to true heading. Either may be missing: state index -1, value 0.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from netpos.filters.compile import kernel, leaf
+from netpos.messages.values import Array
+
+
+@leaf
+def _state(mean: Array, index: int) -> float:
+    return float(mean[index]) if index >= 0 else 0.0
+
+
+@leaf
+def reported(gx: float, gy: float, mean: Array, length: int, heading: int, h: Array) -> float:
+    """g u at ``mean`` (n,), whose entries 2 and 3 are v; its gradient there is added to ``h``
+    (n,). length, heading : state indices of k and a"""
+    scale, angle = math.exp(-_state(mean, length)), _state(mean, heading)
+    c, s = scale * math.cos(angle), scale * math.sin(angle)
+    h[2] += gx * c - gy * s
+    h[3] += gx * s + gy * c
+    ux, uy = c * mean[2] + s * mean[3], c * mean[3] - s * mean[2]
+    value = gx * ux + gy * uy
+    if length >= 0:
+        h[length] -= value
+    if heading >= 0:
+        h[heading] += gx * uy - gy * ux
+    return float(value)
+
+
+@kernel
+def curvature(gx: float, gy: float, mean: Array, cov: Array, length: int, heading: int) -> float:
+    """Half the trace of (h'' P)^2 of ``reported`` at ``mean`` (n,) under ``cov`` (n, n)."""
+    h = np.zeros(mean.size)
+    value = reported(gx, gy, mean, length, heading, h)
+    index = (2, 3, length, heading)
+    second, P = np.zeros((4, 4)), np.zeros((4, 4))
+    second[0, 2], second[1, 2], second[2, 2] = -h[2], -h[3], value
+    second[0, 3], second[1, 3], second[3, 3] = -h[3], h[2], -value
+    second[2, 3] = -h[heading] if heading >= 0 else 0.0
+    for a in range(4):
+        for b in range(4):
+            second[max(a, b), min(a, b)] = second[min(a, b), max(a, b)]
+            if index[a] >= 0 and index[b] >= 0:
+                P[a, b] = cov[index[a], index[b]]
+    spread = second @ P
+    return 0.5 * float((spread * spread.T).sum())
