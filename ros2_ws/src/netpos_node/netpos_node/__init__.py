@@ -4,11 +4,13 @@ messages."""
 from __future__ import annotations
 
 import importlib
+import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import fields
+from pathlib import Path
 from typing import Any, TypeVar
 
 import rclpy
@@ -36,6 +38,19 @@ LATCHED = QoSProfile(
 )
 
 
+_PROFILES = {
+    "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).with_name("fastdds.xml")),
+    "RMW_FASTRTPS_USE_QOS_FROM_XML": "1",
+}
+
+
+def choose_profiles(environment: MutableMapping[str, str]) -> None:
+    """Let Fast DDS take the endpoints' memory policy from ``fastdds.xml``, unless the user has
+    chosen profiles; before a context is initialised."""
+    if not {*_PROFILES, "FASTDDS_DEFAULT_PROFILES_FILE"} & environment.keys():
+        environment.update(_PROFILES)
+
+
 def message_class(type_name: str) -> Any:
     """The rclpy class of a type name such as ``nav_msgs/msg/Odometry``."""
     package, _, name = type_name.split("/")
@@ -49,6 +64,7 @@ CDR = cdr_codec()  # the same for the bytes of messages
 def run(factory: Callable[[], Node], spin: Callable[[Node], None] = rclpy.spin) -> None:
     """Start a node, spin it, shut down; a bad parameter ends the process with one sentence and
     code 2."""
+    choose_profiles(os.environ)
     rclpy.init()
     try:
         node = factory()

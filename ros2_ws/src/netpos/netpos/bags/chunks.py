@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from io import BytesIO
 from typing import Any
 
@@ -22,6 +22,7 @@ from netpos.bags.scan import unpack
 
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")
+_INDEX = struct.Struct("<BQHI")
 _FIXED = _MESSAGE.size - _HEAD.size  # bytes of a message's record between its length and its data
 
 Found = tuple[int, int, str, bytes]  # log time, place in the file, topic, payload
@@ -50,18 +51,42 @@ def _messages_of(file: Any, chunk: Any, number: int, topics: Mapping[int, str]) 
     file.seek(chunk.chunk_start_offset + _HEAD.size)
     body = file.read(chunk.chunk_length - _HEAD.size)
     raw = unpack(Chunk.read(ReadDataStream(BytesIO(body))))
+    offsets = _indexed(file, chunk, topics) if chunk.message_index_offsets else _walked(raw)
     found: list[Found] = []
-    position, place = 0, number << 40
+    place = number << 40
+    for at in offsets:
+        opcode, size, channel, _, time, _ = _MESSAGE.unpack_from(raw, at)
+        end = at + _HEAD.size + size
+        if opcode != Opcode.MESSAGE or end > len(raw):
+            raise ValueError("the index of a chunk does not fit it")
+        if channel in topics:
+            found.append((time, place + at, topics[channel], raw[at + _MESSAGE.size : end]))
+    return found
+
+
+def _indexed(file: Any, chunk: Any, channels: Container[int]) -> list[int]:
+    """Where the messages of ``channels`` begin in the records of a chunk, by its index."""
+    found: list[int] = []
+    for channel, offset in chunk.message_index_offsets.items():
+        if channel not in channels:
+            continue
+        file.seek(offset)
+        opcode, _, owner, size = _INDEX.unpack(file.read(_INDEX.size))
+        if (opcode, owner) != (Opcode.MESSAGE_INDEX, channel):
+            raise ValueError("a chunk has no index where it should be")
+        found += struct.unpack(f"<{size // 8}Q", file.read(size))[1::2]
+    return found
+
+
+def _walked(raw: bytes) -> list[int]:
+    """Where the messages begin in the records of a chunk."""
+    found: list[int] = []
+    position = 0
     while position < len(raw):
-        if raw[position] == Opcode.MESSAGE:
-            _, size, channel, _, time, _ = _MESSAGE.unpack_from(raw, position)
-            end = position + _HEAD.size + size
-            if channel in topics:
-                cdr = raw[position + _MESSAGE.size : end]
-                found.append((time, place + position, topics[channel], cdr))
-        else:
-            end = position + _HEAD.size + _HEAD.unpack_from(raw, position)[1]
-        position = end
+        opcode, size = _HEAD.unpack_from(raw, position)
+        if opcode == Opcode.MESSAGE:
+            found.append(position)
+        position += _HEAD.size + size
     if position != len(raw):
         raise ValueError("a record exceeds its chunk")
     return found

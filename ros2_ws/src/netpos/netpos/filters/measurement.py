@@ -36,16 +36,13 @@ along a.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 
 from netpos.filters.compile import kernel, leaf
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.filters.step_velocity import curvature, reported
-from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
+from netpos.messages.values import Array
 
 
 class Kind(IntEnum):
@@ -67,9 +64,6 @@ class Kind(IntEnum):
 KIND, VALUE, VARIANCE, GATE_VARIANCE, BIAS, COMMON, GROUP, ORIGIN = range(8)
 AXES = 10
 HEADING, LEVER, BLOCKED = 19, 20, 23
-# Plain integers: arithmetic of flags costs ten times as much.
-_AZIMUTH, _ELEVATION, _TOA = int(Field.AZIMUTH), int(Field.ELEVATION), int(Field.TOA)
-_RANGE, _PHASE, _POSITION = int(Field.RANGE), int(Field.PHASE), int(Field.POSITION)
 ROW_WIDTH = 24
 
 
@@ -273,145 +267,3 @@ def linearise(rows: Array, mean: Array, height_m: float) -> tuple[Array, Array]:
     for i in range(m):
         innovation[i] = innovation_row(rows[i], mean, height_m, H[i])
     return innovation, H
-
-
-def rsu_axes(info: RsuInfo) -> Array:
-    """Rotation map -> RSU axes, row-major (9,), of the RSU's pose."""
-    x, y, z, w = (info.quaternion / np.linalg.norm(info.quaternion)).tolist()
-    return np.array(  # by hand: SciPy's Rotation would cost every tracker 24 MB and 0.2 s
-        [
-            1.0 - 2.0 * (y * y + z * z),
-            2.0 * (x * y + z * w),
-            2.0 * (x * z - y * w),
-            2.0 * (x * y - z * w),
-            1.0 - 2.0 * (x * x + z * z),
-            2.0 * (y * z + x * w),
-            2.0 * (x * z + y * w),
-            2.0 * (y * z - x * w),
-            1.0 - 2.0 * (x * x + y * y),
-        ]
-    )
-
-
-def array_direction(axes: Array) -> Array:
-    """Unit vector (3,) in map along a two-antenna array, slave to master, for ``axes`` (9,) of
-    ``rsu_axes``: the paper's x axis, to the right of the boresight."""
-    return -axes[3:6]
-
-
-@dataclass(frozen=True, slots=True)
-class Coupling:
-    """How the slow and coloured errors of one RSU enter its rows, by kind; what is absent is white
-    and unbiased."""
-
-    bias: Mapping[Kind, int]  # state index of the RSU's own bias
-    common: Mapping[Kind, int]  # state index of the bias its network shares
-    inflation: Mapping[Kind, float]  # variance factor of correlated noise
-
-
-UNCOUPLED = Coupling({}, {}, {})
-
-
-def scalar_values(
-    m: RsuMeasurement, convention: AngleConvention
-) -> Iterator[tuple[Kind, float, float]]:
-    """Kind, value and variance of each scalar quantity in a measurement, in units of the rows."""
-    c, fields = SPEED_OF_LIGHT_MPS, int(m.fields)
-    cone = convention is AngleConvention.CONE
-    if fields & _AZIMUTH:
-        if cone:
-            yield Kind.COSINE_Y, math.sin(m.azimuth_rad), _cosine_var(m.azimuth_rad, m.azimuth_var)
-        else:
-            yield Kind.AZIMUTH, m.azimuth_rad, m.azimuth_var
-    if fields & _ELEVATION:
-        if cone:
-            variance = _cosine_var(m.elevation_rad, m.elevation_var)
-            yield Kind.COSINE_Z, math.sin(m.elevation_rad), variance
-        else:
-            yield Kind.ELEVATION, m.elevation_rad, m.elevation_var
-    if fields & _TOA:
-        yield Kind.TOA, c * m.toa_s, c * c * m.toa_var
-    if fields & _RANGE:
-        yield Kind.RANGE, m.range_m, m.range_var
-    if fields & _PHASE:
-        yield Kind.PHASE, m.phase_difference_rad, m.phase_difference_var
-
-
-def _cosine_var(angle: float, variance: float) -> float:
-    """Variance of sin(angle), at end-fire no smaller than the second-order term."""
-    return max(math.cos(angle) ** 2 * variance, variance * variance / 2.0)
-
-
-def rsu_rows(
-    m: RsuMeasurement,
-    info: RsuInfo,
-    axes: Array,
-    group: int,
-    coupling: Coupling = UNCOUPLED,
-    heading: int = -1,
-) -> Array:
-    """Rows (m, ROW_WIDTH) of one RSU measurement; a position fix of its antenna becomes two
-    decorrelated LINEAR rows.
-
-    axes : (9,) of ``rsu_axes``
-    heading : state index of the device's heading, by which its lever arm turns; -1: none
-    """
-    scalars = list(scalar_values(m, info.angle_convention))
-    rows = np.empty((len(scalars), ROW_WIDTH))
-    rows[:, ORIGIN:AXES] = info.position
-    rows[:, AXES:HEADING] = axes
-    rows[:, HEADING:] = heading, *m.lever_arm, 0.0
-    for row, (kind, value, variance) in zip(rows, scalars, strict=True):
-        row[:ORIGIN] = (
-            kind,
-            value,
-            variance * coupling.inflation.get(kind, 1.0),
-            variance,
-            coupling.bias.get(kind, -1),
-            coupling.common.get(kind, -1),
-            group,
-        )
-    if info.baseline_m > 0.0:
-        _place_antennas(rows, info, array_direction(axes))
-    if int(m.fields) & _POSITION:
-        fix = linear_rows(m.position[:2], m.position_cov[:2, :2], np.eye(2, 6), group)
-        fix[:, HEADING:BLOCKED] = heading, *m.lever_arm
-        rows = np.vstack([rows, fix])
-    return rows
-
-
-def _place_antennas(rows: Array, info: RsuInfo, along: Array) -> None:
-    """Let the ``rows`` (m, ROW_WIDTH) of a two-antenna anchor count from its master, and its
-    phases along the array."""
-    for row in rows:
-        kind = int(row[KIND])
-        if kind in (Kind.RANGE, Kind.TOA):
-            row[ORIGIN:AXES] = info.position + info.baseline_m / 2.0 * along
-        elif kind == Kind.PHASE:
-            row[AXES : AXES + 3] = 2.0 * math.pi * info.baseline_m / info.wavelength_m * along
-
-
-def linear_rows(value: Array, cov: Array, H: Array, group: int) -> Array:
-    """Rows of a linear measurement ``value = H x + noise`` with full covariance, decorrelated by
-    its Cholesky factor.
-
-    value (m,), cov (m, m) positive definite, H (m, 6) of the core states. Raises ``LinAlgError``
-    where cov is not.
-    """
-    L = np.linalg.cholesky((cov + cov.T) / 2.0)
-    rows = np.zeros((len(value), ROW_WIDTH))
-    rows[:, KIND] = Kind.LINEAR
-    rows[:, VALUE] = np.linalg.solve(L, value)
-    rows[:, VARIANCE] = rows[:, GATE_VARIANCE] = 1.0
-    rows[:, BIAS] = rows[:, COMMON] = rows[:, HEADING] = -1
-    rows[:, GROUP] = group
-    rows[:, ORIGIN : ORIGIN + 6] = np.linalg.solve(L, H)
-    return rows
-
-
-def speed_row(speed_mps: float, variance: float, group: int) -> Array:
-    """Row (1, ROW_WIDTH) of a ground-speed measurement."""
-    row = np.zeros((1, ROW_WIDTH))
-    row[0, :ORIGIN] = Kind.SPEED, speed_mps, variance, variance, -1, -1, group
-    row[0, HEADING] = -1
-    return row

@@ -12,7 +12,7 @@
 """
 
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.track import TrackOutput
+from netpos.tracking.report import TrackOutput
 from netpos.tracking.tracker import Tracker
 
 __all__ = ["TrackOutput", "Tracker", "TrackerConfig"]

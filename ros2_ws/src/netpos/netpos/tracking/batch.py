@@ -7,31 +7,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netpos.filters.measurement import (
-    BIAS,
-    COMMON,
-    KIND,
-    UNCOUPLED,
-    VARIANCE,
-    Kind,
-    linear_rows,
-    linearise,
-    rsu_rows,
-    speed_row,
-)
-from netpos.messages.values import Array, GroundSpeed, RsuMeasurement, Velocity
+from netpos.filters.measurement import BIAS, COMMON, KIND, ROW_WIDTH, VARIANCE, Kind, linearise
+from netpos.filters.rows import ROWS_MAX, couple, linear_rows, put_measurement, speed_row
+from netpos.messages.values import Array, Field, GroundSpeed, RsuMeasurement, Velocity
 from netpos.tracking.rsus import BiasStates, Rsu
 
 Source = RsuMeasurement | Velocity | GroundSpeed
+_TOA = int(Field.TOA)
 _VELOCITY_H = np.eye(2, 6, k=2)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Batch:
     """Rows (m, ROW_WIDTH) of one epoch and, per group, the item they come from."""
 
     rows: Array
     items: tuple[Source, ...]
+
+    @property
+    def has_time(self) -> bool:
+        """Whether there is a time of arrival in it."""
+        return any(isinstance(i, RsuMeasurement) and int(i.fields) & _TOA for i in self.items)
 
     def slow_variance(self, biases: BiasStates) -> Array:
         """Variance (m,) that the slow errors add to each row before there are states of them."""
@@ -57,22 +53,26 @@ def batch_of(
     heading : state index of the device's heading, -1: none
     inflation : variance factor of velocities with correlated errors, by source
     """
-    blocks = []
+    rows, end = np.empty((ROWS_MAX * len(items), ROW_WIDTH)), 0
     for group, item in enumerate(items):
+        first = end
         if isinstance(item, RsuMeasurement):
             rsu = rsus[item.rsu_id]
-            coupling = UNCOUPLED if biases is None else biases.coupling(rsu, item)
-            blocks.append(rsu_rows(item, rsu.info, rsu.axes, group, coupling, heading))
-        elif isinstance(item, Velocity):
-            rows = linear_rows(item.velocity, item.cov, _VELOCITY_H, group)
-            rows[:, VARIANCE] *= (inflation or {}).get(item.source, 1.0)
+            end = put_measurement(rows, first, item, rsu.cone, rsu.place, group, heading)
+            if biases is not None and not rsu.plain:
+                couple(rows[first:end], rsu.kinds(item), biases.coupling(rsu, item))
+            continue
+        if isinstance(item, Velocity):
+            block = linear_rows(item.velocity, item.cov, _VELOCITY_H, group)
+            block[:, VARIANCE] *= (inflation or {}).get(item.source, 1.0)
             states = (-1, -1) if biases is None else biases.of_steps(item.source)
             if max(states) >= 0:
-                rows[:, KIND], rows[:, BIAS], rows[:, COMMON] = Kind.STEP_VELOCITY, *states
-            blocks.append(rows)
+                block[:, KIND], block[:, BIAS], block[:, COMMON] = Kind.STEP_VELOCITY, *states
         else:
-            blocks.append(speed_row(item.speed_mps, item.speed_var, group))
-    return Batch(np.vstack(blocks) if len(blocks) > 1 else blocks[0], tuple(items))
+            block = speed_row(item.speed_mps, item.speed_var, group)
+        end += len(block)
+        rows[first:end] = block
+    return Batch(rows[:end], tuple(items))
 
 
 def velocity_inflation(
@@ -91,7 +91,7 @@ def velocity_inflation(
     return factors
 
 
-def mostly_accepted(batch: Batch, accepted: Array) -> bool:
+def mostly_accepted(batch: Batch, accepted: Sequence[float]) -> bool:
     """Whether at least half of the RSUs, or of all where there is none, were accepted."""
     votes = [
         bool(taken)

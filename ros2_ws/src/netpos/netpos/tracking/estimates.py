@@ -76,6 +76,7 @@ class Single:
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
         self.stamp_ns = stamp_ns
         self._options = options_of(config)
+        self._factored = config.filter == "srukf"
         self._motion: Array = motions_of(config)[0].copy()
         mean, cov = grown(mean, cov, initial_extra_sd(config))
         self._mean, self._spread = mean.copy(), engine.to_spread(cov, self._options)
@@ -94,7 +95,7 @@ class Single:
 
     @property
     def cov(self) -> Array:
-        return engine.to_cov(self._spread, self._options)
+        return engine.to_cov(self._spread, self._options) if self._factored else self._spread
 
     @property
     def motion(self) -> Array:
@@ -102,8 +103,9 @@ class Single:
 
     @property
     def prior(self) -> tuple[Array, Array]:
-        n = self._mean.size
-        return self._spare[0], engine.to_cov(self._spare[1 : n + 1], self._options)
+        spread = self._spare[1 : self._mean.size + 1]
+        cov = engine.to_cov(spread, self._options) if self._factored else spread
+        return self._spare[0], cov
 
     def grow(self, sd: Array) -> None:
         if self._mean.size < 6 + sd.size:
@@ -144,10 +146,11 @@ class Single:
             self._spare,
         )
         self.stamp_ns = stamp_ns
-        return nis, dof, self._accepted[0, : int(rows[-1, GROUP]) + 1]
+        return nis, dof, self._accepted[0, : int(rows.item(-1, GROUP)) + 1]
 
     def copy(self) -> Single:
-        twin = copy.copy(self)
+        twin = Single.__new__(Single)
+        twin.__dict__.update(self.__dict__)
         twin._mean, twin._spread = self._mean.copy(), self._spread.copy()
         twin._motion = self._motion.copy()
         return twin

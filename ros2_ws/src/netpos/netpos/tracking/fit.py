@@ -20,6 +20,7 @@ from netpos.filters.measurement import (
 from netpos.messages.values import Array, RsuMeasurement
 from netpos.tracking.batch import Batch, Source
 from netpos.tracking.health import RsuHealth
+from netpos.tracking.health_words import Observation
 from netpos.tracking.rsus import Rsu
 
 AnySource = TypeVar("AnySource", bound=Source)
@@ -62,7 +63,7 @@ def without_isolated(
 
 
 def with_refused(
-    batch: Batch, accepted: Array, gate: Array, nis: float, dof: int
+    batch: Batch, accepted: Sequence[float], gate: Array, nis: float, dof: int
 ) -> tuple[float, int]:
     """``nis`` of ``dof`` accepted rows of an epoch with those it refused, as at their gate."""
     if dof < len(batch.rows):
@@ -75,18 +76,24 @@ def with_refused(
 
 
 def observe(
-    health: RsuHealth, vue_id: str, stamp_ns: int, batch: Batch, fits: Array, accepted: Array
+    health: RsuHealth,
+    vue_id: str,
+    stamp_ns: int,
+    batch: Batch,
+    fits: Array,
+    accepted: Sequence[float],
 ) -> None:
     """Tell ``health`` how the measurements of an epoch fitted: ``fits`` (m, 2) per row, whether
     ``accepted`` (groups,) per item."""
-    found: list[dict[str, tuple[float, float]]] = [{} for _ in batch.items]
+    found: list[list[tuple[str, tuple[float, float]]]] = [[] for _ in batch.items]
     kinds, groups = batch.rows[:, KIND].tolist(), batch.rows[:, GROUP].tolist()
     for kind, group, (innovation, sd) in zip(kinds, groups, fits.tolist(), strict=True):
         if kind in _KIND_NAMES:
-            found[int(group)][_KIND_NAMES[kind]] = (innovation, sd)
+            found[int(group)].append((_KIND_NAMES[kind], (innovation, sd)))
     for item, taken, innovations in zip(batch.items, accepted, found, strict=True):
         if isinstance(item, RsuMeasurement):
-            health.observe(item.rsu_id, vue_id, stamp_ns, bool(taken), innovations)
+            seen = Observation(stamp_ns, vue_id, bool(taken), tuple(innovations))
+            health.take(item.rsu_id, seen)
 
 
 def observe_isolated(
@@ -96,4 +103,4 @@ def observe_isolated(
     fused; its rows have no bias states."""
     widen(fits, batch.rows, rsu)
     fitting = bool(((fits[:, 0] / fits[:, 1]) ** 2 <= gate[1]).all())
-    observe(health, vue_id, stamp_ns, batch, fits, np.array([fitting]))
+    observe(health, vue_id, stamp_ns, batch, fits, [fitting])

@@ -157,11 +157,17 @@ class RsuHealth:
         innovations : (measured minus predicted in m or rad, its sd) by ``Kind`` name, any case
         Raises ``ValueError`` for an innovation that is not finite or an sd that is not > 0.
         """
-        for value, sd in innovations.values():
+        self.take(rsu_id, Observation(stamp_ns, vue_id, accepted, tuple(innovations.items())))
+
+    def take(self, rsu_id: str, seen: Observation) -> None:
+        """``observe`` for an observation that exists."""
+        for _, (value, sd) in seen.innovations:
             if not (-math.inf < value < math.inf and 0.0 < sd < math.inf):
                 raise ValueError(
-                    f"innovation and sd of {rsu_id} must be finite, the sd > 0, got {innovations}"
+                    f"innovation and sd of {rsu_id} must be finite, the sd > 0, got "
+                    f"{dict(seen.innovations)}"
                 )
+        stamp_ns, vue_id, _, _ = seen
         if stamp_ns >= self._due_ns:
             self._advance(stamp_ns)
         rsu = self._rsus.get(rsu_id)
@@ -181,7 +187,7 @@ class RsuHealth:
         stream = streams.get((vue_id, rsu_id))
         if stream is None:
             stream = streams[vue_id, rsu_id] = {}
-        stream[stamp_ns] = Observation(stamp_ns, vue_id, accepted, tuple(innovations.items()))
+        stream[stamp_ns] = seen
 
     def rewind(self, vue_id: str, stamp_ns: int) -> None:
         """Drop what was observed of a device from ``stamp_ns`` on, as far as it is not judged: its

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from netpos.filters.compile import leaf
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages.values import Array, ClockState, Odometry, TrackState
 from netpos.tracking.config import TrackerConfig
@@ -14,8 +15,13 @@ from netpos.tracking.config import TrackerConfig
 # this variance.
 UNOBSERVED_VAR = 1e6
 _YAW_VAR_MAX = math.pi**2 / 3.0  # of a heading about which nothing is known
-_POSE_COV = np.diag([0.0, 0.0, UNOBSERVED_VAR, UNOBSERVED_VAR, UNOBSERVED_VAR, 0.0])
-_TWIST_COV = np.diag([0.0, 0.0, *([UNOBSERVED_VAR] * 4)])
+_COVS = np.array(  # of pose and twist
+    [
+        np.diag([0.0, 0.0, UNOBSERVED_VAR, UNOBSERVED_VAR, UNOBSERVED_VAR, 0.0]),
+        np.diag([0.0, 0.0, *([UNOBSERVED_VAR] * 4)]),
+    ]
+)
+_POSITION, _QUATERNION, _VELOCITY, _RATE, _VECTORS = 0, 3, 7, 10, 13
 
 
 def eigenvalues(xx: float, xy: float, yy: float) -> tuple[float, float]:
@@ -37,15 +43,43 @@ def heading(mean: Array, cov: Array, last: float, index: int = -1) -> tuple[floa
     ``last`` where the speed does not stand out from its error."""
     if index >= 0:
         return math.remainder(float(mean[index]), math.tau), float(cov[index, index])
-    vx, vy = mean[2:4].tolist()
+    yaw, variance = _course(mean, cov, last)
+    return yaw, variance
+
+
+@leaf
+def _course(mean: Array, cov: Array, last: float) -> tuple[float, float]:
+    vx, vy = mean[2], mean[3]
     speed2 = vx * vx + vy * vy
     if speed2 < 1e-12:
         return last, _YAW_VAR_MAX
-    (xx, xy), (_, yy) = cov[2:4, 2:4].tolist()
+    xx, xy, yy = cov[2, 2], cov[2, 3], cov[3, 3]
     variance = (vy * vy * xx - 2.0 * vx * vy * xy + vx * vx * yy) / (speed2 * speed2)
     if variance > _YAW_VAR_MAX / 4.0:
         return last, _YAW_VAR_MAX
     return math.atan2(vy, vx), variance
+
+
+@leaf
+def _fill(
+    mean: Array, cov: Array, yaw: float, yaw_var: float, vectors: Array, covs: Array
+) -> None:
+    """Vectors and covariances of an odometry, all but its height, from what is not estimated."""
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    vx, vy = mean[2], mean[3]
+    xx, xy, yy = cov[2, 2], cov[2, 3], cov[3, 3]
+    vectors[_POSITION], vectors[_POSITION + 1] = mean[0], mean[1]
+    vectors[_VELOCITY], vectors[_VELOCITY + 1] = cos * vx + sin * vy, cos * vy - sin * vx
+    vectors[_QUATERNION + 2] = math.sin(yaw / 2.0)
+    vectors[_QUATERNION + 3] = math.cos(yaw / 2.0)
+    pose, twist = covs[0], covs[1]
+    for a in range(2):
+        for b in range(2):
+            pose[a, b] = cov[a, b]
+    pose[5, 5] = yaw_var
+    twist[0, 0] = cos * cos * xx + 2.0 * cos * sin * xy + sin * sin * yy
+    twist[1, 1] = sin * sin * xx - 2.0 * cos * sin * xy + cos * cos * yy
+    twist[0, 1] = twist[1, 0] = cos * sin * (yy - xx) + (cos * cos - sin * sin) * xy
 
 
 def odometry(
@@ -58,30 +92,25 @@ def odometry(
     yaw_var: float,
 ) -> Odometry:
     """Odometry of a planar track: pose in map, twist in base_link (x along ``yaw``)."""
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    x, y, vx, vy = mean[:4].tolist()
-    (xx, xy), (_, yy) = cov[2:4, 2:4].tolist()
-    pose_cov, twist_cov = _POSE_COV.copy(), _TWIST_COV.copy()
-    pose_cov[:2, :2] = cov[:2, :2]
-    pose_cov[5, 5] = yaw_var
-    twist_cov[0, 0] = cos * cos * xx + 2.0 * cos * sin * xy + sin * sin * yy
-    twist_cov[1, 1] = sin * sin * xx - 2.0 * cos * sin * xy + cos * cos * yy
-    twist_cov[0, 1] = twist_cov[1, 0] = cos * sin * (yy - xx) + (cos * cos - sin * sin) * xy
+    vectors, covs = np.zeros(_VECTORS), _COVS.copy()
+    _fill(mean, cov, yaw, yaw_var, vectors, covs)
+    vectors[_POSITION + 2] = height_m
     return Odometry(
         stamp_ns=stamp_ns,
         vue_id=vue_id,
-        position=np.array((x, y, height_m)),
-        quaternion=np.array((0.0, 0.0, math.sin(yaw / 2.0), math.cos(yaw / 2.0))),
-        linear_velocity=np.array((cos * vx + sin * vy, cos * vy - sin * vx, 0.0)),
-        pose_cov=pose_cov,
-        twist_cov=twist_cov,
+        position=vectors[_POSITION:_QUATERNION],
+        quaternion=vectors[_QUATERNION:_VELOCITY],
+        linear_velocity=vectors[_VELOCITY:_RATE],
+        angular_velocity=vectors[_RATE:],
+        pose_cov=covs[0],
+        twist_cov=covs[1],
     )
 
 
 def with_yaw_rate(odometry: Odometry, mean: Array, cov: Array, heading: int) -> Odometry:
     """Odometry of a rigid body whose heading and yaw rate are the states from ``heading`` on."""
     rate = heading + 1
-    odometry.angular_velocity = np.array((0.0, 0.0, float(mean[rate])))
+    odometry.angular_velocity[2] = mean[rate]
     odometry.twist_cov[5, 5] = cov[rate, rate]
     odometry.pose_cov[:2, 5] = odometry.pose_cov[5, :2] = cov[:2, heading]
     return odometry
@@ -94,8 +123,8 @@ def clock_state(stamp_ns: int, vue_id: str, mean: Array, cov: Array) -> ClockSta
     return ClockState(
         stamp_ns=stamp_ns,
         vue_id=vue_id,
-        offset_s=float(mean[0]) / c,
-        drift=float(mean[1]) / c,
+        offset_s=mean.item(0) / c,
+        drift=mean.item(1) / c,
         cov=cov / (c * c),
     )
 

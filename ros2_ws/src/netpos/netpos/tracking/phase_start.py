@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections import Counter
+from collections.abc import MutableMapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -118,7 +118,7 @@ def with_sectors(config: TrackerConfig, estimate: Estimate | None, rows: Array) 
     return Sectors.promote(config, *known, rows, at)
 
 
-def corrections(estimate: Estimate, rejected: Counter[str]) -> int:
+def corrections(estimate: Estimate, rejected: MutableMapping[str, int]) -> int:
     """How often a decision about the sector was replaced since last asked; counted as
     ``sector_corrected``."""
     if not isinstance(estimate, Sectors) or not estimate.corrected:

@@ -100,17 +100,18 @@ class NisWindow:
         if not 0.5 <= confidence < 1.0:
             raise ValueError(f"confidence must be in [0.5, 1), got {confidence}")
         self._tail = 1.0 - confidence
-        self._window: deque[tuple[float, int]] = deque(maxlen=epochs)
+        self._nis: deque[float] = deque(maxlen=epochs)
+        self._dofs: deque[int] = deque(maxlen=epochs)
 
     def add(self, nis: float, dof: int) -> None:
         """Take the NIS of one epoch; one without measurements (``dof`` 0) says nothing."""
         if dof > 0:
-            self._window.append((nis, dof))
+            self._nis.append(nis)
+            self._dofs.append(dof)
 
     def inflation(self) -> float:
         """Factor on the sd, >= 1."""
-        dof = sum([d for _, d in self._window])
-        nis = math.fsum([n for n, _ in self._window])
+        dof, nis = sum(self._dofs), math.fsum(self._nis)
         if dof == 0 or nis <= _bound(dof, self._tail):
             return 1.0
         return math.sqrt(nis / dof)
@@ -119,7 +120,7 @@ class NisWindow:
         """An independent copy: a track that goes back in time goes back to it."""
         twin = NisWindow.__new__(NisWindow)
         twin._tail = self._tail
-        twin._window = self._window.copy()
+        twin._nis, twin._dofs = self._nis.copy(), self._dofs.copy()
         return twin
 
 

@@ -26,6 +26,7 @@ from netpos.messages.values import ImuSample, Odometry
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.networks.chain import Chain
 from netpos.tracking.networks.config import FusionConfig
+from netpos.tracking.report import TrackOutput
 from netpos.tracking.sequencer import Item
 from netpos.tracking.settings import (
     FUSION_METADATA,
@@ -33,7 +34,6 @@ from netpos.tracking.settings import (
     TrackerSettings,
     bag_settings,
 )
-from netpos.tracking.track import TrackOutput
 from netpos.tracking.tracker import Tracker
 
 _ODOMETRY = "nav_msgs/msg/Odometry"

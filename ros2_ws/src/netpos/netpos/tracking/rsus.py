@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from netpos.filters.measurement import (
-    UNCOUPLED,
-    Coupling,
-    Kind,
-    rsu_axes,
-    scalar_values,
-)
+from netpos.filters.measurement import Kind
 from netpos.filters.motion import N_CORE
+from netpos.filters.rows import UNCOUPLED, Coupling, rsu_axes, rsu_place, scalar_kinds
 from netpos.messages.values import (
     AngleConvention,
     Array,
@@ -35,6 +29,10 @@ class Rsu:
 
     info: RsuInfo
     axes: Array
+    place: Array
+    """What its rows hold of it, of ``rsu_place``."""
+    cone: bool
+    """Its angles are those of linear arrays."""
     plain: bool
     """Its errors are white and unbiased."""
 
@@ -48,7 +46,9 @@ class Rsu:
             info.common_range_bias_sd_m,
             info.noise_correlation_time_s,
         )
-        return cls(info, rsu_axes(info), not any(slow))
+        axes = rsu_axes(info)
+        cone = info.angle_convention is AngleConvention.CONE
+        return cls(info, axes, rsu_place(info, axes), cone, not any(slow))
 
     def bias_sd(self, kind: Kind) -> float:
         """Standard deviation of the RSU's own bias in rows of a kind; 0 where it has none."""
@@ -62,7 +62,7 @@ class Rsu:
 
     def kinds(self, m: RsuMeasurement) -> tuple[Kind, ...]:
         """Kinds of the scalar rows a measurement of this RSU gives."""
-        return tuple(kind for kind, _, _ in scalar_values(m, self.info.angle_convention))
+        return scalar_kinds(int(m.fields), self.info.angle_convention)
 
     def phase_fault(self) -> str | None:
         """Reason to refuse a phase difference of this RSU."""
@@ -71,8 +71,7 @@ class Rsu:
     def in_front(self, dx: float, dy: float) -> bool:
         """Whether a horizontal offset from the RSU is one its array can see: neither a CONE array
         nor two antennas tell front from back."""
-        spherical = self.info.angle_convention is AngleConvention.SPHERICAL
-        if spherical and not self.info.baseline_m:
+        if not self.cone and not self.info.baseline_m:
             return True
         return bool(self.axes[0] * dx + self.axes[1] * dy >= 0.0)
 
@@ -101,18 +100,16 @@ class BiasStates:
     _last_ns: dict[tuple[str, Kind], int] = field(default_factory=dict)
 
     def copy(self) -> BiasStates:
-        """An independent copy."""
-        twin = copy.copy(self)
-        twin.sd, twin.tau_s = self.sd.copy(), self.tau_s.copy()
-        twin._slots, twin._last_ns = self._slots.copy(), self._last_ns.copy()
-        return twin
+        """An independent copy; the lists and the slots are replaced, never changed."""
+        last_ns = self._last_ns.copy()
+        return BiasStates(self.first, self.steps, self.sd, self.tau_s, self._slots, last_ns)
 
     def arrays(self) -> Array:
         """(2, k): standard deviation and time constant of each."""
         return np.array([self.sd, self.tau_s]).reshape(2, -1)
 
     def coupling(self, rsu: Rsu, m: RsuMeasurement) -> Coupling:
-        """Coupling of the rows of ``m``; new biases are appended to ``sd`` and ``tau_s``."""
+        """Coupling of the rows of ``m``; new biases are added to ``sd`` and ``tau_s``."""
         if rsu.plain:
             return UNCOUPLED
         info = rsu.info
@@ -168,9 +165,9 @@ class BiasStates:
 
     def _slot(self, name: tuple[str, str], sd: float, tau_s: float) -> int:
         if name not in self._slots:
-            self._slots[name] = self.first + len(self.sd)
-            self.sd.append(sd)
-            self.tau_s.append(tau_s)
+            self._slots = {**self._slots, name: self.first + len(self.sd)}
+            self.sd = [*self.sd, sd]
+            self.tau_s = [*self.tau_s, tau_s]
         return self._slots[name]
 
     def _inflation(self, info: RsuInfo, kind: Kind, stamp_ns: int) -> float:

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from netpos.filters.compile import leaf
 from netpos.filters.measurement import BIAS, COMMON, GROUP, KIND, Kind
 from netpos.filters.motion import Parameter
 from netpos.messages.values import Array
@@ -20,12 +21,14 @@ from netpos.tracking.protection import protection_level
 _DOUBT = 0.9  # a decision is taken back below this probability
 
 
+@leaf
 def phase_place(rows: Array) -> int:
     """Index of the first phase in ``rows`` (m, ROW_WIDTH) with a range of the same measurement
     just before it; -1: there is none."""
-    for i in np.flatnonzero(rows[1:, KIND] == Kind.PHASE).tolist():
-        if rows[i, KIND] == Kind.RANGE and rows[i, GROUP] == rows[i + 1, GROUP]:
-            return i + 1
+    for i in range(1, rows.shape[0]):
+        ranged = int(rows[i - 1, KIND]) == Kind.RANGE and rows[i - 1, GROUP] == rows[i, GROUP]
+        if ranged and int(rows[i, KIND]) == Kind.PHASE:
+            return i
     return -1
 
 

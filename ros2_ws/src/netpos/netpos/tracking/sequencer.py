@@ -28,13 +28,11 @@ _SET_BACK_AFTER = 10  # stamps in a row from before the history: the device's ti
 def channel_and_source(item: Item) -> tuple[str, str]:
     """Channel an item arrived on and who sent it; their order is the order of application within
     an epoch."""
-    match item:
-        case InitialPose():
-            return POSE, ""
-        case RsuMeasurement():
-            return RSU, item.rsu_id
-        case _:
-            return item.source, item.source
+    if isinstance(item, RsuMeasurement):
+        return RSU, item.rsu_id
+    if isinstance(item, InitialPose):
+        return POSE, ""
+    return item.source, item.source
 
 
 @dataclass(slots=True)
@@ -108,7 +106,10 @@ class Sequencer:
         self._applied: dict[int, Epoch] = {}
         self._late: list[tuple[int, Item]] = []
         self._watermark: dict[str, int] = {}
+        self.newest_ns = 0
+        """Newest stamp heard; 0 before the first."""
         self._released_ns = -1
+        self._forget_ns = 0
         self._last_of: dict[tuple[str, str], int] = {}
         self._suspect_ns: int | None = None
         self._late_in_row = 0
@@ -139,16 +140,12 @@ class Sequencer:
         self.mark(key[0], stamp)
         return None
 
-    @property
-    def newest_ns(self) -> int:
-        """Newest stamp heard; 0 before the first."""
-        return max(self._watermark.values(), default=0)
-
     def mark(self, channel: str, stamp_ns: int) -> None:
         """Note that a channel has reached a stamp."""
         if channel == IMU and self._tick_ns > 0:
             self._tick(self._watermark.get(channel, stamp_ns), stamp_ns)
         self._watermark[channel] = max(stamp_ns, self._watermark.get(channel, stamp_ns))
+        self.newest_ns = max(stamp_ns, self.newest_ns)
 
     def _tick(self, from_ns: int, to_ns: int) -> None:
         """Have epochs at the multiples of the tick after ``from_ns``, none older than a second."""
@@ -160,6 +157,8 @@ class Sequencer:
 
     def take_late(self) -> list[tuple[int, Item]]:
         """Late items and their stamps, oldest first, to be merged into epochs applied before."""
+        if not self._late:
+            return []
         late, self._late = self._late, []
         return sorted(late, key=lambda entry: (entry[0], channel_and_source(entry[1])))
 
@@ -168,10 +167,9 @@ class Sequencer:
         self._applied[epoch.stamp_ns] = epoch
 
     def _time_fault(self, stamp: int) -> str | None:
-        newest = max(self._watermark.values(), default=None)
-        if newest is None:
+        if not self._watermark:
             return None
-        if stamp > newest + self._future_ns:
+        if stamp > self.newest_ns + self._future_ns:
             suspect, self._suspect_ns = self._suspect_ns, stamp
             if suspect is None or abs(stamp - suspect) > self._future_ns:
                 return "future_stamp"
@@ -218,23 +216,27 @@ class Sequencer:
         if self._history_ns > 0:
             if not (stamp in self._applied and epoch.is_late_pose()):
                 self._applied[stamp] = epoch
-            for old in [s for s in self._applied if s < self._released_ns - self._history_ns]:
-                del self._applied[old]
+            self._forget_applied(self._released_ns - self._history_ns)
         for key in epoch.items:
             self._last_of[key] = stamp
         return epoch
 
+    def _forget_applied(self, before_ns: int) -> None:
+        """Drop epochs older than the history, from time to time: looking at all costs more."""
+        if before_ns >= self._forget_ns:
+            for old in [s for s in self._applied if s < before_ns]:
+                del self._applied[old]
+            self._forget_ns = before_ns + self._history_ns // 2
+
     def _ready(self, epoch: Epoch) -> bool:
-        if self._needs_pose and POSE not in self._watermark:
-            return max(self._watermark.values()) >= epoch.stamp_ns + self._hold_ns
-        newest = max(self._watermark.values())
-        if newest >= epoch.stamp_ns + self._hold_ns:
+        stamp, newest = epoch.stamp_ns, self.newest_ns
+        if newest >= stamp + self._hold_ns:
             return True
-        stamp = epoch.stamp_ns
-        reached = all(
-            w >= stamp or w < newest - self._live_ns
-            for c, w in self._watermark.items()
-            if c != POSE
-        )
-        closed = epoch.rsu_complete() or self._watermark.get(RSU, 0) > epoch.stamp_ns
-        return reached and closed and (newest > epoch.stamp_ns or not epoch.only_a_pose())
+        if self._needs_pose and POSE not in self._watermark:
+            return False
+        if not epoch.rsu_complete() and self._watermark.get(RSU, 0) <= stamp:
+            return False
+        for channel, reached in self._watermark.items():
+            if reached < stamp and reached >= newest - self._live_ns and channel != POSE:
+                return False
+        return newest > stamp or not epoch.only_a_pose()

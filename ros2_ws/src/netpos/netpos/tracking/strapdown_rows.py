@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from netpos.filters.measurement import GATE_VARIANCE, UNCOUPLED, rsu_rows
+from netpos.filters.measurement import GATE_VARIANCE
+from netpos.filters.rows import UNCOUPLED, rsu_rows
 from netpos.filters.space import SpaceKind, direction_rows, linearise_in_space, place_rows
 from netpos.messages.values import Array, Field, GroundSpeed, RsuMeasurement
 from netpos.tracking.batch import Batch

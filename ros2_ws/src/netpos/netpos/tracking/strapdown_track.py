@@ -19,7 +19,7 @@ from netpos.filters.error_state import MEMORY, Imu, Sensors, advance, correct, d
 from netpos.filters.measurement import GROUP, KIND, VARIANCE, Kind
 from netpos.filters.space import CLOCK, SpaceKind
 from netpos.filters.space_conditioning import condition_in_space
-from netpos.messages.values import Array, InitialPose, Odometry, RsuMeasurement, TrackStatus
+from netpos.messages.values import Array, InitialPose, Odometry, RsuMeasurement
 from netpos.tracking import output
 from netpos.tracking.batch import Batch, mostly_accepted
 from netpos.tracking.blockage import Blockage
@@ -29,6 +29,7 @@ from netpos.tracking.health import RsuHealth
 from netpos.tracking.history import History, merge
 from netpos.tracking.models import gate_thresholds
 from netpos.tracking.protection import NisWindow, protection_level
+from netpos.tracking.report import Applied, TrackOutput, total, track_status
 from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sequencer import Epoch, Item
 from netpos.tracking.strapdown_engine import compile_kernels
@@ -37,7 +38,6 @@ from netpos.tracking.strapdown_output import odometry_of
 from netpos.tracking.strapdown_rows import Source, batch_in_space, fits_in_space, usable
 from netpos.tracking.strapdown_smoothing import Recorder
 from netpos.tracking.strapdown_start import SampleBuffer, StrapdownStart
-from netpos.tracking.track import TrackOutput
 
 _POSE_VAR_MIN = 1e-4  # an initial pose may leave the height's variance at 0
 _RATE_WINDOW_NS = 50_000_000
@@ -135,7 +135,7 @@ class StrapdownTrack:
     @property
     def rejected(self) -> Counter[str]:
         """Measurements refused at the door or rejected by the track, by reason."""
-        return self.refused + self._state.rejected
+        return Counter(total(self.refused, self._state.rejected))
 
     def reset(self) -> None:
         """Forget the estimate and start anew; the counts go on."""
@@ -166,9 +166,9 @@ class StrapdownTrack:
             silent_s = (epoch.stamp_ns - self._state.last_accepted_ns) * 1e-9
             if silent_s > self._config.max_gap_s:
                 self._forget()
-        nis, dof, sources = self._apply(epoch.stamp_ns, items)
+        applied = self._apply(epoch.stamp_ns, items)
         self._record()
-        return self._report(self._state.estimate, epoch.stamp_ns, nis, dof, sources)
+        return self._report(self._state.estimate, applied)
 
     def _between(self, stamp_ns: int) -> TrackOutput:
         """Report of an instant between epochs; nothing changes."""
@@ -176,7 +176,7 @@ class StrapdownTrack:
         if estimate is not None:
             estimate = estimate.copy()
             self._advance(estimate, stamp_ns, None)
-        return self._report(estimate, stamp_ns, 0.0, 0, ())
+        return self._report(estimate, Applied(stamp_ns))
 
     def revise(self, late: list[tuple[int, Item]]) -> tuple[list[Epoch], TrackOutput]:
         """Go back to the oldest of the late items and apply all epochs since then once more; the
@@ -193,7 +193,7 @@ class StrapdownTrack:
 
     # measurements
 
-    def _apply(self, stamp_ns: int, items: list[Source]) -> tuple[float, int, tuple[str, ...]]:
+    def _apply(self, stamp_ns: int, items: list[Source]) -> Applied:
         watched: list[RsuMeasurement] = []
         if self._config.isolate_rsus:
             items, watched = without_isolated(self._health, stamp_ns, items)
@@ -201,7 +201,7 @@ class StrapdownTrack:
         batch = batch_in_space(items, self._rsus, self._state.biases) if items else None
         estimate = self._state.estimate
         if estimate is None:
-            return 0.0, 0, self._try_start(stamp_ns, batch) if batch else ()
+            return Applied(stamp_ns, sources=self._try_start(stamp_ns, batch) if batch else ())
         self._grow(estimate)
         self._advance(estimate, stamp_ns, self.recorder)
         for item in watched:
@@ -210,11 +210,9 @@ class StrapdownTrack:
             observe_isolated(
                 self._health, self._vue_id, stamp_ns, alone, fits, self._rsus[rsu], self._gate
             )
-        return self._update(stamp_ns, estimate, batch) if batch else (0.0, 0, ())
+        return self._update(stamp_ns, estimate, batch) if batch else Applied(stamp_ns)
 
-    def _update(
-        self, stamp_ns: int, estimate: _Estimate, batch: Batch
-    ) -> tuple[float, int, tuple[str, ...]]:
+    def _update(self, stamp_ns: int, estimate: _Estimate, batch: Batch) -> Applied:
         state, nav, cov = self._state, estimate.nav, estimate.cov
         state.blockage.expect(batch)
         self._condition(batch, nav, cov)
@@ -222,26 +220,28 @@ class StrapdownTrack:
         fits = fits_in_space(batch.rows, nav, cov)
         accepted = np.zeros(len(batch.items))
         nis, dof = correct(nav, cov, batch.rows, self._gate, accepted)
-        refused = int(len(batch.items) - accepted.sum())
+        taken = accepted.tolist()
+        refused = taken.count(0.0)
         if refused:
             state.rejected["gate"] += refused
-        state.nis_window.add(*with_refused(batch, accepted, self._gate, nis, dof))
+        state.nis_window.add(*with_refused(batch, taken, self._gate, nis, dof))
         if self._config.isolate_rsus:
-            observe(self._health, self._vue_id, stamp_ns, batch, fits, accepted)
+            observe(self._health, self._vue_id, stamp_ns, batch, fits, taken)
         sources: tuple[str, ...] = ()
         if dof > 0:
             sources = self._note_accepted(stamp_ns, batch, accepted)
-            state.has_clock |= bool((batch.rows[:, KIND] == Kind.TOA).any())
+            state.has_clock = state.has_clock or batch.has_time
         else:
             doubt_standstill(estimate.memory)
-        if mostly_accepted(batch, accepted):
+        applied = Applied(stamp_ns, nis, dof, sources)
+        if mostly_accepted(batch, taken):
             state.rejected_in_row = 0
-            return nis, dof, sources
+            return applied
         state.rejected_in_row += 1
         if state.rejected_in_row >= self._config.max_rejected_epochs:
             state.rejected["track_lost"] += 1
             self._forget()
-        return nis, dof, sources
+        return applied
 
     def _condition(self, batch: Batch, nav: Array, cov: Array) -> None:
         """Re-weight the rows of an epoch as the robust options say."""
@@ -344,15 +344,8 @@ class StrapdownTrack:
             for i in self.recorder.smoothed()
         ]
 
-    def _report(
-        self,
-        estimate: _Estimate | None,
-        stamp_ns: int,
-        nis: float,
-        dof: int,
-        sources: tuple[str, ...],
-    ) -> TrackOutput:
-        state = self._state
+    def _report(self, estimate: _Estimate | None, epoch: Applied) -> TrackOutput:
+        state, stamp_ns = self._state, epoch.stamp_ns
         position_sd, level, heard_ns = 0.0, -1.0, None
         odometry, clock = None, None
         if estimate is not None:
@@ -372,17 +365,14 @@ class StrapdownTrack:
                 there = slice(CLOCK, CLOCK + 2)
                 mean, cov = estimate.nav[CLOCK + 1 : CLOCK + 3], estimate.cov[there, there]
                 clock = output.clock_state(stamp_ns, self._vue_id, mean, cov)
-        status = TrackStatus(
-            stamp_ns=stamp_ns,
-            vue_id=self._vue_id,
-            state=output.track_state(self._config, stamp_ns, heard_ns, position_sd),
-            nis=nis,
-            nis_dof=dof,
-            used=len(sources),
+        status = track_status(
+            self._config,
+            self._vue_id,
+            epoch,
             accepted=state.accepted,
-            rejected=dict(self.rejected),
-            sources=sources,
+            rejected=total(self.refused, state.rejected),
+            heard_ns=heard_ns,
             position_sd_m=position_sd,
-            protection_level_m=level,
+            level_m=level,
         )
         return TrackOutput(odometry, clock, status)

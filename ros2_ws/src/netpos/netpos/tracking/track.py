@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from netpos.filters.measurement import KIND, VARIANCE, Kind
+from netpos.filters.measurement import VARIANCE
 from netpos.messages.values import (
     Array,
-    ClockState,
     InitialPose,
-    NetworkTrack,
     Odometry,
     RsuMeasurement,
-    StepCalibration,
-    TrackState,
-    TrackStatus,
     Velocity,
 )
 from netpos.tracking import estimates, output
@@ -39,6 +33,7 @@ from netpos.tracking.health import RsuHealth
 from netpos.tracking.history import History, merge
 from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser, with_heading
+from netpos.tracking.memory import TrackMemory
 from netpos.tracking.models import (
     gate_thresholds,
     heading_index,
@@ -46,9 +41,10 @@ from netpos.tracking.models import (
     pose_state,
     step_errors,
 )
-from netpos.tracking.networks.secondary import OwnNoise, Secondary
+from netpos.tracking.networks.secondary import Secondary
 from netpos.tracking.phase_start import PhaseStart, corrections, with_sectors
-from netpos.tracking.protection import NisWindow, protection_level, unnoticed_shift
+from netpos.tracking.protection import protection_level, unnoticed_shift
+from netpos.tracking.report import Applied, TrackOutput, total, track_status
 from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sectors import Sectors
 from netpos.tracking.sequencer import Epoch, Item
@@ -58,62 +54,6 @@ from netpos.tracking.steadiness import Steadiness
 _IMU_HOLE_S = 0.05
 _LEVEL_MAX_M = 1e6
 _BLIND_GYRO = 1.0  # rad/s/sqrt(Hz): what the heading does while the IMU is silent
-
-
-@dataclass(frozen=True, slots=True)
-class TrackOutput:
-    """What a track says at one epoch; odometry is None until the first fix, clock until the first
-    TOA. ``revised``: said before of the same epoch, without what came late. ``smoothed``: earlier
-    epochs that are now ``fixed_lag_s`` old. ``network``: whose track it is, "" for that of all;
-    ``track``: the same for others to fuse with their own."""
-
-    odometry: Odometry | None
-    clock: ClockState | None
-    status: TrackStatus
-    revised: bool = False
-    smoothed: tuple[Odometry, ...] = ()
-    network: str = ""
-    track: NetworkTrack | None = None
-
-
-@dataclass(slots=True)
-class _State:
-    """All of a track that changes with an epoch."""
-
-    biases: BiasStates
-    initialiser: Initialiser
-    blockage: Blockage
-    phase_start: PhaseStart
-    steadiness: Steadiness
-    segment: int = 0
-    estimate: Estimate | None = None
-    own: OwnNoise | None = None
-    bias: Array = field(default_factory=lambda: np.zeros((2, 0)))
-    pose: tuple[Array, Array] | None = None
-    nis_window: NisWindow = field(default_factory=NisWindow)
-    yaw: float = 0.0
-    has_clock: bool = False
-    rejected_in_row: int = 0
-    unnoticed_m: float = 0.0
-    last_accepted_ns: int = 0
-    velocity_ns: dict[str, int] = field(default_factory=dict)
-    accepted: int = 0
-    rejected: Counter[str] = field(default_factory=Counter)
-
-    def copy(self) -> _State:
-        twin = copy.copy(self)
-        twin.biases = self.biases.copy()
-        twin.blockage = self.blockage.copy()
-        if self.estimate is None:
-            twin.initialiser = self.initialiser.copy()
-            twin.phase_start = self.phase_start.copy()
-        else:
-            twin.estimate = self.estimate.copy()
-        twin.nis_window = self.nis_window.copy()
-        twin.rejected = self.rejected.copy()
-        twin.velocity_ns = self.velocity_ns.copy()
-        twin.steadiness = self.steadiness.copy()
-        return twin
 
 
 class Track:
@@ -134,7 +74,7 @@ class Track:
         self._extra_sd = initial_extra_sd(config)
         self._heading = heading_index(config)
         self._secondary = Secondary(vue_id, config) if config.network else None
-        self._history: History[_State] = History(int(config.history_s * 1e9))
+        self._history: History[TrackMemory] = History(int(config.history_s * 1e9))
         self._fixed_lag = FixedLag(vue_id, config) if config.fixed_lag_s > 0.0 else None
         self.posteriors: list[Posterior] | None = None
         """Where every epoch's posterior is kept, for a smoother; None: nowhere."""
@@ -143,8 +83,8 @@ class Track:
         """Measurements refused at the door, by reason."""
         self._state = self._fresh()
 
-    def _fresh(self) -> _State:
-        return _State(
+    def _fresh(self) -> TrackMemory:
+        return TrackMemory(
             BiasStates(6 + self._extra_sd.size, step_errors(self._config)),
             Initialiser(self._config),
             Blockage.of(self._config),
@@ -155,7 +95,7 @@ class Track:
     @property
     def rejected(self) -> Counter[str]:
         """Measurements refused at the door or rejected by the track, by reason."""
-        return self.refused + self._state.rejected
+        return Counter(total(self.refused, self._state.rejected))
 
     def reset(self) -> None:
         """Forget the estimate and start anew; the counts of accepted and rejected measurements go
@@ -179,8 +119,7 @@ class Track:
                 self._start_from_pose(epoch.stamp_ns, item)
             else:
                 items.append(item)
-        nis, dof = 0.0, 0
-        sources: tuple[str, ...] = ()
+        applied = Applied(epoch.stamp_ns)
         if items:
             estimate = self._state.estimate
             if estimate is not None:
@@ -189,10 +128,10 @@ class Track:
                     self._forget()
             items, watched = self._split(epoch.stamp_ns, items)
             if items:
-                nis, dof, sources = self._apply(epoch.stamp_ns, items)
-            self._watch(epoch.stamp_ns, watched)
-        result = self._report(epoch.stamp_ns, nis, dof, sources)
-        return self._smooth(result)
+                applied = self._apply(epoch.stamp_ns, items)
+            if watched:
+                self._watch(epoch.stamp_ns, watched)
+        return self._smooth(self._report(applied))
 
     def _smooth(self, result: TrackOutput) -> TrackOutput:
         """Keep the posterior and add what the smoother makes of it."""
@@ -235,10 +174,10 @@ class Track:
         new = [epoch for epoch in made if epoch is not None]
         return new, replace(result, revised=True, smoothed=tuple(smoothed))
 
-    def _apply(self, stamp_ns: int, items: list[Source]) -> tuple[float, int, tuple[str, ...]]:
+    def _apply(self, stamp_ns: int, items: list[Source]) -> Applied:
         batch = self._batch(items)
         if self._state.estimate is None:
-            return 0.0, 0, self._try_first_fix(stamp_ns, batch)
+            return Applied(stamp_ns, sources=self._try_first_fix(stamp_ns, batch))
         return self._update(stamp_ns, batch)
 
     def _split(
@@ -280,8 +219,7 @@ class Track:
         bias_var = batch.slow_variance(state.biases)
         if state.phase_start.heard(batch):
             state.estimate = state.phase_start.add(stamp_ns, batch.rows, bias_var)
-            started = np.full(len(batch.items), state.estimate is not None)
-            return self._note_accepted(stamp_ns, batch, started) if started.all() else ()
+            return self._note_accepted(stamp_ns, batch) if state.estimate is not None else ()
         solution = state.pose
         if solution is None:
             state.initialiser.add(stamp_ns, batch.rows, bias_var, heard)
@@ -296,38 +234,41 @@ class Track:
                 state.rejected["heading_open"] += len(batch.items)
                 return ()
         state.estimate = estimates.start(self._config, stamp_ns, *solution)
-        state.has_clock = bool((batch.rows[:, KIND] == Kind.TOA).any())
-        return self._note_accepted(stamp_ns, batch, np.ones(len(batch.items)))
+        state.has_clock = batch.has_time
+        return self._note_accepted(stamp_ns, batch)
 
-    def _update(self, stamp_ns: int, batch: Batch) -> tuple[float, int, tuple[str, ...]]:
+    def _update(self, stamp_ns: int, batch: Batch) -> Applied:
         state = self._state
         state.estimate = with_sectors(self._config, state.estimate, batch.rows)
         estimate = self._prepare(stamp_ns, batch.items)
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
         state.blockage.expect(batch)
-        nis, dof, accepted = estimate.step(
+        nis, dof, flags = estimate.step(
             stamp_ns, unheard_s, state.rejected_in_row, batch.rows, state.bias
         )
+        accepted = flags.tolist()
         state.blockage.learn(batch)
         if self._secondary is not None:
             state.own = self._secondary.after(
                 state.own, stamp_ns, estimate, batch.rows, state.bias
             )
         state.segment += corrections(estimate, state.rejected)
-        state.has_clock |= bool((batch.rows[:, KIND] == Kind.TOA).any()) and dof > 0
+        state.has_clock = state.has_clock or (dof > 0 and batch.has_time)
         self._note_fit(stamp_ns, batch, accepted, nis, dof)
-        refused = int(len(batch.items) - accepted.sum())
+        refused = accepted.count(0.0)
         if refused:
             state.rejected["gate"] += refused
         sources = self._note_accepted(stamp_ns, batch, accepted) if dof > 0 else ()
-        if mostly_accepted(batch, accepted):
-            state.rejected_in_row = 0
-            return nis, dof, sources
-        state.rejected_in_row += 1
+        self._note_misfit(not refused or mostly_accepted(batch, accepted))
+        return Applied(stamp_ns, nis, dof, sources)
+
+    def _note_misfit(self, fits: bool) -> None:
+        """Count the epochs in a row that did not fit; too many, and the track is lost."""
+        state = self._state
+        state.rejected_in_row = 0 if fits else state.rejected_in_row + 1
         if state.rejected_in_row >= self._config.max_rejected_epochs:
             state.rejected["track_lost"] += 1
             self._forget()
-        return nis, dof, sources
 
     def _prepare(self, stamp_ns: int, items: tuple[Source, ...] = ()) -> Estimate:
         """The estimate with the biases heard of, the IMU up to ``stamp_ns`` and what velocities
@@ -347,7 +288,7 @@ class Track:
         return estimate
 
     def _note_fit(
-        self, stamp_ns: int, batch: Batch, accepted: Array, nis: float, dof: int
+        self, stamp_ns: int, batch: Batch, accepted: Sequence[float], nis: float, dof: int
     ) -> None:
         """Tell the protection level and the health of the RSUs how the epoch fitted."""
         state = self._state
@@ -355,17 +296,17 @@ class Track:
         if math.isfinite(nis):
             state.nis_window.add(nis, dof)
         assert state.estimate is not None
+        prior, height_m = state.estimate.prior, self._config.device_height_m
         if self._config.manoeuvre_speed_sd_mps > 0.0:
-            prior, height_m = state.estimate.prior, self._config.device_height_m
             state.unnoticed_m = unnoticed_shift(*prior, batch.rows, height_m, self._gate[2])
         if not self._config.isolate_rsus:
             return
-        fits = row_fits(*state.estimate.prior, batch.rows, self._config.device_height_m)
+        fits = row_fits(*prior, batch.rows, height_m)
         observe(self._health, self._vue_id, stamp_ns, batch, fits, accepted)
 
     def _watch(self, stamp_ns: int, watched: list[RsuMeasurement]) -> None:
         """Compare what isolated RSUs say with the estimate, without fusing it."""
-        if not watched or self._state.estimate is None:
+        if self._state.estimate is None:
             return
         self._predict(stamp_ns)
         mean, cov = self._state.estimate.mean, self._state.estimate.cov
@@ -375,18 +316,22 @@ class Track:
             rsu = self._rsus[item.rsu_id]
             observe_isolated(self._health, self._vue_id, stamp_ns, batch, fits, rsu, self._gate)
 
-    def _note_accepted(self, stamp_ns: int, batch: Batch, accepted: Array) -> tuple[str, ...]:
+    def _note_accepted(
+        self, stamp_ns: int, batch: Batch, accepted: Sequence[float] | None = None
+    ) -> tuple[str, ...]:
+        """Count what was ``accepted`` (None: all of it); who sent it."""
         state = self._state
         sources = []
-        for item, taken in zip(batch.items, accepted, strict=True):
-            if taken:
-                state.accepted += 1
-                if isinstance(item, RsuMeasurement):
-                    state.biases.accepted(self._rsus[item.rsu_id], item)
-                    sources.append(item.rsu_id)
-                else:
-                    sources.append(item.source)
-                    state.velocity_ns[item.source] = item.stamp_ns
+        for i, item in enumerate(batch.items):
+            if accepted is not None and not accepted[i]:
+                continue
+            if isinstance(item, RsuMeasurement):
+                state.biases.accepted(self._rsus[item.rsu_id], item)
+                sources.append(item.rsu_id)
+            else:
+                sources.append(item.source)
+                state.velocity_ns[item.source] = item.stamp_ns
+        state.accepted += len(sources)
         state.last_accepted_ns = stamp_ns
         return tuple(sources)
 
@@ -395,57 +340,56 @@ class Track:
         if estimate is not None and stamp_ns > estimate.stamp_ns:
             self._prepare(stamp_ns).predict(stamp_ns, self._state.bias)
 
-    def _report(
-        self, stamp_ns: int, nis: float, dof: int, sources: tuple[str, ...]
-    ) -> TrackOutput:
-        self._predict(stamp_ns)
-        state = self._state
-        estimate = state.estimate
-        position_sd, level, steps = 0.0, -1.0, StepCalibration()
-        if estimate is not None:
-            mean, cov = estimate.mean, estimate.cov
-            position_sd = output.largest_sd(cov)
-            if self._config.calibrates_steps:
-                steps = state.biases.step_calibration(mean, cov)
-            risk, inflation = self._config.integrity_risk, state.nis_window.inflation()
-            level = protection_level(cov[:2, :2], risk, inflation)
-            unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
-            moved = state.unnoticed_m + self._config.manoeuvre_speed_sd_mps * unheard_s
-            level = max(level, min(moved, _LEVEL_MAX_M))
-            if isinstance(estimate, Sectors):
-                level = estimate.radius(level, risk)
-        status = TrackStatus(
-            stamp_ns=stamp_ns,
-            vue_id=self._vue_id,
-            state=self._track_state(stamp_ns, position_sd),
-            nis=nis,
-            nis_dof=dof,
-            used=len(sources),
-            accepted=state.accepted,
-            rejected=dict(self.rejected),
-            sources=sources,
-            position_sd_m=position_sd,
-            protection_level_m=level,
-            steps=steps,
-        )
+    def _report(self, epoch: Applied) -> TrackOutput:
+        self._predict(epoch.stamp_ns)
+        state, config = self._state, self._config
+        estimate, rejected = state.estimate, total(self.refused, state.rejected)
         if estimate is None:
-            return TrackOutput(None, None, status, network=self._config.network)
-        state.yaw, yaw_var = output.heading(mean, cov, state.yaw, self._heading)
-        height = self._config.device_height_m
-        odometry = output.odometry(stamp_ns, self._vue_id, mean, cov, height, state.yaw, yaw_var)
-        if self._heading >= 0:
-            odometry = output.with_yaw_rate(odometry, mean, cov, self._heading)
+            status = track_status(
+                config,
+                self._vue_id,
+                epoch,
+                accepted=state.accepted,
+                rejected=rejected,
+                heard_ns=None,
+            )
+            return TrackOutput(None, None, status, network=config.network)
+        mean, cov = estimate.mean, estimate.cov
+        status = track_status(
+            config,
+            self._vue_id,
+            epoch,
+            accepted=state.accepted,
+            rejected=rejected,
+            heard_ns=state.last_accepted_ns,
+            position_sd_m=output.largest_sd(cov),
+            level_m=self._level(epoch.stamp_ns, estimate),
+            decided=estimate.decided,
+            steps=state.biases.step_calibration(mean, cov) if config.calibrates_steps else None,
+        )
         clock = None
         if state.has_clock:
-            clock = output.clock_state(stamp_ns, self._vue_id, mean[4:6], cov[4:6, 4:6])
+            clock = output.clock_state(epoch.stamp_ns, self._vue_id, mean[4:6], cov[4:6, 4:6])
         track = None
         if self._secondary is not None:
             track = self._secondary.track(state.own, state.segment, estimate, state.bias)
-        return TrackOutput(odometry, clock, status, network=self._config.network, track=track)
+        odometry = self._odometry(epoch.stamp_ns, mean, cov)
+        return TrackOutput(odometry, clock, status, network=config.network, track=track)
 
-    def _track_state(self, stamp_ns: int, position_sd: float) -> TrackState:
-        estimate = self._state.estimate
-        heard_ns = None if estimate is None else self._state.last_accepted_ns
-        if estimate is not None and not estimate.decided:
-            position_sd = math.inf
-        return output.track_state(self._config, stamp_ns, heard_ns, position_sd)
+    def _level(self, stamp_ns: int, estimate: Estimate) -> float:
+        """Protection level [m]."""
+        state, config = self._state, self._config
+        risk, inflation = config.integrity_risk, state.nis_window.inflation()
+        level = protection_level(estimate.cov[:2, :2], risk, inflation)
+        unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
+        moved = state.unnoticed_m + config.manoeuvre_speed_sd_mps * unheard_s
+        level = max(level, min(moved, _LEVEL_MAX_M))
+        return estimate.radius(level, risk) if isinstance(estimate, Sectors) else level
+
+    def _odometry(self, stamp_ns: int, mean: Array, cov: Array) -> Odometry:
+        state, height_m = self._state, self._config.device_height_m
+        state.yaw, yaw_var = output.heading(mean, cov, state.yaw, self._heading)
+        odometry = output.odometry(stamp_ns, self._vue_id, mean, cov, height_m, state.yaw, yaw_var)
+        if self._heading >= 0:
+            output.with_yaw_rate(odometry, mean, cov, self._heading)
+        return odometry

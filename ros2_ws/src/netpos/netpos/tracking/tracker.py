@@ -20,10 +20,13 @@ from netpos.messages.values import (
 from netpos.tracking import validation
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.health import HealthConfig, RsuHealth, RsuReport
+from netpos.tracking.report import TrackOutput
 from netpos.tracking.rsus import Rsu
 from netpos.tracking.sequencer import IMU, Epoch, Item, Sequencer
 from netpos.tracking.smoothing import check_smoothable
-from netpos.tracking.track import Track, TrackOutput
+from netpos.tracking.track import Track
+
+_PHASE = int(Field.PHASE)  # a plain integer: arithmetic of flags costs ten times as much
 
 if TYPE_CHECKING:
     from netpos.tracking.strapdown_track import StrapdownTrack
@@ -74,10 +77,11 @@ class Tracker:
     def add(self, item: Item | ImuSample) -> str | None:
         """Take a measurement; returns the reason when it is refused (also counted in the track's
         status)."""
-        if isinstance(item, ImuSample):
+        if isinstance(item, RsuMeasurement):
+            if not self.concerns(item):
+                return None
+        elif isinstance(item, ImuSample):
             return self._add_imu(item)
-        if isinstance(item, RsuMeasurement) and not self.concerns(item):
-            return None
         reason = self._fault(item)
         self._touched.add(item.vue_id)
         if reason is None:
@@ -92,9 +96,11 @@ class Tracker:
     def concerns(self, measurement: RsuMeasurement) -> bool:
         """Whether a measurement is for this tracker: one of a network leaves those of RSUs it
         knows to be of other networks to their trackers."""
-        rsu = self._rsus.get(measurement.rsu_id)
         network = self._config.network
-        return not network or rsu is None or rsu.info.network == network
+        if not network:
+            return True
+        rsu = self._rsus.get(measurement.rsu_id)
+        return rsu is None or rsu.info.network == network
 
     def _add_imu(self, sample: ImuSample) -> str | None:
         if not self._config.use_imu:
@@ -112,6 +118,8 @@ class Tracker:
 
     def process(self) -> list[TrackOutput]:
         """Apply every epoch that is complete, oldest first, device by device."""
+        if not self._touched:
+            return []
         touched, self._touched = self._touched, set()
         return self._apply(Sequencer.release, touched)
 
@@ -145,13 +153,16 @@ class Tracker:
     def _apply(
         self, take: Callable[[Sequencer], list[Epoch]], vue_ids: Iterable[str]
     ) -> list[TrackOutput]:
-        outputs = []
+        outputs: list[TrackOutput] = []
         for vue in sorted(vue_ids):
-            if vue not in self._sequencers:
+            sequencer = self._sequencers.get(vue)
+            if sequencer is None:
                 continue
-            sequencer, track = self._sequencers[vue], self._tracks[vue]
             late = sequencer.take_late()
             epochs = take(sequencer)
+            if not late and not epochs:
+                continue
+            track = self._tracks[vue]
             if late:
                 new, revised = track.revise(late)
                 for epoch in new:
@@ -169,7 +180,7 @@ class Tracker:
                 fault = validation.measurement_fault(item)
                 if fault is None and item.rsu_id not in self._rsus:
                     return "unknown_rsu"
-                if fault is None and item.fields & Field.PHASE:
+                if fault is None and int(item.fields) & _PHASE:
                     return self._rsus[item.rsu_id].phase_fault()
                 return fault
             case Velocity():

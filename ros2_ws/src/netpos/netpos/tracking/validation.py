@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from operator import attrgetter
 
 import numpy as np
 
-from netpos.filters.measurement import rsu_axes
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.filters.rows import rsu_axes
 from netpos.messages.fields import MAP_FRAME
 from netpos.messages.topics import is_vue_id
 from netpos.messages.values import (
@@ -37,12 +38,20 @@ _KNOWN = int(
 )
 _LARGEST = 1e9
 _LEVER_ARM_MAX_M = 1e3
+_NO_LEVER = (0.0, 0.0, 0.0)
 _TILT_MAX = 0.05  # of the baseline: the first fix takes two antennas for level
 _BASELINE_MAX = 50.0  # wavelengths: each takes two hypotheses
 # Variances (m, rad, m/s) beyond which double precision cannot fuse with metres.
 _VAR_MIN, _VAR_MAX = 1e-6**2, 1e6**2
 _ASYMMETRY_MAX = 1e-6  # relative
 _CONDITION_MIN = 1e-12  # smallest over largest eigenvalue; below it a Cholesky factor is rounding
+
+
+@lru_cache(256)
+def _quantities(fields: int) -> tuple[tuple[attrgetter[tuple[float, float]], float], ...]:
+    """What reads the value and variance of each scalar in ``fields``, and the square of what makes
+    the variance one of metres or radians."""
+    return tuple((read, scale * scale) for flag, read, scale in _SCALARS if fields & flag)
 
 
 def measurement_fault(m: RsuMeasurement) -> str | None:
@@ -54,14 +63,13 @@ def measurement_fault(m: RsuMeasurement) -> str | None:
     fields = int(m.fields)
     if not fields or fields & ~_KNOWN:
         return "no_fields" if not fields else "unknown_fields"
-    for flag, quantity, scale in _SCALARS:
-        if fields & flag:
-            value, variance = quantity(m)
-            if not (math.isfinite(value) and abs(value) < _LARGEST and math.isfinite(variance)):
-                return "not_finite"
-            if not _variance_in_range(scale * scale * variance):
-                return "variance"
-    if not all(abs(arm) < _LEVER_ARM_MAX_M for arm in m.lever_arm):
+    for quantity, scale2 in _quantities(fields):
+        value, variance = quantity(m)
+        if not (abs(value) < _LARGEST and math.isfinite(variance)):
+            return "not_finite"
+        if not _VAR_MIN <= scale2 * variance <= _VAR_MAX:
+            return "variance"
+    if m.lever_arm != _NO_LEVER and not all(abs(arm) < _LEVER_ARM_MAX_M for arm in m.lever_arm):
         return "lever_arm"
     if fields & _RANGE and m.range_m < 0.0:
         return "negative_range"

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from netpos.filters import ekf
 from netpos.filters.bearing import fuse_bearing, is_plain_bearing
-from netpos.filters.measurement import BIAS, HEADING, rsu_axes, rsu_rows
+from netpos.filters.measurement import BIAS, HEADING
+from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 
 RSU = np.array([3.0, -2.0])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from filterpy.kalman import ExtendedKalmanFilter
 from netpos.filters import ekf
-from netpos.filters.measurement import VALUE, VARIANCE, linearise, rsu_axes, rsu_rows
+from netpos.filters.measurement import VALUE, VARIANCE, linearise
 from netpos.filters.motion import (
     NO_BIAS,
     SPEED_OF_LIGHT_MPS,
@@ -17,6 +17,7 @@ from netpos.filters.motion import (
     noise,
     transition,
 )
+from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 
 T = 0.1

@@ -26,10 +26,9 @@ from netpos.filters.measurement import (
     is_angle,
     linearise,
     predict_row,
-    rsu_axes,
-    rsu_rows,
     wrap,
 )
+from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 from scipy.spatial.transform import Rotation
 

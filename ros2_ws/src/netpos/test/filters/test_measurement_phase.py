@@ -14,13 +14,11 @@ from netpos.filters.measurement import (
     ORIGIN,
     VALUE,
     Kind,
-    array_direction,
     curvature_variance,
     innovation_row,
     predict_row,
-    rsu_axes,
-    rsu_rows,
 )
+from netpos.filters.rows import array_direction, rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from scipy.spatial.transform import Rotation
 

@@ -19,15 +19,10 @@ from netpos.filters.measurement import (
     ROW_WIDTH,
     VALUE,
     VARIANCE,
-    Coupling,
     Kind,
-    linear_rows,
     linearise,
-    rsu_axes,
-    rsu_rows,
-    scalar_values,
-    speed_row,
 )
+from netpos.filters.rows import Coupling, linear_rows, rsu_axes, rsu_rows, scalar_values, speed_row
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation

@@ -6,17 +6,10 @@ import math
 
 import numpy as np
 import pytest
-from netpos.filters.measurement import (
-    KIND,
-    ROW_WIDTH,
-    VALUE,
-    VARIANCE,
-    Kind,
-    rsu_axes,
-    rsu_rows,
-)
+from netpos.filters.measurement import KIND, ROW_WIDTH, VALUE, VARIANCE, Kind
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.filters.position_fix import FixStatus, fix_position, start_of
+from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.filters.space import place_rows, value_at
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from scipy.optimize import least_squares

@@ -15,9 +15,8 @@ from netpos.filters.measurement import (
     ROW_WIDTH,
     VALUE,
     Kind,
-    rsu_axes,
-    rsu_rows,
 )
+from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.filters.space import (
     CLOCK,
     SpaceKind,

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 from netpos.filters import ekf, srukf
-from netpos.filters.measurement import BIAS, COMMON, KIND, Kind, curvature_variance, linear_rows
+from netpos.filters.measurement import BIAS, COMMON, KIND, Kind, curvature_variance
 from netpos.filters.measurement import predict_row as predict
+from netpos.filters.rows import linear_rows
 from netpos.messages.values import Array
 from netpos.tracking.engine import scratch
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters.measurement import BLOCKED, KIND, Kind, rsu_axes, rsu_rows
+from netpos.filters.measurement import BLOCKED, KIND, Kind
+from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Field, RsuInfo, RsuMeasurement
 from netpos.tracking import TrackerConfig
 from netpos.tracking.batch import Batch

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from netpos.filters import ekf, srukf
-from netpos.filters.measurement import GROUP, ROW_WIDTH, Kind, rsu_axes, rsu_rows
+from netpos.filters.measurement import GROUP, ROW_WIDTH, Kind
 from netpos.filters.motion import NO_BIAS, SPEED_OF_LIGHT_MPS
+from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, InitialPose, RsuInfo, RsuMeasurement
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking import Tracker, TrackerConfig, engine

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters.measurement import linear_rows
 from netpos.filters.motion import NO_BIAS
+from netpos.filters.rows import linear_rows
 from netpos.messages.values import Array, Field, GroundSpeed, ImuSample
 from netpos.tracking import TrackerConfig, TrackOutput, estimates
 from netpos.tracking.models import motions_of

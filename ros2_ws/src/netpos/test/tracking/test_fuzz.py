@@ -17,14 +17,8 @@ from typing import Any
 import numpy as np
 import pytest
 from netpos.filters import conditioning
-from netpos.filters.measurement import (
-    GATE_VARIANCE,
-    VARIANCE,
-    Coupling,
-    Kind,
-    rsu_axes,
-    rsu_rows,
-)
+from netpos.filters.measurement import GATE_VARIANCE, VARIANCE, Kind
+from netpos.filters.rows import Coupling, rsu_axes, rsu_rows
 from netpos.messages.values import (
     AngleConvention,
     Array,

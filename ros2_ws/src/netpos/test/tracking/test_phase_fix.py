@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from netpos.filters.measurement import KIND, VALUE, Kind, predict_row, rsu_axes, rsu_rows
+from netpos.filters.measurement import KIND, VALUE, Kind, predict_row
+from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.phase_fix import admissible, nearest_turns, place, spawn, to_fix
 from scipy.spatial.transform import Rotation

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from netpos.filters.measurement import linearise, rsu_axes, rsu_rows
+from netpos.filters.measurement import linearise
+from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.protection import (
     RISK_MIN,

@@ -8,14 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters.measurement import (
-    HEADING,
-    LEVER,
-    Coupling,
-    linearise,
-    rsu_axes,
-    rsu_rows,
-)
+from netpos.filters.measurement import HEADING, LEVER, linearise
+from netpos.filters.rows import Coupling, rsu_axes, rsu_rows
 from netpos.messages.values import (
     AngleConvention,
     Array,

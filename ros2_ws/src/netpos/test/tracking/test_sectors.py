@@ -9,16 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters.measurement import (
-    KIND,
-    VALUE,
-    VARIANCE,
-    Kind,
-    linear_rows,
-    rsu_axes,
-    rsu_rows,
-)
+from netpos.filters.measurement import KIND, VALUE, VARIANCE, Kind
 from netpos.filters.motion import NO_BIAS
+from netpos.filters.rows import linear_rows, rsu_axes, rsu_rows
 from netpos.filters.sigma import innovation_cov, regress
 from netpos.messages.values import (
     Array,

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netpos.filters.measurement import VARIANCE, curvature_variance, rsu_axes, rsu_rows
+from netpos.filters.measurement import VARIANCE, curvature_variance
 from netpos.filters.motion import NO_BIAS, SPEED_OF_LIGHT_MPS, motion_parameters, noise, transition
+from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 
 DT_S = 0.1

@@ -17,10 +17,9 @@ from netpos.filters.measurement import (
     VALUE,
     VARIANCE,
     Kind,
-    rsu_axes,
-    rsu_rows,
 )
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.radio.measure import AZIMUTH, ELEVATION, PHASE, RANGE, TOA, Observations
 from netpos.tracking.rsus import Rsu

@@ -18,14 +18,9 @@ from netpos.evaluation.reproduce.steps import (
     reported_velocity,
     velocity_rows,
 )
-from netpos.filters.measurement import (
-    GATE_VARIANCE,
-    VALUE,
-    VARIANCE,
-    rsu_axes,
-    rsu_rows,
-)
+from netpos.filters.measurement import GATE_VARIANCE, VALUE, VARIANCE
 from netpos.filters.motion import NO_BIAS
+from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.radio.anchor import uwb_wavelength_m
 from netpos.radio.noise import generator

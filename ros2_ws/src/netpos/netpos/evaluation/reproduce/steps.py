@@ -11,14 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from netpos.filters.measurement import (
-    GROUP,
-    ORIGIN,
-    ROW_WIDTH,
-    VALUE,
-    VARIANCE,
-    linear_rows,
-)
+from netpos.filters.measurement import GROUP, ORIGIN, ROW_WIDTH, VALUE, VARIANCE
+from netpos.filters.rows import linear_rows
 from netpos.inertial.pdr_output import step_velocity
 from netpos.messages.values import Array, Velocity
 

@@ -22,8 +22,8 @@ from netpos.tracking.networks.common_instant import Moved, at_common_instant
 from netpos.tracking.networks.config import FusionConfig
 from netpos.tracking.networks.validation import network_track_fault
 from netpos.tracking.protection import protection_level
+from netpos.tracking.report import TrackOutput
 from netpos.tracking.sequencer import Epoch, Item, Sequencer
-from netpos.tracking.track import TrackOutput
 
 
 class NetworkState(IntEnum):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
-from netpos.filters.measurement import AXES, BIAS, KIND, ORIGIN, Kind, rsu_axes, rsu_rows
+from netpos.filters.measurement import AXES, BIAS, KIND, ORIGIN, Kind
+from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Beacon
 from netpos.scenario import Simulation, load_scenario
 

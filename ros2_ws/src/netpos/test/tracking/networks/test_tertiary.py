@@ -10,7 +10,7 @@ import pytest
 from netpos.messages.values import NetworkTrack
 from netpos.tracking.networks.config import FusionConfig
 from netpos.tracking.networks.tertiary import NetworkState, TrackFusion
-from netpos.tracking.track import TrackOutput
+from netpos.tracking.report import TrackOutput
 
 Maker = Callable[..., NetworkTrack]
 NETWORKS = ("wimax", "wifi")

@@ -1,0 +1,64 @@
+"""What a track remembers from epoch to epoch."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+from netpos.messages.values import Array
+from netpos.tracking.blockage import Blockage
+from netpos.tracking.estimates import Estimate
+from netpos.tracking.initialise import Initialiser
+from netpos.tracking.networks.secondary import OwnNoise
+from netpos.tracking.phase_start import PhaseStart
+from netpos.tracking.protection import NisWindow
+from netpos.tracking.rsus import BiasStates
+from netpos.tracking.steadiness import Steadiness
+
+
+@dataclass(slots=True)
+class TrackMemory:
+    """All of a track that changes with an epoch; unheard of until its first measurement."""
+
+    biases: BiasStates
+    initialiser: Initialiser
+    blockage: Blockage
+    phase_start: PhaseStart
+    steadiness: Steadiness
+    segment: int = 0
+    estimate: Estimate | None = None
+    own: OwnNoise | None = None
+    bias: Array = field(default_factory=lambda: np.zeros((2, 0)))
+    pose: tuple[Array, Array] | None = None
+    nis_window: NisWindow = field(default_factory=NisWindow)
+    yaw: float = 0.0
+    has_clock: bool = False
+    rejected_in_row: int = 0
+    unnoticed_m: float = 0.0
+    last_accepted_ns: int = 0
+    velocity_ns: dict[str, int] = field(default_factory=dict)
+    accepted: int = 0
+    rejected: defaultdict[str, int] = field(default_factory=lambda: defaultdict(int))
+
+    def copy(self) -> TrackMemory:
+        """An independent copy, for a track to go back to."""
+        twin = TrackMemory.__new__(TrackMemory)
+        for name in _FIELDS:
+            setattr(twin, name, getattr(self, name))
+        twin.biases = self.biases.copy()
+        twin.blockage = self.blockage.copy()
+        if self.estimate is None:
+            twin.initialiser = self.initialiser.copy()
+            twin.phase_start = self.phase_start.copy()
+        else:
+            twin.estimate = self.estimate.copy()
+        twin.nis_window = self.nis_window.copy()
+        twin.rejected = self.rejected.copy()
+        twin.velocity_ns = self.velocity_ns.copy()
+        twin.steadiness = self.steadiness.copy()
+        return twin
+
+
+_FIELDS = tuple(entry.name for entry in fields(TrackMemory))

@@ -1,0 +1,81 @@
+"""What a track says at one epoch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from netpos.messages.values import ClockState, NetworkTrack, Odometry, StepCalibration, TrackStatus
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.output import track_state
+
+
+@dataclass(slots=True)
+class TrackOutput:
+    """What a track says at one epoch; odometry is None until the first fix, clock until the first
+    TOA. ``revised``: said before of the same epoch, without what came late. ``smoothed``: earlier
+    epochs that are now ``fixed_lag_s`` old. ``network``: whose track it is, "" for that of all;
+    ``track``: the same for others to fuse with their own."""
+
+    odometry: Odometry | None
+    clock: ClockState | None
+    status: TrackStatus
+    revised: bool = False
+    smoothed: tuple[Odometry, ...] = ()
+    network: str = ""
+    track: NetworkTrack | None = None
+
+
+@dataclass(slots=True)
+class Applied:
+    """What became of the measurements of one epoch: NIS, its degrees of freedom and who sent what
+    was accepted."""
+
+    stamp_ns: int
+    nis: float = 0.0
+    dof: int = 0
+    sources: tuple[str, ...] = ()
+
+
+def total(refused: Mapping[str, int], rejected: Mapping[str, int]) -> dict[str, int]:
+    """Measurements refused at the door or rejected by the track, by reason."""
+    counts = dict(refused)
+    for reason, number in rejected.items():
+        counts[reason] = counts.get(reason, 0) + number
+    return counts
+
+
+def track_status(
+    config: TrackerConfig,
+    vue_id: str,
+    epoch: Applied,
+    *,
+    accepted: int,
+    rejected: dict[str, int],
+    heard_ns: int | None,
+    position_sd_m: float = 0.0,
+    level_m: float = -1.0,
+    decided: bool = True,
+    steps: StepCalibration | None = None,
+) -> TrackStatus:
+    """Status of a track after an ``epoch``.
+
+    accepted, rejected : counts since start; heard_ns : stamp of the last accepted measurement,
+    None before the first fix; decided : whether it is known which of several solutions is true
+    """
+    sd_m = position_sd_m if decided else math.inf
+    return TrackStatus(
+        stamp_ns=epoch.stamp_ns,
+        vue_id=vue_id,
+        state=track_state(config, epoch.stamp_ns, heard_ns, sd_m),
+        nis=epoch.nis,
+        nis_dof=epoch.dof,
+        used=len(epoch.sources),
+        accepted=accepted,
+        rejected=rejected,
+        sources=epoch.sources,
+        position_sd_m=position_sd_m,
+        protection_level_m=level_m,
+        steps=steps or StepCalibration(),
+    )
