@@ -45,10 +45,11 @@ class Initial:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Figures:
     """Accuracy, availability and consistency of one device, after the convergence prefix of
-    ``skipped`` estimates.
+    ``skipped`` estimates and from the first one in state TRACKING on.
 
-    n: estimates scored. duration_s: from the first to the last of them. availability: share of
-    the ground truth's span at which the newest ready estimate is at most 0.2 s old (5 Hz,
+    n: estimates scored. initialising: estimates before the first in state TRACKING, 0 where the
+    recording has no track status. duration_s: from the first to the last scored. availability:
+    share of the ground truth's span at which the newest ready estimate is at most 0.2 s old (5 Hz,
     fokin2020's priority passage), convergence included; an estimate is ready in state TRACKING.
     rmse_m, p50..max: horizontal position error; mean_error_m: mean horizontal error, which
     fokin2020:eq.34 calls RMSE; rmse_3d_m with the vertical; north, east, down: by axis, as
@@ -99,6 +100,7 @@ class Figures:
     )
     estimates: int = 0
     skipped: int = 0
+    initialising: int = 0
     outside_truth: int = 0
     in_truth_gap: int = 0
     duplicates: int = 0
@@ -299,7 +301,10 @@ def _rejections(statuses: Sequence[TrackStatus]) -> dict[str, Any]:
 def score(
     run: Run, *, skip: int = SKIP_EPOCHS, max_truth_gap_s: float = MAX_TRUTH_GAP_S
 ) -> Scored:
-    """Figures of a run, with the pairs they come from; the first ``skip`` estimates do not count.
+    """Figures of a run, with the pairs they come from.
+
+    Neither the first ``skip`` estimates count nor those before the first in state TRACKING: an
+    error of metres is what INITIALISING says. A track lost later and started anew does count.
 
     Raises
     ------
@@ -310,10 +315,12 @@ def score(
     if not len(run.truth):
         raise ValueError("there is no ground truth to score against")
     pairs = pair(run.estimate, run.truth, max_truth_gap_s)
-    left = run.estimate.stamp_ns[skip:]
+    ready_ns = ready_stamps(run.estimate, run.statuses)
+    stamps = run.estimate.stamp_ns
+    initialising = int((stamps < ready_ns[0]).sum()) if ready_ns.size else len(stamps)
+    left = stamps[max(skip, initialising) :]
     from_ns = int(left[0]) if left.size else int(np.iinfo(np.int64).max)
     scored = pairs.take(pairs.estimate.stamp_ns >= from_ns)
-    ready_ns = ready_stamps(run.estimate, run.statuses)
     clock_ns, clock = clock_error_series(run, max_truth_gap_s)
     clock = clock[clock_ns >= from_ns]
     figures = Figures(
@@ -323,7 +330,8 @@ def score(
         speed_max_mps=float(np.linalg.norm(run.truth.velocity[:, :2], axis=1).max()),
         initial=_initial(run, pairs, ready_ns),
         estimates=len(run.estimate),
-        skipped=len(run.estimate) - left.size,
+        skipped=min(skip, len(stamps)),
+        initialising=initialising,
         outside_truth=pairs.outside,
         in_truth_gap=pairs.in_gap,
         duplicates=run.estimate.duplicates,

@@ -38,8 +38,8 @@ td:first-child,th:first-child{text-align:left}
 .ok{color:#117733}.bad{color:#aa2222}
 </style><script>{{ script }}</script></head><body>
 <h1>netpos report</h1>
-<p>netpos {{ version }}. The first {{ skip }} estimates of each device are not scored.
-Position errors are horizontal unless named otherwise.</p>
+<p>netpos {{ version }}. The first {{ skip }} estimates of each device are not scored,
+nor those before it is first TRACKING. Position errors are horizontal unless named otherwise.</p>
 {% for reason in left_out %}<p class="bad">Left out: {{ reason|e }}</p>{% endfor %}
 {% for s in sections %}<h2>{{ s.name|e }}</h2>
 <div class="tables">{% for t in s.tables %}<table><caption>{{ t.caption }}</caption>

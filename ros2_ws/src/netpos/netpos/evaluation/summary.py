@@ -11,6 +11,7 @@ NOTHING = "–"
 # label, unit, field of Figures, format
 _ROWS = (
     ("estimates scored", "", "n", "d"),
+    ("before the first TRACKING", "", "initialising", "d"),
     ("duration", "s", "duration_s", ".1f"),
     ("availability", "%", "availability", ".1%"),
     ("position RMSE", "m", "rmse_m", ".3f"),

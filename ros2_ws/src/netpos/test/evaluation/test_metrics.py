@@ -119,6 +119,33 @@ def test_skipped_estimates_do_not_count() -> None:
     assert score(run_of(truth, estimate), skip=19).figures.max_m == pytest.approx(100.0)
 
 
+def test_a_track_is_scored_from_its_first_tracking_state() -> None:
+    """What comes before says that it is metres off; what comes after, lost or not, counts."""
+    truth = straight(60)
+    estimate = [
+        moved(p, 0.0, 100.0 if k < 30 else 7.0 if k == 40 else 1.0) for k, p in enumerate(truth)
+    ]
+    tracking = [k >= 30 and k != 40 for k in range(60)]
+    statuses = [
+        status(0.1 * k, TrackState.TRACKING if tracking[k] else TrackState.INITIALISING)
+        for k in range(60)
+    ]
+    figures = score(run_of(truth, estimate, statuses=statuses), skip=20).figures
+    assert (figures.n, figures.skipped, figures.initialising) == (30, 20, 30)
+    assert figures.max_m == pytest.approx(7.0)
+    later = score(run_of(truth, estimate, statuses=statuses), skip=45).figures
+    assert (later.n, later.skipped, later.initialising) == (15, 45, 30)
+    assert later.max_m == pytest.approx(1.0)
+
+
+def test_a_track_that_is_never_ready_has_no_score() -> None:
+    statuses = [status(0.1 * k, TrackState.INITIALISING) for k in range(40)]
+    figures = score(run_of(straight(40), straight(40), statuses=statuses)).figures
+    assert (figures.n, figures.initialising, figures.rmse_m) == (0, 40, None)
+    unknown = score(run_of(straight(40), straight(40))).figures
+    assert (unknown.n, unknown.initialising) == (20, 0)
+
+
 def test_velocity_is_compared_in_map_axes() -> None:
     """A right speed of 3 m/s under a heading wrong by 90 degrees is an error of 3 sqrt 2."""
     truth = [pose(0, 0, speed=3.0), pose(1, 3, speed=3.0)]

@@ -20,14 +20,18 @@ from netpos.evaluation.reproduce.steps import (
     steps_of,
     velocity_rows,
 )
-from netpos.filters.measurement import GROUP
+from netpos.evaluation.reproduce.troubles import NO_TROUBLE, Trouble, within
+from netpos.filters.measurement import GROUP, VALUE, predict_row
 from netpos.filters.motion import NO_BIAS
 from netpos.messages.values import Array
 from netpos.radio.noise import generator
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.schema import RectangleRoute
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.estimates import Estimate
+from netpos.tracking.phase_fix import TWO_PI, spawn
 from netpos.tracking.phase_start import PhaseStart
+from netpos.tracking.sectors import Sectors
 from netpos.tracking.steadiness import Steadiness
 
 Ints = npt.NDArray[np.int64]
@@ -53,13 +57,14 @@ _BASELINE = "rsus.units.0.antennas.baseline_wavelengths"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """A way to walk the rectangle: baseline, settings of the tracker over the scenario's own, and
-    when the anchor is hidden (from, to) [s]."""
+    """A way to walk the rectangle: baseline, settings of the tracker over the scenario's own,
+    when the anchor is hidden (from, to) [s], and what else goes wrong."""
 
     name: str
     wavelengths: float
     tracker: tuple[tuple[str, object], ...] = ()
     hidden_s: tuple[float, float] | None = None
+    trouble: Trouble = NO_TROUBLE
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,10 +106,9 @@ class Setup:
         assert isinstance(route, RectangleRoute)
         points = route.waypoints(generator(0, ""))
         self.steps = steps_of(points, np.array(route.pauses_s), SPEED_MPS, STEP_M)
-        self.heard = np.ones(len(self.times_s), dtype=bool)
+        self.heard = case.trouble.heard(self.times_s)
         if case.hidden_s is not None:
-            low, high = case.hidden_s
-            self.heard = (self.times_s < low) | (self.times_s >= high)
+            self.heard &= ~within(self.times_s, case.hidden_s)
 
     def rows(self, seed: int) -> Array:
         """Rows (n, 4, ROW_WIDTH) of all epochs: range and phase, then velocity."""
@@ -112,8 +116,11 @@ class Setup:
         _, _, radio, _ = observation_rows(seen, self._templates, first_bias=6)
         rng = generator(seed, f"{VUE}/steps")
         tau_s = self.config.velocity_correlation_s
-        velocity, _ = velocity_rows(self.times_s, self.steps, ERRORS, rng, tau_s)
-        return np.concatenate([radio.reshape(len(velocity), 2, -1), velocity], axis=1)
+        trouble = self._case.trouble
+        velocity, _ = velocity_rows(self.times_s, self.steps, trouble.errors, rng, tau_s)
+        radio = radio.reshape(len(velocity), 2, -1)
+        trouble.spoil(self.times_s, radio, generator(seed, f"{VUE}/trouble"))
+        return np.concatenate([radio, velocity], axis=1)
 
     def run(self, seed: int) -> Walked:
         """Simulate and estimate one seed."""
@@ -122,6 +129,8 @@ class Setup:
         decided, nis, dof = np.zeros(n, dtype=bool), np.zeros(n), np.zeros(n)
         start, estimate, rejected, last_ns = PhaseStart(self.config), None, 0, 0
         steadiness = Steadiness(self.config)
+        wrong_s = self._case.trouble.wrong_s
+        wrong_at = -1 if wrong_s is None else int(np.searchsorted(self.times_s, wrong_s))
         for k, stamp in enumerate(self.stamps_ns.tolist()):
             own = rows[k] if self.heard[k] else _alone(rows[k, 2:])
             velocity = reported(stamp, own[-2:])
@@ -132,13 +141,30 @@ class Setup:
             else:
                 if density is not None:
                     estimate.shake(density)
+                if k == wrong_at:
+                    estimate = _moved(self.config, estimate, own)
                 unheard_s = (stamp - last_ns) / NS
                 nis[k], dof[k], taken = estimate.step(stamp, unheard_s, rejected, own, NO_BIAS)
-                rejected = 0 if 2 * taken.sum() >= taken.size else rejected + 1
+                rejected = 0 if taken[0] else rejected + 1  # the anchor's group where it is heard
+                if rejected >= self.config.max_rejected_epochs:
+                    start, estimate, rejected = PhaseStart(self.config), None, 0
             last_ns = stamp
             if estimate is not None:
                 mean[k], cov[k], decided[k] = estimate.mean, estimate.cov, estimate.decided
         return Walked(self.times_s, self.truth, mean, cov, decided, nis, dof)
+
+
+def _moved(config: TrackerConfig, estimate: Estimate, rows: Array) -> Estimate:
+    """The same estimate, sure of the sector beside its own, towards boresight."""
+    mean, cov, phase = estimate.mean.copy(), estimate.cov.copy(), rows[1]
+    speed, height_m = config.initial_speed_sd_mps, config.device_height_m
+    excess = predict_row(phase, mean, height_m, np.zeros(mean.size)) - phase[VALUE]
+    turns = round(excess / TWO_PI)
+    moving = slice(2, 4)
+    velocity, velocity_cov = mean[moving].copy(), cov[moving, moving].copy()
+    spawn(mean, cov, rows[0], phase, turns + (1 if turns <= 0 else -1), speed, height_m)
+    mean[moving], cov[moving, moving] = velocity, velocity_cov
+    return Sectors.promote(config, estimate.stamp_ns, mean, cov, rows, 1)
 
 
 def _alone(rows: Array) -> Array:

@@ -94,9 +94,10 @@ def velocity_rows(
             errors.heading_sd_rad,
         )
         rows[step == s] = linear_rows(value, cov, _VELOCITY, 1)
-    if tau_s > 0.0:
-        gaps = np.maximum(1.0, tau_s / np.maximum(np.diff(times_s), 1e-9))
-        rows[1:, :, VARIANCE] *= gaps[:, None]
+    if tau_s > 0.0 and len(times_s) > 1:
+        gaps_s = np.diff(times_s)
+        gaps_s = np.append(gaps_s[:1], gaps_s)  # dead reckoning has reported before
+        rows[:, :, VARIANCE] *= np.maximum(1.0, tau_s / np.maximum(gaps_s, 1e-9))[:, None]
     rows[..., GROUP] = 1
     return rows, step
 

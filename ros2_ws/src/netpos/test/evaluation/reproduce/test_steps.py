@@ -67,7 +67,7 @@ def test_errors_that_last_weigh_less() -> None:
     times = np.array([1.1, 1.2, 1.6, 3.0])
     rng = np.random.default_rng(3)
     rows, _ = velocity_rows(times, steps, StepErrors(), rng, 0.6)
-    np.testing.assert_allclose(rows[:, 0, VARIANCE], [1.0, 6.0, 1.5, 1.0])
+    np.testing.assert_allclose(rows[:, 0, VARIANCE], [6.0, 6.0, 1.5, 1.0])  # as if heard before
     np.testing.assert_array_equal(rows[..., GATE_VARIANCE], 1.0)
     assert math.isfinite(rows.sum())
 
