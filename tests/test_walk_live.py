@@ -16,7 +16,7 @@ from netpos.messages.values import ImuSample
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.offline import simulate_to_bag
 from netpos_msgs.msg import Step
-from runs import TRACK_STATUS, changed_scenario, finish, graphs, script
+from runs import TRACK_STATUS, changed_scenario, finish, graphs, messages, netpos, script
 
 RATE = 4
 
@@ -145,12 +145,32 @@ def test_swapped_axes_and_no_magnetometer_are_told_once_by_the_running_node(
 def test_the_run_script_dead_reckons_who_walks(
     scenario: str, graph: Graph, tmp_path: Path
 ) -> None:
-    """run_graph.sh starts a pdr_node; the tracker fuses its velocities."""
+    """run_graph.sh starts a pdr_node; the tracker fuses its velocities and says what it learned of
+    the person, the same live, offline and in a replay."""
     bag_path = tmp_path / "run"
-    finish(script(graph, "run_graph", scenario, bag_path, str(RATE)))
+    started = script(graph, "run_graph", scenario, bag_path, str(RATE))
+    netpos("run", scenario, "--offline", "--bag", tmp_path / "offline")
+    finish(started)
     with BagReader(bag_path) as bag:
         steps = [e.message for e in bag.messages(["/vue_1/step"])]
         status = [e.message for e in bag.messages([TRACK_STATUS])]
     assert len(steps) == 32
     fused = [s for s in status if "step_velocity" in s.sources]
     assert len(fused) > 200
+    netpos("replay", bag_path, "--out", tmp_path / "again")
+    learned = steps_learned(bag_path)
+    assert 0.8 < learned[0] < 1.2
+    assert 0.0 < learned[1] < 0.09  # 0.1 at the start
+    assert 0.0 < learned[3] < 0.05
+    for other in ("offline", "again"):
+        np.testing.assert_allclose(steps_learned(tmp_path / other), learned, atol=1e-6)
+
+
+def steps_learned(bag: Path) -> tuple[float, ...]:
+    """Length factor, heading offset and their sds as last said."""
+    said = {stamp_ns(s.header.stamp): s for s in messages(bag, TRACK_STATUS)}
+    last = said[max(said)]
+    return (
+        *(last.step_length_factor, last.step_length_factor_sd),
+        *(last.step_heading_offset, last.step_heading_offset_sd),
+    )

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
+import pytest
 from netpos.inertial.gait import Gait, GaitModel
 from netpos.inertial.gait import walk as walk_route
 from netpos.inertial.imu import (
@@ -19,6 +20,7 @@ from netpos.inertial.magnetic_calibration import fit_iron
 from netpos.inertial.pdr import PedestrianDeadReckoning
 from netpos.inertial.pdr_config import PdrConfig
 from netpos.inertial.pdr_output import StepEvent, StepVelocity
+from netpos.scenario import load_scenario
 from netpos.world.routes import rectangle
 from scipy.spatial.transform import Rotation
 
@@ -67,17 +69,36 @@ def test_a_simulated_walk_is_counted_placed_and_headed() -> None:
     assert core.conditions == ()
 
 
-def test_step_velocities_of_simulated_walks_are_consistent() -> None:
-    """NEES of the velocity at every output, starts, stops and turns included; 2 expected."""
-    nees = []
+@pytest.fixture(scope="module")
+def whitened() -> list[np.ndarray]:
+    """Velocity errors (n, 2) of four walks over their stated sd, starts, stops and turns
+    included; one every 0.1 s."""
+    walks = []
     for seed in range(4):
         gait, _, velocities, _ = simulated(PAPER_WALK, seed)
         truth = gait.body_at([v.stamp_ns * 1e-9 - 1.0 for v in velocities]).velocity[:, :2]
-        for v, true in zip(velocities, truth, strict=True):
-            error = v.velocity - true
-            nees.append(float(error @ np.linalg.solve(v.covariance, error)))
+        errors = [
+            np.linalg.solve(np.linalg.cholesky(v.covariance), v.velocity - true)
+            for v, true in zip(velocities, truth, strict=True)
+        ]
+        walks.append(np.array(errors))
+    return walks
+
+
+def test_step_velocities_of_simulated_walks_are_consistent(whitened: list[np.ndarray]) -> None:
+    """NEES of the velocity at every output; 2 expected."""
+    nees = (np.concatenate(whitened) ** 2).sum(axis=1)
     assert 0.4 < np.mean(nees) < 2.5
     assert np.quantile(nees, 0.99) < 9.2
+
+
+def test_how_long_errors_of_step_velocities_last(whitened: list[np.ndarray]) -> None:
+    """Their power spectral density at 0 over the variance stated, by the sum of the correlations
+    up to 2 s: what ``velocity_correlation_s`` of ``pedestrian_walk`` says."""
+    count = sum(e.size for e in whitened)
+    lags = [sum((e[k:] * e[: len(e) - k]).sum() for e in whitened) / count for k in range(21)]
+    stated = load_scenario("pedestrian_walk").tracker["velocity_correlation_s"]
+    assert 0.1 * (lags[0] + 2.0 * sum(lags[1:])) == pytest.approx(stated, rel=0.3)
 
 
 def test_a_disturbed_field_leaves_the_heading_to_the_gyro() -> None:
