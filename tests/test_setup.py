@@ -192,6 +192,22 @@ def test_container_files_fit_the_checkout(repository: Path) -> None:
         ).is_file()
 
 
+def test_the_containers_of_several_networks_are_those_of_the_scenario(repository: Path) -> None:
+    """A tracker for each network of two_networks and the fusion, heard by all of them."""
+    services = yaml.safe_load((repository / "docker" / "networks.yaml").read_text())["services"]
+    scenario = repository / "ros2_ws/src/netpos_bringup/scenarios/two_networks.yaml"
+    networks = [entry["name"] for entry in yaml.safe_load(scenario.read_text())["networks"]]
+    commands = {name: service["command"].split() for name, service in services.items()}
+    assert all(tuple(words[2:4]) in executables(repository) for words in commands.values())
+    trackers = [words for words in commands.values() if words[3] == "ekf_tracker"]
+    assert sorted(w.removeprefix("network:=") for t in trackers for w in t
+                  if w.startswith("network:=")) == sorted(networks)  # fmt: skip
+    assert f"subscribers:={1 + len(networks)}" in commands["rsu_sensor"]
+    first = yaml.safe_load((repository / "docker" / "compose.yaml").read_text())["services"]
+    assert set(services["vue_sim"]["depends_on"]) <= set(first) | set(services)
+    assert ["track_fusion", "track_fusion"] in [words[2:4] for words in commands.values()]
+
+
 def test_packages_declare_one_another(repository: Path) -> None:
     """A package that imports another of this workspace says so in its package.xml."""
     source = repository / "ros2_ws" / "src"

@@ -84,7 +84,7 @@ def tables(evaluation: Evaluation) -> list[Table]:
 
     names = list(evaluation.vues)
     figures = Table("figure", "unit", title=f"{evaluation.path.name}: accuracy")
-    for name in names:
+    for name in evaluation.columns():
         figures.add_column(name, justify="right")
     for row in figure_rows(evaluation):
         figures.add_row(*map(escape, row))

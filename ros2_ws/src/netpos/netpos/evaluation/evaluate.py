@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from netpos.bags import BagReader, codec
-from netpos.evaluation.metrics import SKIP_EPOCHS, Run, Scored, score
+from netpos.evaluation.metrics import SKIP_EPOCHS, Figures, Run, Scored, score
 from netpos.evaluation.pairing import Trajectory
 from netpos.evaluation.recorded_bound import recorded_bound_m
 from netpos.evaluation.requirements import Verdict, judge
@@ -28,6 +28,7 @@ from netpos.messages.values import (
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.settings import bag_settings
 
+_ODOMETRY, _CLOCK = "nav_msgs/msg/Odometry", "netpos_msgs/msg/ClockState"
 _Sink = tuple[str, Callable[[Any], Any], Callable[[Any], None]]
 
 
@@ -94,15 +95,27 @@ class VueEvaluation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evaluation:
-    """Result of ``evaluate_bag``. ``topics``: type and number of messages; ``buildings``: (k, 4)
-    rectangles x_min, y_min, x_max, y_max [m], none where the bag does not hold its scenario."""
+    """Result of ``evaluate_bag``. ``networks``: of several networks, how each alone did, by
+    network and device, under the devices' true names only. ``topics``: type and number of
+    messages; ``buildings``: (k, 4) rectangles x_min, y_min, x_max, y_max [m], none where the bag
+    does not hold its scenario."""
 
     path: Path
     skip: int
     vues: Mapping[str, VueEvaluation]
+    networks: Mapping[str, Mapping[str, Scored]]
     rsus: tuple[RsuInfo, ...]
     buildings: Array
     topics: Mapping[str, tuple[str, int]]
+
+    def columns(self) -> dict[str, Figures]:
+        """Figures by the name of their column in a table: devices, then devices by network."""
+        own = {name: vue.scored.figures for name, vue in self.vues.items()}
+        return own | {
+            f"{vue} by {network}": scored.figures
+            for network, vues in self.networks.items()
+            for vue, scored in vues.items()
+        }
 
     def to_json(self) -> dict[str, Any]:
         """Plain types in the form of ``netpos evaluate --json``."""
@@ -110,6 +123,10 @@ class Evaluation:
             "bag": self.path.name,
             "skip": self.skip,
             "vues": {name: vue.scored.figures.to_json() for name, vue in self.vues.items()},
+            "networks": {
+                network: {name: scored.figures.to_json() for name, scored in vues.items()}
+                for network, vues in self.networks.items()
+            },
             "requirements": {
                 name: {verdict.name: verdict.to_json() for verdict in vue.verdicts}
                 for name, vue in self.vues.items()
@@ -122,9 +139,14 @@ class Evaluation:
         }
 
 
+def _key(vue: str, network: str) -> str:
+    return f"{network}/{vue}" if network else vue
+
+
 @dataclass(slots=True)
 class _Recording:
-    """The messages of a bag that matter here, as values, in recorded order."""
+    """The messages of a bag that matter here, as values, in recorded order, by device; what a
+    network says by "network/device"."""
 
     truth: dict[str, list[Odometry]] = field(default_factory=lambda: defaultdict(list))
     estimate: dict[str, list[Odometry]] = field(default_factory=lambda: defaultdict(list))
@@ -138,12 +160,13 @@ class _Recording:
         default_factory=lambda: defaultdict(_DeliveryCounter)
     )
 
-    def run(self, vue: str) -> Run:
+    def run(self, vue: str, network: str = "") -> Run:
+        by = _key(vue, network)
         return Run(
             truth=Trajectory.of(self.truth[vue]),
-            estimate=Trajectory.of(self.estimate[vue]),
-            statuses=self.status[vue],
-            clock=self.clock[vue],
+            estimate=Trajectory.of(self.estimate[by]),
+            statuses=self.status[by],
+            clock=self.clock[by],
             clock_truth=self.clock_truth[vue],
         )
 
@@ -170,11 +193,32 @@ def _chosen(bag: BagReader, path: Path, vue: str | None) -> list[str]:
     return names
 
 
-def _sinks(recording: _Recording, vues: list[str]) -> dict[str, _Sink]:
+def _networks(bag: BagReader, vues: list[str]) -> list[tuple[str, str]]:
+    """Networks with estimates of their own and the devices of ``vues`` they are of, sorted."""
+    filled = sorted(topics.split_network(t) for t, info in bag.topics.items() if info.count)
+    return [(net, vue) for net, vue, name in filled if name == topics.ODOMETRY and vue in vues]
+
+
+def _output_sinks(recording: _Recording, vue: str, network: str) -> dict[str, _Sink]:
+    """What becomes of what a tracker says of a device."""
+    convert, by = codec(), _key(vue, network)
+    of_vue: dict[str, _Sink] = {
+        topics.ODOMETRY: (_ODOMETRY, convert.odometry_from_msg, recording.estimate[by].append),
+        topics.CLOCK_STATE: (_CLOCK, convert.clock_state_from_msg, recording.clock[by].append),
+        topics.TRACK_STATUS: (
+            "netpos_msgs/msg/TrackStatus",
+            convert.track_status_from_msg,
+            recording.status[by].append,
+        ),
+    }
+    return {topics.of_vue(vue, name, network): sink for name, sink in of_vue.items()}
+
+
+def _sinks(
+    recording: _Recording, vues: list[str], networks: list[tuple[str, str]]
+) -> dict[str, _Sink]:
     """What becomes of each topic: its type, the conversion to a value and where the value goes."""
     convert = codec()
-    odometry, clock = "nav_msgs/msg/Odometry", "netpos_msgs/msg/ClockState"
-    status = "netpos_msgs/msg/TrackStatus"
 
     def add_rsu(info: RsuInfo) -> None:
         recording.rsus[info.rsu_id] = info
@@ -192,31 +236,25 @@ def _sinks(recording: _Recording, vues: list[str]) -> dict[str, _Sink]:
         ),
     }
     for vue in vues:
-        truth, estimate = recording.truth[vue], recording.estimate[vue]
-        clocks, true_clocks = recording.clock[vue], recording.clock_truth[vue]
+        truth, clock = recording.truth[vue], recording.clock_truth[vue]
         of_vue: dict[str, _Sink] = {
-            topics.GROUND_TRUTH: (odometry, convert.odometry_from_msg, truth.append),
-            topics.ODOMETRY: (odometry, convert.odometry_from_msg, estimate.append),
-            topics.CLOCK_STATE: (clock, convert.clock_state_from_msg, clocks.append),
-            topics.GROUND_TRUTH_CLOCK: (clock, convert.clock_state_from_msg, true_clocks.append),
+            topics.GROUND_TRUTH: (_ODOMETRY, convert.odometry_from_msg, truth.append),
+            topics.GROUND_TRUTH_CLOCK: (_CLOCK, convert.clock_state_from_msg, clock.append),
             topics.INITIAL_POSE: (
                 "geometry_msgs/msg/PoseWithCovarianceStamped",
                 partial(convert.initial_pose_from_msg, vue_id=vue),
                 recording.poses[vue].append,
             ),
-            topics.TRACK_STATUS: (
-                status,
-                convert.track_status_from_msg,
-                recording.status[vue].append,
-            ),
         }
         sinks |= {topics.of_vue(vue, name): sink for name, sink in of_vue.items()}
+    for network, vue in [*(("", vue) for vue in vues), *networks]:
+        sinks |= _output_sinks(recording, vue, network)
     return sinks
 
 
-def _read(bag: BagReader, vues: list[str]) -> _Recording:
+def _read(bag: BagReader, vues: list[str], networks: list[tuple[str, str]]) -> _Recording:
     recording = _Recording()
-    sinks = _sinks(recording, vues)
+    sinks = _sinks(recording, vues, networks)
     wanted = sinks.keys() & bag.topics.keys()
     for topic in sorted(wanted):
         expected, found = sinks[topic][0], bag.topics[topic].type_name
@@ -267,7 +305,8 @@ def evaluate_bag(path: Path, *, skip: int = SKIP_EPOCHS, vue: str | None = None)
     """
     with BagReader(path) as bag:
         names = _chosen(bag, path, vue)
-        recording = _read(bag, names)
+        of_networks = _networks(bag, names)
+        recording = _read(bag, names, of_networks)
         counts = {topic: (info.type_name, info.count) for topic, info in bag.topics.items()}
         buildings = buildings_of(bag.metadata)
         config = _config_of(bag)
@@ -284,7 +323,17 @@ def evaluate_bag(path: Path, *, skip: int = SKIP_EPOCHS, vue: str | None = None)
             verdicts=judge(scored.figures, scored.counted.horizontal_error),
             delivery=recording.delivery[name].result(beacons),
         )
+    networks: dict[str, dict[str, Scored]] = {}
+    for network, name in of_networks:
+        scored = score(recording.run(name, network), skip=skip)
+        networks.setdefault(network, {})[name] = scored
     rsus = tuple(recording.rsus[name] for name in sorted(recording.rsus))
     return Evaluation(
-        path=path, skip=skip, vues=vues, rsus=rsus, buildings=buildings, topics=counts
+        path=path,
+        skip=skip,
+        vues=vues,
+        networks=networks,
+        rsus=rsus,
+        buildings=buildings,
+        topics=counts,
     )

@@ -164,7 +164,7 @@ def _errors(evaluation: Evaluation) -> go.Figure:
 
 def _section(evaluation: Evaluation) -> dict[str, object]:
     names = list(evaluation.vues)
-    accuracy = {"caption": "Figures", "head": ["figure", "unit", *names]}
+    accuracy = {"caption": "Figures", "head": ["figure", "unit", *evaluation.columns()]}
     verdicts = {"caption": "Requirements", "head": ["set", "requirement", "required", *names]}
     plots = [
         figure.to_html(full_html=False, include_plotlyjs=False)

@@ -58,8 +58,8 @@ def _interval(figures: Figures) -> str:
 
 
 def figure_rows(evaluation: Evaluation) -> list[list[str]]:
-    """Rows of label, unit and one value per device."""
-    all_figures = [vue.scored.figures for vue in evaluation.vues.values()]
+    """Rows of label, unit and one value per entry of ``Evaluation.columns``."""
+    all_figures = list(evaluation.columns().values())
     rows = []
     for label, unit, name, style in _ROWS:
         rows.append([label, unit, *(_text(getattr(f, name), style) for f in all_figures)])

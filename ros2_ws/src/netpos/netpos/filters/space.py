@@ -117,7 +117,7 @@ def innovation_at(row: Array, nav: Array, C: Array, h: Array) -> float:
         value += nav[CLOCK + 1]
     for column in (BIAS, COMMON):
         index = int(row[column])
-        if index > CLOCK:
+        if CLOCK < index < h.size:  # a state without clock and biases takes none
             h[index] = 1.0
             value += nav[index + 1]
     difference = row[VALUE] - value

@@ -52,6 +52,14 @@ def split(topic: str) -> tuple[str, str]:
     return (parts[0], parts[1]) if len(parts) == 2 and parts[0] != "rsu" else ("", topic)
 
 
+def split_network(topic: str) -> tuple[str, str, str]:
+    """Network, device and name of a device's topic below a network's; ("", "", topic) for any
+    other."""
+    parts = topic.strip("/").split("/")
+    found = len(parts) == 4 and parts[0] == NETWORKS
+    return (parts[1], parts[2], parts[3]) if found else ("", "", topic)
+
+
 def is_tracker_output(topic: str) -> bool:
     """Whether a topic is published by a tracker or by the fusion of tracks (and left out when a
     bag is re-estimated)."""

@@ -10,9 +10,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
 
+from netpos.filters.measurement import BIAS, COMMON, GROUP, KIND, LEVER, VARIANCE, Kind
 from netpos.filters.position_fix import FixStatus, fix_position, start_of
+from netpos.filters.space import linearise_in_space
 from netpos.inertial.alignment import fit_course, way_of
+from netpos.inertial.strapdown import ERR, NAV, QUATERNION
 from netpos.messages.values import Array, ImuSample
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.strapdown_models import nav_of, start_sd
@@ -24,6 +28,7 @@ _ATTEMPT_NS = 500_000_000
 _HEADING_SD_MAX = 0.1
 _MISFIT_MAX = 4.0
 _TILT_SD = 0.03
+_FALSE_ALARM = 1e-3
 _NS = 1e9
 
 
@@ -76,10 +81,11 @@ class StrapdownStart:
         return StrapdownStart(self.config, self._fixes.copy(), self._tried_ns)
 
     def add_rows(self, stamp_ns: int, rows: Array, lever: Array) -> None:
-        """Take the fix of one epoch of RSU rows, where they give one."""
-        fix = fix_position(rows, start_of(rows, self.config.device_height_m))
-        if fix.status == FixStatus.CONVERGED:
-            self.add_fix(stamp_ns, fix.position, fix.cov, lever)
+        """Take the fix of one epoch of RSU rows, where they give one; without the station that
+        contradicts the others, where one does."""
+        fix = sound_fix(rows, self.config.device_height_m)
+        if fix is not None:
+            self.add_fix(stamp_ns, *fix, lever)
 
     def add_fix(self, stamp_ns: int, position: Array, cov: Array, lever: Array) -> None:
         """Take a position (3,) of the antenna at ``lever``."""
@@ -139,3 +145,43 @@ class StrapdownStart:
         cov[[0, 1, 3, 4, 8], [0, 1, 3, 4, 8]] += [0.01, 0.01, 0.25, 0.25, 1e-3]
         cov[2, 2] = max(height_var, 0.25)
         return cov
+
+
+def sound_fix(rows: Array, height_m: float) -> tuple[Array, Array] | None:
+    """Position (3,) and covariance (3, 3) of the fix of ``rows`` (m, ROW_WIDTH).
+
+    Where its residuals are too large it is that without the one station which makes them so, and
+    where no single one does, with a covariance as much larger. None where there is no fix.
+    """
+    fix = fix_position(rows, start_of(rows, height_m))
+    if fix.status != FixStatus.CONVERGED:
+        return None
+    cost, limit, dof = _misfit(rows, fix.position)
+    if cost <= limit:
+        return fix.position, fix.cov
+    best, least = None, math.inf
+    for group in np.unique(rows[:, GROUP]):
+        others = rows[rows[:, GROUP] != group]
+        other = fix_position(others, start_of(others, height_m))
+        if other.status != FixStatus.CONVERGED:
+            continue
+        cost_without, limit_without, dof_without = _misfit(others, other.position)
+        if dof_without > 0 and cost_without <= limit_without and cost_without < least:
+            best, least = (other.position, other.cov), cost_without
+    return best or (fix.position, fix.cov * cost / dof)
+
+
+def _misfit(rows: Array, position: Array) -> tuple[float, float, int]:
+    """Sum of squared residuals over their variances, what a true fix stays below but for one in a
+    thousand, and the degrees of freedom."""
+    nav, at = np.zeros(NAV), rows.copy()
+    nav[:3], nav[QUATERNION + 3] = position, 1.0
+    at[:, LEVER : LEVER + 3] = 0.0  # the fix is the antenna's
+    at[:, [BIAS, COMMON]] = -1.0
+    residual, _, _ = linearise_in_space(at, nav, np.zeros((ERR, ERR)))
+    weight, times = 1.0 / rows[:, VARIANCE], rows[:, KIND] == Kind.TOA
+    if times.any():
+        residual[times] -= np.average(residual[times], weights=weight[times])
+    dof = len(rows) - (4 if times.any() else 3)
+    limit = float(chdtri(dof, _FALSE_ALARM)) if dof > 0 else math.inf
+    return float(weight @ residual**2), limit, dof

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -83,31 +83,36 @@ def make_drive(seed: int = 3, n: int = 200) -> Drive:
     )
 
 
-def write_drive(
-    path: Path,
-    drive: Drive,
-    *,
-    truth: bool = True,
-    estimates: bool = True,
-    measurements: Sequence[RsuMeasurement] | None = None,
-) -> Path:
-    """Record a drive in time order with RSUs, measurements, clocks and status.
+Row = tuple[int, str, object]
 
-    ``measurements`` replaces those of the drive; they are recorded in the given order.
-    """
+
+def _truth_rows(drive: Drive) -> list[Row]:
     convert = codec()
-    rows: list[tuple[int, str, object]] = []
-    for k, rsu_xy in enumerate([(20.0, 6.0), (70.0, 6.0), (95.0, 40.0)]):
-        info = RsuInfo(rsu_id=f"rsu_{k}", position=np.array([*rsu_xy, 5.0]), stamp_ns=T0_NS)
-        rows.append((T0_NS, "/rsu/info", convert.rsu_info_to_msg(info)))
-    if truth:
-        for pose in drive.truth:
-            clock = ClockState(stamp_ns=pose.stamp_ns, vue_id="vue_1", offset_s=2e-5, drift=0.0)
-            rows.append((pose.stamp_ns, "/vue_1/ground_truth", convert.odometry_to_msg(pose)))
-            rows.append(
-                (pose.stamp_ns, "/vue_1/ground_truth_clock", convert.clock_state_to_msg(clock))
-            )
-    for k, pose in enumerate(drive.estimates if estimates else []):
+    rows: list[Row] = []
+    for pose in drive.truth:
+        clock = ClockState(stamp_ns=pose.stamp_ns, vue_id="vue_1", offset_s=2e-5, drift=0.0)
+        rows.append((pose.stamp_ns, "/vue_1/ground_truth", convert.odometry_to_msg(pose)))
+        rows.append(
+            (pose.stamp_ns, "/vue_1/ground_truth_clock", convert.clock_state_to_msg(clock))
+        )
+    return rows
+
+
+def _measurement_rows(drive: Drive) -> list[Row]:
+    """Two RSUs each estimate; one measurement is lost."""
+    found = [
+        RsuMeasurement(stamp_ns=pose.stamp_ns, rsu_id=rsu, vue_id="vue_1", sequence=k, expected=2)
+        for k, pose in enumerate(drive.estimates)
+        for rsu in ("rsu_0", "rsu_1")
+        if (k, rsu) != (7, "rsu_1")
+    ]
+    return [(m.stamp_ns, "/rsu/measurements", codec().measurement_to_msg(m)) for m in found]
+
+
+def _estimate_rows(drive: Drive) -> list[Row]:
+    convert = codec()
+    rows: list[Row] = []
+    for k, pose in enumerate(drive.estimates):
         stamp = pose.stamp_ns
         clock = ClockState(
             stamp_ns=stamp,
@@ -124,18 +129,42 @@ def write_drive(
             rejected={"gate": k // 50},
             sources=("rsu_0", "rsu_1"),
         )
-        for rsu in ("rsu_0", "rsu_1"):
-            measurement = RsuMeasurement(
-                stamp_ns=stamp, rsu_id=rsu, vue_id="vue_1", sequence=k, expected=2
-            )
-            if measurements is None and (k, rsu) != (7, "rsu_1"):  # one measurement is lost
-                rows.append((stamp, "/rsu/measurements", convert.measurement_to_msg(measurement)))
         rows.append((stamp, "/vue_1/odometry", convert.odometry_to_msg(pose)))
         rows.append((stamp, "/vue_1/clock_state", convert.clock_state_to_msg(clock)))
         rows.append((stamp, "/vue_1/track_status", convert.track_status_to_msg(status)))
+    return rows
+
+
+def write_drive(
+    path: Path,
+    drive: Drive,
+    *,
+    truth: bool = True,
+    estimates: bool = True,
+    measurements: Sequence[RsuMeasurement] | None = None,
+    others: Mapping[str, Sequence[Odometry]] | None = None,
+) -> Path:
+    """Record a drive in time order with RSUs, measurements, clocks and status.
+
+    ``measurements`` replaces those of the drive; they are recorded in the given order. ``others``:
+    odometry on other topics.
+    """
+    convert = codec()
+    rows: list[Row] = []
+    for k, rsu_xy in enumerate([(20.0, 6.0), (70.0, 6.0), (95.0, 40.0)]):
+        info = RsuInfo(rsu_id=f"rsu_{k}", position=np.array([*rsu_xy, 5.0]), stamp_ns=T0_NS)
+        rows.append((T0_NS, "/rsu/info", convert.rsu_info_to_msg(info)))
+    if truth:
+        rows += _truth_rows(drive)
+    if estimates and measurements is None:
+        rows += _measurement_rows(drive)
+    if estimates:
+        rows += _estimate_rows(drive)
     rows += [
         (T0_NS, "/rsu/measurements", convert.measurement_to_msg(m)) for m in measurements or ()
     ]
+    for topic, odometry in (others or {}).items():
+        rows += [(o.stamp_ns, topic, convert.odometry_to_msg(o)) for o in odometry]
     with BagWriter(path) as bag:
         for stamp, topic, message in sorted(rows, key=lambda row: row[0]):
             bag.write(topic, message, stamp)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,30 @@ def test_json_has_the_agreed_keys_and_reads_back(drive_bag: Path) -> None:
     assert set(content["requirements"]["vue_1"]) == {"tsp", "v2x_set_1", "v2x_set_2", "v2x_set_3"}
     assert figures["bound_ratio"] > 0.0
     assert json.loads(json.dumps(content, allow_nan=False)) == content
+
+
+def test_networks_are_scored_apart(
+    tmp_path: Path, drive: Any, drive_bag: Path, record: Callable[..., Path]
+) -> None:
+    """What a network says of a device whose truth is known, against that; under another name it
+    cannot be told."""
+    aside = [replace(o, position=o.position + np.array([3.0, 0.0, 0.0])) for o in drive.estimates]
+    others = {
+        "/networks/wifi/vue_1/odometry": drive.estimates,
+        "/networks/wimax/vue_1/odometry": aside,
+        "/networks/wimax/stranger/odometry": aside,
+    }
+    bag = record(tmp_path / "networks", drive, others=others)
+    content = evaluate_bag(bag).to_json()
+    assert set(content["networks"]) == {"wifi", "wimax"}
+    assert set(content["networks"]["wimax"]) == {"vue_1"}
+    own, wifi = content["vues"]["vue_1"], content["networks"]["wifi"]["vue_1"]
+    assert list(wifi) == list(own)
+    assert wifi["rmse_m"] == own["rmse_m"]
+    assert wifi["clock_offset_sd_ns"] is None
+    assert content["networks"]["wimax"]["vue_1"]["rmse_m"] > 1.5 * own["rmse_m"]
+    assert list(evaluate_bag(bag).columns()) == ["vue_1", "vue_1 by wifi", "vue_1 by wimax"]
+    assert evaluate_bag(drive_bag).to_json()["networks"] == {}
 
 
 def test_the_same_bag_gives_the_same_figures(drive_bag: Path) -> None:

@@ -15,6 +15,9 @@ from netpos.radio.noise import generator
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking import Tracker, TrackerConfig, TrackOutput
 from netpos.tracking.health import RsuState
+from netpos.tracking.rsus import Rsu
+from netpos.tracking.strapdown_rows import batch_in_space
+from netpos.tracking.strapdown_start import sound_fix
 
 NS = 1_000_000_000
 VUE = "vue_1"
@@ -216,3 +219,45 @@ def test_blocked_paths_cost_less_with_the_options(option: dict[str, Any], most: 
         found.append([rms(errors(simulation, o)[20:]) for o in outputs])
     plain, aware = np.mean(found, axis=0)
     assert aware < most * plain
+
+
+@pytest.mark.parametrize("times", [False, True])
+def test_a_station_that_lies_from_the_beginning_does_not_prevent_the_start(times: bool) -> None:
+    """The nearest of four to eight stations is 40 m off: the first fixes go without it."""
+    made = one_way if times else simulated
+    simulation = made(5700, 25.0, (5, 8))
+    items = items_of(simulation)
+    liar = loudest([i for i in items if i.stamp_ns < simulation.scenario.start_ns + 10 * NS], 0)
+
+    def bent(item: Item) -> Item:
+        if not isinstance(item, RsuMeasurement) or item.rsu_id != liar:
+            return item
+        return replace(item, range_m=item.range_m + 40.0, toa_s=item.toa_s + 40.0 / 299_792_458.0)
+
+    outputs, _ = run(simulation, map(bent, items))
+    first = next(o for o in outputs if o.odometry is not None)
+    assert first.status.stamp_ns - simulation.scenario.start_ns <= 8 * NS
+    assert np.abs(errors(simulation, outputs)).max() < 4.0
+
+
+def test_without_a_single_culprit_the_fix_says_less() -> None:
+    """Two of four stations lie, each its own way: nobody is left out, the covariance grows."""
+    simulation = simulated(5800, 3.0, (4, 4))
+    beacon = next(e for e in simulation.events() if isinstance(e, Beacon))
+    measured = simulation.measure(beacon)
+    known = {rsu.rsu_id: Rsu.of(rsu) for rsu in simulation.rsus}
+
+    def fix(lies: dict[int, float]) -> tuple[Array, Array]:
+        bent = [replace(m, range_m=m.range_m + lies.get(i, 0.0)) for i, m in enumerate(measured)]
+        found = sound_fix(batch_in_space(bent, known, None).rows, 1.5)
+        assert found is not None
+        return found
+
+    place, cov = fix({})
+    doubted, wide = fix({0: 60.0, 1: -25.0})
+    assert np.linalg.norm(place - beacon.position) < 4.0
+    assert np.trace(wide) > 10.0 * np.trace(cov)
+    one, sure = fix({0: 60.0})
+    assert np.linalg.norm(one - beacon.position) < 5.0
+    assert np.trace(sure) < 10.0 * np.trace(cov)
+    assert np.linalg.norm(doubted - beacon.position) > 5.0

@@ -45,6 +45,7 @@ FIX, FIX_HEIGHT, LOOSE, LOOSE_DIAGONAL, LOOSE_FIXED, TIGHT, VEHICLE = (
     "tight",
     "tight, vehicle constraints",
 )
+VARIANTS = (FIX, FIX_HEIGHT, LOOSE, LOOSE_DIAGONAL, LOOSE_FIXED, TIGHT, VEHICLE)
 RANGE_SD_M = 1.0
 FEW_STATIONS = 2
 # Of the device's clock, as it is simulated [(s/s)/sqrt(s)].

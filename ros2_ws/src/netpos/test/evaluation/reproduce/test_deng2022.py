@@ -8,11 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from netpos.evaluation.reproduce import blocked_drive as drives
-from netpos.evaluation.reproduce import car_drive, deng2022
+from netpos.evaluation.reproduce import car_drive, deng2022, drive_bounds
 from netpos.evaluation.reproduce.blocked_drive import (
     FIX,
     FIX_HEIGHT,
     LOOSE,
+    LOOSE_DIAGONAL,
+    LOOSE_FIXED,
     TIGHT,
     VARIANTS,
     VEHICLE,
@@ -87,7 +89,9 @@ def test_outages_are_ten_silent_seconds() -> None:
     silent = ~done.heard
     edges = np.flatnonzero(np.diff(silent.astype(int)))
     lengths = np.diff(edges)[::2]
-    assert set(lengths.tolist()) == {drives.OUTAGE_S - 1}  # silent epochs between heard ones
+    assert set(lengths.tolist()) == {
+        deng2022.OUTAGES.outage_s - 1
+    }  # silent epochs between heard ones
     result = tally_seeds(deng2022.OUTAGES, range(SEED, SEED + 1))[VEHICLE]
     assert result.outage_m.shape == (len(lengths), 2)
     ends = edges[1::2]
@@ -113,9 +117,58 @@ def test_every_cell_has_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
             found += [rows[f"{label}: RMS {axis}"] for axis in ("north", "east", "down")]
             assert tuple(row.paper for row in found) == cells
             assert all(row.ok is not None for row in found)
+    for axis in ("north", "east", "down"):
+        assert rows[f"{deng2022.ONE_WAY.name}, SINS, {TIGHT}: RMS {axis}"].ours is not None
     real = [row for row in outcome.rows if row.name.startswith("Real")]
     assert len(real) == 22
     assert all(row.ours is None for row in real)
+
+
+def test_the_bound_is_kept_and_nearly_reached(tally: dict[str, Tally]) -> None:
+    """No unbiased filter is better than its posterior Cramér-Rao bound; the tight one reaches it
+    but for chance, and the filter that made it never left the true way."""
+    epochs, made = drive_bounds.bound_drives(deng2022.BLOCKED, SEED)
+    states = drive_bounds.true_states(
+        drives.simulation_of(deng2022.BLOCKED).with_seed(SEED), epochs
+    )
+    for variant in (TIGHT, VEHICLE):
+        assert np.abs(made[variant].nav[:, :3] - states[:, :3]).max() < 0.02
+        bound = np.sqrt(np.diagonal(made[variant].cov, axis1=1, axis2=2)[:, :2].mean(axis=0).sum())
+        ratio = np.hypot(*tally[variant].rms_m[:2]) / bound
+        assert 0.8 < ratio < 1.3
+    exact = np.diagonal(made[drive_bounds.EXACT].cov, axis1=1, axis2=2)[:, :3].sum()
+    assert exact < np.diagonal(made[VEHICLE].cov, axis1=1, axis2=2)[:, :3].sum()
+
+
+def test_less_told_of_a_fix_costs(tally: dict[str, Tally], blocked: Run) -> None:
+    plane = {name: np.hypot(*t.rms_m[:2]) for name, t in tally.items()}
+    assert plane[LOOSE] < plane[LOOSE_DIAGONAL] < plane[LOOSE_FIXED]
+    fixes = blocked.fixes[FIX]
+    told = drives.less_told(fixes)
+    np.testing.assert_array_equal(told[LOOSE_DIAGONAL].cov[:, 0, 0], fixes.cov[:, 0, 0])
+    assert not told[LOOSE_DIAGONAL].cov[:, 0, 1].any()
+    good = fixes.status == FixStatus.CONVERGED
+    np.testing.assert_allclose(told[LOOSE_FIXED].cov[7], fixes.cov[good].mean(axis=0))
+
+
+def test_one_way_times_find_the_clock() -> None:
+    found = tally_seeds(deng2022.ONE_WAY, range(SEED + 2, SEED + 3))
+    assert set(found) == {FIX, FIX_HEIGHT, TIGHT, VEHICLE}
+    error, said = found[TIGHT].clock_ns
+    assert said < 6.0
+    assert error < 3.0 * said
+    assert np.hypot(*found[TIGHT].rms_m[:2]) < 3.0
+
+
+def test_smoothing_bridges_outages() -> None:
+    """Given what comes after, the error inside is a fraction of the filter's."""
+    with Work(1, SEED, 1) as work:
+        found = drive_bounds.in_outages(work, deng2022.OUTAGES)
+    for variant in (TIGHT, VEHICLE):
+        filtered, smoothed = (
+            np.hypot(*found[f"{variant}, {what}"].rms_m[:2]) for what in ("filtered", "smoothed")
+        )
+        assert smoothed < 0.4 * filtered
 
 
 @pytest.mark.parametrize(("seconds", "limit"), [(10.0, 2.0)])
