@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from netpos.bags import codec
+from netpos.scenario import load_scenario
 from runs import (
     INFOS,
     MEASUREMENTS,
@@ -22,6 +23,48 @@ from runs import (
 )
 
 SEED = "3"
+TRACKER = load_scenario("blocked_5g_drive").tracker
+
+
+def test_odometry_between_epochs_and_the_clock_are_the_same_live_and_offline(
+    tmp_path: Path,
+) -> None:
+    """One-way times and 50 Hz of odometry, bit by bit, and what the epochs say is not changed."""
+    drive = changed_scenario(
+        tmp_path / "drive.yaml",
+        "blocked_5g_drive",
+        max_duration_s=30.0,
+        measurement={
+            "quantities": ["azimuth", "elevation", "toa"],
+            "nearest": 5,
+            "fewest": 4,
+            "errors": {
+                "model": "fixed",
+                "azimuth_sd_deg": 8.5,
+                "elevation_sd_deg": 2.5,
+                "toa_sd_s": 3.336e-9,
+            },
+        },
+        tracker={**TRACKER, "odometry_rate_hz": 50.0},
+    )
+    live, offline = tmp_path / "live", tmp_path / "offline"
+    with graphs(tmp_path) as (graph,):
+        started = script(graph, "run_graph", drive, live, "3", SEED)
+        netpos("run", drive, "--offline", "--seed", SEED, "--bag", offline)
+        finish(started)
+    topics = (ODOMETRY, TRACK_STATUS, "/vue_1/clock_state")
+    mine, theirs = payloads(live, topics), payloads(offline, topics)
+    for topic in topics:
+        assert len(theirs[topic]) > 1000, topic
+        assert mine[topic] == theirs[topic], topic
+    again, sparse = tmp_path / "again", tmp_path / "sparse"
+    netpos("replay", live, "--out", again)
+    assert payloads(again, topics) == mine
+    netpos("replay", live, "--out", sparse, "--set", "odometry_rate_hz=0", "--smooth")
+    at_epochs = payloads(sparse, (ODOMETRY,))[ODOMETRY]
+    assert len(at_epochs) < 30
+    assert set(at_epochs) <= set(mine[ODOMETRY])
+    assert len(messages(sparse, "/vue_1/odometry_smoothed")) == len(at_epochs)
 
 
 def test_a_drive_in_space_is_the_same_live_and_offline(tmp_path: Path) -> None:
