@@ -11,6 +11,7 @@ from netpos.filters.motion import ProcessNoise
 from netpos.tracking.parameters import check_fields, from_mapping
 from netpos.tracking.parameters import choice as _choice
 from netpos.tracking.parameters import real as _real
+from netpos.tracking.rsus import StepErrors
 
 FILTERS = ("ekf", "iekf", "ukf", "srukf", "kf")
 BACKENDS = ("compiled", "filterpy")
@@ -325,6 +326,15 @@ class TrackerConfig:
     def use_imu(self) -> bool:
         """Whether the device's IMU is an input."""
         return self.motion_model in ("inertial", "strapdown")
+
+    @property
+    def step_errors(self) -> StepErrors:
+        """What is wrong with all steps of a person alike, to be estimated."""
+        return StepErrors(
+            length_sd=self.step_length_factor_sd,
+            heading_sd_rad=self.step_heading_offset_sd_rad,
+            tau_s=self.step_error_time_s,
+        )
 
     @property
     def calibrates_steps(self) -> bool:

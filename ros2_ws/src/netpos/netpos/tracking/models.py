@@ -17,7 +17,6 @@ from netpos.filters.motion import (
 from netpos.messages.values import Array
 from netpos.tracking.config import FILTERS, ROBUST, TrackerConfig
 from netpos.tracking.engine import GATE_SIZE, Option
-from netpos.tracking.rsus import StepErrors
 
 FILTER_ITERATIONS = {"ekf": 1, "iekf": 8}
 
@@ -95,15 +94,6 @@ def by_sectors(config: TrackerConfig) -> bool:
     """Whether phase differences are resolved by a bank of filters."""
     single = config.motion_model not in ("interacting", "rigid_body", "strapdown")
     return config.ambiguity == "hypotheses" and config.backend == "compiled" and single
-
-
-def step_errors(config: TrackerConfig) -> StepErrors:
-    """What is wrong with all steps of a person alike, to be estimated."""
-    return StepErrors(
-        length_sd=config.step_length_factor_sd,
-        heading_sd_rad=config.step_heading_offset_sd_rad,
-        tau_s=config.step_error_time_s,
-    )
 
 
 def initial_extra_sd(config: TrackerConfig) -> Array:

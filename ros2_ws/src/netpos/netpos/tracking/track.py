@@ -34,13 +34,7 @@ from netpos.tracking.history import History, merge
 from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser, with_heading
 from netpos.tracking.memory import TrackMemory
-from netpos.tracking.models import (
-    gate_thresholds,
-    heading_index,
-    initial_extra_sd,
-    pose_state,
-    step_errors,
-)
+from netpos.tracking.models import gate_thresholds, heading_index, initial_extra_sd, pose_state
 from netpos.tracking.networks.secondary import Secondary
 from netpos.tracking.phase_start import PhaseStart, corrections, with_sectors
 from netpos.tracking.protection import protection_level, unnoticed_shift
@@ -85,7 +79,7 @@ class Track:
 
     def _fresh(self) -> TrackMemory:
         return TrackMemory(
-            BiasStates(6 + self._extra_sd.size, step_errors(self._config)),
+            BiasStates(6 + self._extra_sd.size, self._config.step_errors),
             Initialiser(self._config),
             Blockage.of(self._config),
             PhaseStart(self._config),

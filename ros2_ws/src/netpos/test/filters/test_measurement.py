@@ -72,11 +72,11 @@ def closed_form(row: Array, x: Array, height_m: float) -> float:
         turn = Rotation.from_euler("z", x[8])
         reported = turn.inv().apply([x[2], x[3], 0.0])[:2] / np.exp(x[6])
         return float(row[ORIGIN + 2 : ORIGIN + 4] @ reported)
-    d = np.array([x[0], x[1], height_m]) - row[ORIGIN:AXES]
+    antenna = np.append(x[:2], height_m + row[LEVER + 2])
     if row[HEADING] >= 0:
         turn = Rotation.from_euler("z", x[int(row[HEADING])])
-        d += turn.apply([row[LEVER], row[LEVER + 1], 0.0])
-    d[2] += row[LEVER + 2]
+        antenna += turn.apply([row[LEVER], row[LEVER + 1], 0.0])
+    d = antenna - row[ORIGIN:AXES]
     ux, uy, uz = Rotation.from_matrix(row[AXES:HEADING].reshape(3, 3)).apply(d)
     r = float(np.linalg.norm(d))
     value = {
@@ -84,7 +84,7 @@ def closed_form(row: Array, x: Array, height_m: float) -> float:
         Kind.ELEVATION: lambda: np.arcsin(uz / r),
         Kind.TOA: lambda: r + x[4],
         Kind.RANGE: lambda: r,
-        Kind.LINEAR: lambda: row[ORIGIN : ORIGIN + 6] @ x[:6],
+        Kind.LINEAR: lambda: row[ORIGIN : ORIGIN + 6] @ [*antenna[:2], *x[2:6]],
         Kind.SPEED: lambda: abs(complex(x[2], x[3])),
         Kind.COSINE_Y: lambda: uy / r,
         Kind.COSINE_Z: lambda: uz / r,

@@ -23,7 +23,7 @@ from netpos.messages.values import Array, Beacon, TrackState, Velocity
 from netpos.radio.noise import generator
 from netpos.tracking import Tracker, TrackOutput
 
-RUNS = 200  # at most: every run is a tracker's, message by message
+RUNS = 100  # at most: every run is a tracker's, message by message
 HIDDEN_S = (10.0, 25.0)
 OFF = (0.10, 0.15)  # of the length
 HEADING_SD_RAD = math.radians(3.0)

@@ -40,7 +40,7 @@ def test_fifteen_hidden_seconds(walks: dict[str, list[person.Walk]]) -> None:
     """The error is a third, and the covariance holds it."""
     rmse, nees = {}, {}
     for name, runs in walks.items():
-        assert all(run.times_s[-1] == pytest.approx(25.5) for run in runs)
+        assert all(run.times_s[-1] > 24.8 for run in runs)  # hidden up to 25 s
         rmse[name], nees[name] = person._scores(runs, 15.0, 25.0)
     assert rmse["estimated"] < rmse["unknown"] / 3
     assert nees["estimated"] < 3 < nees["unknown"]
