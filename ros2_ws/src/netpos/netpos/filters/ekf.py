@@ -255,12 +255,15 @@ def update(
                     cov[a, b] = work[W_COV + a, b]
             nis = _fuse_used(mean, cov, rows, work)
     if iterations > 1:
-        if bends(rows, mean, height_m, work):
+        bent, wide = bends(rows, mean, height_m, work), is_wide(rows, work)
+        if bent:
             iterate_used(mean, cov, rows, height_m, iterations, work)
             if on_top(mean, cov, rows, work):
                 fuse_around(mean, cov, rows, height_m, work)
-        if is_wide(rows, work):
+        if wide:
             refine_used(mean, cov, rows, height_m, work)
+        if (bent or wide) and not is_definite(cov, work):
+            fuse_by_factor(mean, cov, rows.shape[0], work)
     return nis, used
 
 

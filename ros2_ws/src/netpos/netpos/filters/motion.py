@@ -70,7 +70,8 @@ class Parameter(IntEnum):
     YAW_INCREMENT = 14  # INERTIAL, input: integrated yaw rate over the step [rad]
     SPEED_INCREMENT = 15  # INERTIAL, input: integrated forward acceleration over the step [m/s]
     JUMP_SPEED = 16  # sd [m/s] of a velocity step the filter allowed for in this step; 0: none
-    JUMP_TIME = 17  # how long ago at most it happened [s]
+    JUMP_TIME = 17  # how long ago it happened [s]
+    JUMP_SPREAD = 18  # sd [m] of the position it led to, beside that: its time is not known
 
 
 _EXTRAS = {
@@ -256,7 +257,8 @@ def add_noise(mean: Array, dt: float, motion: Array, bias: Array, cov: Array) ->
     else:
         _add_acceleration(dt, motion, cov)
     _add_clock(dt, motion, cov)
-    add_jump(motion[Parameter.JUMP_SPEED], motion[Parameter.JUMP_TIME], cov)
+    time_s, spread_m = motion[Parameter.JUMP_TIME], motion[Parameter.JUMP_SPREAD]
+    add_jump(motion[Parameter.JUMP_SPEED], time_s, spread_m, cov)
     if model == Model.CONSTANT_TURN:
         cov[6, 6] += motion[Parameter.TURN_RATE] ** 2 * dt
     elif model == Model.RIGID_BODY:
@@ -272,11 +274,13 @@ def add_noise(mean: Array, dt: float, motion: Array, bias: Array, cov: Array) ->
 
 
 @leaf
-def add_jump(sd: float, time_s: float, cov: Array) -> None:
+def add_jump(sd: float, time_s: float, spread_m: float, cov: Array) -> None:
     """Add, in place, a velocity step of ``sd`` [m/s] per axis ``time_s`` ago, and the position it
-    leads to."""
+    leads to, known but for ``spread_m`` (sd). Nothing happens for sd 0."""
+    if sd == 0.0:
+        return
     for p in range(2):
-        cov[p, p] += (sd * time_s) ** 2
+        cov[p, p] += (sd * time_s) ** 2 + spread_m**2
         cov[p, p + 2] += sd * sd * time_s
         cov[p + 2, p] += sd * sd * time_s
         cov[p + 2, p + 2] += sd * sd

@@ -10,11 +10,14 @@ import numpy as np
 
 from netpos.filters import conditioning, ekf, kf, srukf, ukf
 from netpos.filters.compile import kernel, leaf
+from netpos.filters.manoeuvre import add_manoeuvre, unnoticed_s
 from netpos.filters.measurement import GROUP
-from netpos.filters.motion import Parameter, add_jump
+from netpos.filters.motion import SPEED_OF_LIGHT_MPS, Parameter, add_jump
 from netpos.messages.values import Array
 
 GATE_SIZE = 65
+_FARTHEST_M = 1e9  # no measurement may say more
+_ROUNDING = 1e-15  # of turned axes
 
 
 class Option(IntEnum):
@@ -117,7 +120,7 @@ def open_velocity(spread: Array, sd: float, unheard_s: float, options: Array) ->
     if int(options[Option.FILTER]) == Filter.SRUKF:
         _open_factor(spread, sd, unheard_s)
         return
-    add_jump(sd, unheard_s, spread)
+    add_jump(sd, unheard_s, 0.0, spread)
 
 
 @kernel
@@ -126,6 +129,71 @@ def _open_factor(spread: Array, sd: float, unheard_s: float) -> None:
         x = np.zeros(spread.shape[0])
         x[p], x[p + 2] = sd * unheard_s, sd
         srukf.cholesky_update(spread, x, 1.0)
+
+
+@kernel
+def manoeuvre_s(
+    mean: Array, spread: Array, rows: Array, unheard_s: float, options: Array
+) -> float:
+    """Time [s] in which a manoeuvre may have begun, seen from the prediction: since the last
+    accepted measurement, or for as long as it goes unnoticed. A step of the velocity that its own
+    sd allows for is followed, and no manoeuvre."""
+    cov = spread
+    if int(options[Option.FILTER]) == Filter.SRUKF:
+        cov = srukf.covariance(spread)
+    h, height_m = np.empty(mean.size), options[Option.HEIGHT]
+    speed, gate = options[Option.MANOEUVRE_SPEED], options[GATE + 2]
+    if 2.0 * speed * speed <= cov[2, 2] + cov[3, 3]:
+        return unheard_s
+    typical_s, _ = unnoticed_s(mean, cov, rows, height_m, gate, speed, h)
+    return max(unheard_s, typical_s if math.isfinite(typical_s) else 0.0)
+
+
+@kernel
+def allow_manoeuvre(spread: Array, within_s: float, options: Array) -> None:
+    """Add, in place, a velocity step of the manoeuvre speed at any time of the last ``within_s``
+    seconds."""
+    speed = options[Option.MANOEUVRE_SPEED]
+    if int(options[Option.FILTER]) != Filter.SRUKF:
+        add_manoeuvre(speed, within_s, spread)
+        return
+    _open_factor(spread, speed, within_s / 2.0)
+    for p in range(2):
+        x = np.zeros(spread.shape[0])
+        x[p] = speed * within_s / math.sqrt(12.0)
+        srukf.cholesky_update(spread, x, 1.0)
+
+
+@leaf
+def note_jump(
+    motion: Array, opened_sd: float, unheard_s: float, manoeuvre_sd: float, within_s: float
+) -> None:
+    """Leave in ``motion`` the velocity steps allowed for, one ``unheard_s`` ago and one at any
+    time of the last ``within_s`` seconds, as one."""
+    opened2, manoeuvre2 = opened_sd * opened_sd, manoeuvre_sd * manoeuvre_sd
+    speed2 = opened2 + manoeuvre2
+    motion[Parameter.JUMP_SPEED] = math.sqrt(speed2)
+    if speed2 == 0.0:
+        return
+    time_s = (opened2 * unheard_s + manoeuvre2 * within_s / 2.0) / speed2
+    position2 = opened2 * unheard_s * unheard_s + manoeuvre2 * within_s * within_s / 3.0
+    motion[Parameter.JUMP_TIME] = time_s
+    motion[Parameter.JUMP_SPREAD] = math.sqrt(max(position2 - speed2 * time_s * time_s, 0.0))
+
+
+@leaf
+def is_sound(mean: Array, cov: Array) -> bool:
+    """Whether the state can be a device's: on earth, slower than light, its position and velocity
+    covariances definite in whatever axes they are told."""
+    if not (abs(mean[0]) < _FARTHEST_M and abs(mean[1]) < _FARTHEST_M):
+        return False
+    if not math.hypot(mean[2], mean[3]) < SPEED_OF_LIGHT_MPS:
+        return False
+    for p in (0, 2):
+        a, b, c = cov[p, p], cov[p, p + 1], cov[p + 1, p + 1]
+        if not (a > 0.0 and a * c - b * b > _ROUNDING * (a + c) ** 2):
+            return False
+    return True
 
 
 @leaf
@@ -161,17 +229,17 @@ def step(
 ) -> tuple[float, int, int]:
     """Predict by ``dt`` and apply one epoch, in place.
 
-    A first look gates with the prediction. Where it rejects something, a second look with a
-    velocity opened by the manoeuvre speed is taken if it accepts more. After ``INFLATE_AFTER``
-    epochs rejected in a row the velocity opens to its initial sd. Nothing accepted leaves the
-    prediction.
+    A first look gates with the prediction. Where it rejects something, a second look that allows
+    for a manoeuvre in the time it may have gone unnoticed is taken if it accepts more. After
+    ``INFLATE_AFTER`` epochs rejected in a row the velocity opens to its initial sd. Nothing
+    accepted leaves the prediction.
 
     rows : (m, ROW_WIDTH), groups numbered 0, 1, ...; the robust options re-weight them in place
     unheard_s : since the last accepted measurement
     accepted : (2, groups), the first row filled with 0 or 1
 
     Returns the NIS of the accepted rows, their number, the number of accepted groups. The velocity
-    step allowed for is left in ``motion`` (JUMP_SPEED, JUMP_TIME), for a smoother to know.
+    step allowed for is left in ``motion`` (``note_jump``), for a smoother to know.
     """
     n, groups = mean.size, int(rows[rows.shape[0] - 1, GROUP]) + 1
     predict(mean, spread, dt, motion, bias, options)
@@ -179,9 +247,9 @@ def step(
     second_mean, second_spread = spare[n + 1], spare[n + 2 :]
     _copy(mean, spread, prior_mean, prior_spread)
     opened = rejected_in_row >= options[Option.INFLATE_AFTER]
-    jump = 0.0
+    jump = options[Option.INITIAL_SPEED] if opened else 0.0
+    turn, within_s = 0.0, 0.0
     if opened:
-        jump = options[Option.INITIAL_SPEED]
         open_velocity(spread, jump, unheard_s, options)
     if options[Option.ROBUST] > 0.0 or options[Option.NLOS_PROBABILITY] > 0.0:
         condition(mean, spread, rows, options, work)
@@ -191,8 +259,9 @@ def step(
     if taken < groups and manoeuvre > 0.0:
         _copy(prior_mean, prior_spread, second_mean, second_spread)
         if opened:
-            open_velocity(second_spread, options[Option.INITIAL_SPEED], unheard_s, options)
-        open_velocity(second_spread, manoeuvre, unheard_s, options)
+            open_velocity(second_spread, jump, unheard_s, options)
+        within_s = manoeuvre_s(prior_mean, prior_spread, rows, unheard_s, options)
+        allow_manoeuvre(second_spread, within_s, options)
         second_nis, second_used = update(
             second_mean, second_spread, rows, options, accepted[1], work
         )
@@ -201,11 +270,11 @@ def step(
             _copy(second_mean, second_spread, mean, spread)
             for g in range(groups):
                 accepted[0, g] = accepted[1, g]
-            jump = math.hypot(jump, manoeuvre)
+            turn = manoeuvre
     if taken == 0:
         _copy(prior_mean, prior_spread, mean, spread)
     else:
-        motion[Parameter.JUMP_SPEED], motion[Parameter.JUMP_TIME] = jump, unheard_s
+        note_jump(motion, jump, unheard_s, turn, within_s)
     return nis, used, taken
 
 

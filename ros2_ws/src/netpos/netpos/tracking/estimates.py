@@ -181,8 +181,11 @@ class _Looks:
     def _set_state(self, state: tuple[Array, ...]) -> None:
         raise NotImplementedError
 
-    def _note_jump(self, sd: float, unheard_s: float) -> None:
-        """Keep the velocity step allowed for, for a smoother."""
+    def _allow(self, within_s: float) -> None:
+        raise NotImplementedError
+
+    def _note_jump(self, *steps: float) -> None:
+        """Keep the velocity steps allowed for, arguments of ``engine.note_jump``."""
 
     @property
     def prior(self) -> tuple[Array, Array]:
@@ -203,7 +206,7 @@ class _Looks:
         before = tuple(part.copy() for part in self._state())
         opened = rejected_in_row >= self._options[Option.INFLATE_AFTER]
         speed = float(self._options[Option.INITIAL_SPEED])
-        jump = speed if opened else 0.0
+        turn = within_s = 0.0
         if opened:
             self._open(speed, unheard_s)
         accepted = np.zeros(int(rows[-1, GROUP]) + 1)
@@ -214,16 +217,17 @@ class _Looks:
             self._restore(before)
             if opened:
                 self._open(speed, unheard_s)
-            self._open(manoeuvre, unheard_s)
+            within_s = engine.manoeuvre_s(*self._prior, rows, unheard_s, self._options)
+            self._allow(within_s)
             second = np.zeros_like(accepted)
             second_nis, second_used = self._update(rows, second)
             if second.sum() > accepted.sum():
                 nis, used, accepted = second_nis, second_used, second
-                jump = float(np.hypot(jump, manoeuvre))
+                turn = manoeuvre
             else:
                 self._set_state(first)
         if accepted.any():
-            self._note_jump(jump, unheard_s)
+            self._note_jump(speed if opened else 0.0, unheard_s, turn, within_s)
         else:
             self._restore(before)
         return nis, used, accepted
@@ -294,6 +298,10 @@ class Interacting(_Looks):
         for cov in self._covs:
             engine.open_velocity(cov, sd, unheard_s, self._options)
 
+    def _allow(self, within_s: float) -> None:
+        for cov in self._covs:
+            engine.allow_manoeuvre(cov, within_s, self._options)
+
     def copy(self) -> Interacting:
         twin = copy.copy(self)
         twin._restore(self._state())
@@ -338,9 +346,8 @@ class Reference(_Looks):
     def shake(self, accel_density: float) -> None:
         self._motion[Parameter.ACCEL] = accel_density
 
-    def _note_jump(self, sd: float, unheard_s: float) -> None:
-        self._motion[Parameter.JUMP_SPEED] = sd
-        self._motion[Parameter.JUMP_TIME] = unheard_s
+    def _note_jump(self, *steps: float) -> None:
+        engine.note_jump(self._motion, *steps)
 
     def _move(self, stamp_ns: int, bias: Array) -> None:
         dt = (stamp_ns - self.stamp_ns) * 1e-9
@@ -354,6 +361,9 @@ class Reference(_Looks):
 
     def _open(self, sd: float, unheard_s: float) -> None:
         engine.open_velocity(self.cov, sd, unheard_s, self._options)
+
+    def _allow(self, within_s: float) -> None:
+        engine.allow_manoeuvre(self.cov, within_s, self._options)
 
     def copy(self) -> Reference:
         twin = copy.copy(self)

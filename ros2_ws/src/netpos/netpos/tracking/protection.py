@@ -2,7 +2,7 @@
 it.
 
 The Gaussian part is exact (``protection_level``). What the covariance cannot know comes on top:
-an optimistic filter (``NisWindow``) and a manoeuvre not yet noticed (``unnoticed_shift``).
+an optimistic filter (``NisWindow``) and a manoeuvre not yet noticed (``manoeuvre_level``).
 """
 
 from __future__ import annotations
@@ -14,14 +14,19 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import chdtri
 
+from netpos.filters import ekf
 from netpos.filters.compile import kernel, leaf
-from netpos.filters.measurement import GATE_VARIANCE, innovation_row, innovation_variance
+from netpos.filters.fusion import workspace
+from netpos.filters.gate import accepted_rows
+from netpos.filters.manoeuvre import add_manoeuvre, unnoticed_s
 from netpos.messages.values import Array
+from netpos.tracking.engine import GATE, Option
 
 _ANGLES = 16
 _COS2 = np.cos(np.linspace(0.0, np.pi / 2, _ANGLES + 1)) ** 2
 _WEIGHT = np.append(np.append(0.5, np.ones(_ANGLES - 1)), 0.5) / _ANGLES
 _ITERATIONS = 20
+_NO_GATE = np.array([np.inf])
 RISK_MIN, RISK_MAX = 1e-15, 0.5
 
 
@@ -125,19 +130,36 @@ class NisWindow:
 
 
 @kernel
-def unnoticed_shift(mean: Array, cov: Array, rows: Array, height_m: float, gate: float) -> float:
-    """Largest distance [m] the device may have moved off the prediction mean (n,), cov (n, n)
-    while its measurements rows (m, ROW_WIDTH) still pass ``gate``, the threshold of the squared
-    Mahalanobis distance: what a manoeuvre does before it is noticed. inf where they leave a
-    direction open."""
-    xx = xy = yy = 0.0
-    h = np.empty(mean.size)
-    for i in range(rows.shape[0]):
-        innovation_row(rows[i], mean, height_m, h)
-        noise = rows[i, GATE_VARIANCE]
-        variance = innovation_variance(rows[i], mean, cov, height_m, noise, h)
-        xx += h[0] * h[0] / variance
-        xy += h[0] * h[1] / variance
-        yy += h[1] * h[1] / variance
-    least = (xx + yy) / 2.0 - math.hypot((xx - yy) / 2.0, xy)
-    return math.sqrt(gate / least) if least > 0.0 else math.inf
+def manoeuvre_level(
+    prior_mean: Array,
+    prior_cov: Array,
+    rows: Array,
+    accepted: Array,
+    unheard_s: float,
+    mean: Array,
+    options: Array,
+    risk: float,
+) -> float:
+    """Radius [m] round ``mean`` (n,) that a device leaves with probability ``risk`` if it is in a
+    manoeuvre nobody has noticed.
+
+    The accepted groups of ``rows`` (m, ROW_WIDTH) are applied once more to the prediction
+    ``prior_mean`` (n,), ``prior_cov`` (n, n), which allows for a manoeuvre in the time it goes
+    unnoticed: how far the two answers lie apart, and the level of the second (solution separation,
+    as receiver autonomous integrity monitoring has it). inf where there is no
+    gate, or a direction is open.
+    """
+    speed, height_m = options[Option.MANOEUVRE_SPEED], options[Option.HEIGHT]
+    x, P = prior_mean.copy(), prior_cov.copy()
+    gate, h = options[GATE + 2], np.empty(x.size)
+    _, longest_s = unnoticed_s(x, P, rows, height_m, gate, speed, h)
+    if math.isinf(longest_s):
+        return math.inf
+    add_manoeuvre(speed, max(unheard_s, longest_s), P)
+    used = rows[accepted_rows(rows, accepted)]
+    if used.shape[0] > 0:
+        work, taken = workspace(x.size, used.shape[0]), np.empty(accepted.size)
+        iterations = int(options[Option.ITERATIONS])
+        ekf.update(x, P, used, height_m, _NO_GATE, iterations, taken, work)
+    apart = math.hypot(x[0] - mean[0], x[1] - mean[1])
+    return float(apart + gaussian_radius(P[0, 0], P[0, 1], P[1, 1], risk))

@@ -227,7 +227,10 @@ class Sectors:
             self._means, self._spreads = before[0].copy(), before[1].copy()
             self._weights = before[2].copy()
             self._heirs = self._heirs.copy()
-            self._advance(stamp_ns, manoeuvre, unheard_s, bias)
+            probable = self._means[self._best], self._spreads[self._best]
+            within_s = engine.manoeuvre_s(*probable, rows, unheard_s, self._options)
+            for s in np.flatnonzero(self._weights > -math.inf).tolist():
+                engine.allow_manoeuvre(self._spreads[s], within_s, self._options)
             second = self._look(rows, at)
             if second[2][self._best].sum() > accepted[int(np.argmax(first[2]))].sum():
                 nis, used, accepted = second

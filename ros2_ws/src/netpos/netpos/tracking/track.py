@@ -21,6 +21,7 @@ from netpos.tracking import estimates, output
 from netpos.tracking.batch import Batch, Source, batch_of, mostly_accepted, velocity_inflation
 from netpos.tracking.blockage import Blockage
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.engine import GATE, is_sound
 from netpos.tracking.estimates import Estimate
 from netpos.tracking.fit import (
     observe,
@@ -34,10 +35,10 @@ from netpos.tracking.history import History, merge
 from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser, with_heading
 from netpos.tracking.memory import TrackMemory
-from netpos.tracking.models import gate_thresholds, heading_index, initial_extra_sd, pose_state
+from netpos.tracking.models import heading_index, initial_extra_sd, options_of, pose_state
 from netpos.tracking.networks.secondary import Secondary
 from netpos.tracking.phase_start import PhaseStart, corrections, with_sectors
-from netpos.tracking.protection import protection_level, unnoticed_shift
+from netpos.tracking.protection import manoeuvre_level, protection_level
 from netpos.tracking.report import Applied, TrackOutput, total, track_status
 from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sectors import Sectors
@@ -64,7 +65,8 @@ class Track:
         self._config = config
         self._rsus = rsus
         self._health = health or RsuHealth()
-        self._gate = gate_thresholds(config.gate_probability)
+        self._options = options_of(config)
+        self._gate = self._options[GATE:]
         self._extra_sd = initial_extra_sd(config)
         self._heading = heading_index(config)
         self._secondary = Secondary(vue_id, config) if config.network else None
@@ -248,6 +250,10 @@ class Track:
             )
         state.segment += corrections(estimate, state.rejected)
         state.has_clock = state.has_clock or (dof > 0 and batch.has_time)
+        if not is_sound(estimate.mean, estimate.cov):
+            state.rejected["diverged"] += 1
+            self._forget()
+            return Applied(stamp_ns)
         self._note_fit(stamp_ns, batch, accepted, nis, dof)
         refused = accepted.count(0.0)
         if refused:
@@ -292,7 +298,15 @@ class Track:
         assert state.estimate is not None
         prior, height_m = state.estimate.prior, self._config.device_height_m
         if self._config.manoeuvre_speed_sd_mps > 0.0:
-            state.unnoticed_m = unnoticed_shift(*prior, batch.rows, height_m, self._gate[2])
+            state.unnoticed_m = manoeuvre_level(
+                *prior,
+                batch.rows,
+                np.array(accepted),
+                (stamp_ns - state.last_accepted_ns) * 1e-9,
+                state.estimate.mean,
+                self._options,
+                self._config.integrity_risk,
+            )
         if not self._config.isolate_rsus:
             return
         fits = row_fits(*prior, batch.rows, height_m)

@@ -202,15 +202,18 @@ def test_add_noise_adds_to_what_is_there(kind: ProcessNoise) -> None:
 
 
 @pytest.mark.parametrize("kind", list(ProcessNoise))
-def test_a_velocity_step_allowed_for(kind: ProcessNoise) -> None:
+@pytest.mark.parametrize("spread_m", [0.0, 0.4])
+def test_a_velocity_step_allowed_for(kind: ProcessNoise, spread_m: float) -> None:
     """A step of velocity of 3 m/s sd, 0.2 s ago: 0.6 m of position go with it, and nothing of the
     clock or the biases."""
     plain = process_noise(kind, 0.4, BIAS_SD, BIAS_TAU, **ONES)
-    Q = process_noise(kind, 0.4, BIAS_SD, BIAS_TAU, jump_speed=3.0, jump_time=0.2, **ONES)
+    jump = {"jump_speed": 3.0, "jump_time": 0.2, "jump_spread": spread_m}
+    Q = process_noise(kind, 0.4, BIAS_SD, BIAS_TAU, **jump, **ONES)
     G = np.zeros((8, 2))
     G[0, 0] = G[1, 1] = 0.6
     G[2, 0] = G[3, 1] = 3.0
-    np.testing.assert_allclose(Q - plain, G @ G.T, rtol=1e-12, atol=1e-14)
+    expected = G @ G.T + spread_m**2 * np.diag([1.0, 1.0, 0, 0, 0, 0, 0, 0])
+    np.testing.assert_allclose(Q - plain, expected, rtol=1e-12, atol=1e-14)
 
 
 def random_spd(rng: np.random.Generator, n: int) -> Array:

@@ -8,8 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 from netpos.filters import ekf, srukf
-from netpos.filters.measurement import GROUP, ROW_WIDTH, Kind
-from netpos.filters.motion import NO_BIAS, SPEED_OF_LIGHT_MPS
+from netpos.filters.measurement import (
+    GATE_VARIANCE,
+    GROUP,
+    ROW_WIDTH,
+    Kind,
+    curvature_variance,
+    linearise,
+)
+from netpos.filters.motion import NO_BIAS, SPEED_OF_LIGHT_MPS, noise
 from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, InitialPose, RsuInfo, RsuMeasurement
 from netpos.scenario import Simulation, load_scenario
@@ -53,6 +60,23 @@ def opened(cov: Array, sd: float, unheard_s: float) -> Array:
     return out
 
 
+def turned(mean: Array, cov: Array, rows: Array, unheard_s: float, options: Array) -> Array:
+    """The mean over all times at which a manoeuvre may have begun: since the last accepted
+    measurement, or twice as long as one goes unnoticed on average over its directions."""
+    _, H = linearise(rows, mean, 0.0)
+    S = np.einsum("ia,ab,ib->i", H, cov, H) + rows[:, GATE_VARIANCE]
+    S += [curvature_variance(row, mean, cov, 0.0) for row in rows]
+    information = (H[:, :2].T / S) @ H[:, :2]
+    sd = options[Option.MANOEUVRE_SPEED]
+    noticed_s = math.sqrt(options[GATE + 2] / (np.trace(information) / 2.0)) / sd
+    within_s = max(unheard_s, 2.0 * noticed_s)
+    if sd**2 <= np.trace(cov[2:4, 2:4]) / 2.0:  # no manoeuvre
+        within_s = unheard_s
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    times = within_s * (nodes + 1.0) / 2.0
+    return sum(w / 2.0 * opened(cov, sd, s) for s, w in zip(times, weights, strict=True))
+
+
 def look(
     mean: Array, cov: Array, rows: Array, options: Array
 ) -> tuple[Array, Array, float, int, Array]:
@@ -84,7 +108,8 @@ def plain_step(
     best = look(prior, P, rows, options)
     sd = options[Option.MANOEUVRE_SPEED]
     if sd > 0.0 and not best[4].all():
-        second = look(prior, opened(P, sd, unheard_s), rows, options)
+        wide = P + turned(prior, prior_cov, rows, unheard_s, options) - prior_cov
+        second = look(prior, wide, rows, options)
         if second[4].sum() > best[4].sum():
             best = second
     if not best[4].any():
@@ -199,7 +224,7 @@ def run(config: TrackerConfig, mean: Array, cov: Array, inputs: Any) -> tuple[in
     return done, out
 
 
-@pytest.mark.parametrize("change", [{}, {"manoeuvre_speed_sd_mps": 20.0}, {"filter": "ekf"}])
+@pytest.mark.parametrize("change", [{}, {"manoeuvre_speed_sd_mps": 40.0}, {"filter": "ekf"}])
 def test_a_run_is_its_steps(change: dict[str, Any]) -> None:
     config = TrackerConfig(**change)
     motion, options = motions_of(config)[0], options_of(config)
@@ -338,6 +363,64 @@ def test_opening_a_factor_is_opening_its_covariance() -> None:
         np.testing.assert_allclose(plain, opened(cov, sd, unheard_s), rtol=1e-14)
         np.testing.assert_allclose(L @ L.T, plain, rtol=1e-12, atol=1e-13)
         assert (np.triu(L, 1) == 0.0).all()
+
+
+@pytest.mark.parametrize("within_s", [0.0, 0.1, 4.0])
+def test_a_manoeuvre_at_any_time(within_s: float) -> None:
+    """The second moments of a step at a uniform time, for covariance and factor."""
+    _, cov = start()
+    root = options_of(TrackerConfig(filter="srukf", manoeuvre_speed_sd_mps=3.0))
+    plain = options_of(TrackerConfig(manoeuvre_speed_sd_mps=3.0))
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    steps = [opened(cov, 3.0, within_s * (x + 1.0) / 2.0) for x in nodes]
+    expected = sum(w / 2.0 * step for w, step in zip(weights, steps, strict=True))
+    L, P = srukf.factor(cov), cov.copy()
+    engine.allow_manoeuvre(P, within_s, plain)
+    engine.allow_manoeuvre(L, within_s, root)
+    np.testing.assert_allclose(P, expected, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(L @ L.T, expected, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize(("opened_sd", "turn"), [(0.0, 0.0), (5.0, 0.0), (0.0, 3.0), (5.0, 3.0)])
+def test_a_smoother_is_told_of_both_steps(opened_sd: float, turn: float) -> None:
+    """What ``noise`` adds from the note is what the looks added."""
+    motion = motions_of(TrackerConfig())[0]
+    without, noted = np.zeros((6, 6)), np.zeros((6, 6))
+    noise(np.zeros(6), 0.1, motion, NO_BIAS, without)
+    engine.note_jump(motion, opened_sd, 1.3, turn, 0.7)
+    noise(np.zeros(6), 0.1, motion, NO_BIAS, noted)
+    expected = opened(without, opened_sd, 1.3)
+    if turn > 0.0:
+        options = options_of(TrackerConfig(manoeuvre_speed_sd_mps=turn))
+        engine.allow_manoeuvre(expected, 0.7, options)
+    np.testing.assert_allclose(noted, expected, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("change", "sound"),
+    [
+        ({}, True),
+        ({"mean": (0, 0.999e9)}, True),
+        ({"mean": (0, -1.001e9)}, False),
+        ({"mean": (1, math.nan)}, False),
+        ({"mean": (2, 2.99e8)}, True),
+        ({"mean": (2, 3.0e8)}, False),
+        ({"cov": (0, 1, 0.999999)}, True),
+        ({"cov": (0, 1, 1.0)}, False),
+        ({"cov": (2, 3, -1.0)}, False),
+        ({"cov": (4, 5, 1.0)}, True),
+    ],
+)
+def test_what_can_be_a_device(change: dict[str, Any], sound: bool) -> None:
+    """A clock may be known exactly; a position and a velocity may not."""
+    mean, cov = np.zeros(6), np.eye(6)
+    if "mean" in change:
+        at, value = change["mean"]
+        mean[at] = value
+    if "cov" in change:
+        i, j, value = change["cov"]
+        cov[i, j] = cov[j, i] = value
+    assert engine.is_sound(mean, cov) is sound
 
 
 def test_what_is_carried_and_the_covariance() -> None:

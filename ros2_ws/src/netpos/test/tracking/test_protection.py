@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from netpos.filters.manoeuvre import unnoticed_s
 from netpos.filters.measurement import linearise
-from netpos.filters.rows import rsu_axes, rsu_rows
+from netpos.filters.rows import linear_rows, rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
+from netpos.tracking import TrackerConfig
+from netpos.tracking.models import options_of
 from netpos.tracking.protection import (
     RISK_MIN,
     NisWindow,
+    manoeuvre_level,
     protection_level,
-    unnoticed_shift,
 )
 from scipy import integrate, optimize, stats
 
@@ -187,21 +190,66 @@ def azimuth_row(x: float, y: float, sd_rad: float, mean: Array) -> Array:
     return rsu_rows(m, info, rsu_axes(info), 0)
 
 
-def test_unnoticed_shift_is_where_the_gate_begins_to_refuse() -> None:
+def test_a_manoeuvre_is_noticed_where_the_gate_begins_to_refuse() -> None:
     """Two bearings at right angles, a prior without width: 1 degree at 100 m and at 40 m. The
-    weaker bearing alone decides, and a device moved that far across it just passes."""
+    weaker bearing alone sees a device that moves across it, and lets it pass until just then."""
     mean, cov, sd, gate = np.array([100.0, 0, 0, 0, 0, 0]), np.zeros((6, 6)), math.radians(1), 9.0
     rows = np.vstack([azimuth_row(0.0, 0.0, sd, mean), azimuth_row(100.0, 40.0, sd, mean)])
-    shift = unnoticed_shift(mean, cov, rows, 0.0, gate)
-    assert shift == pytest.approx(3.0 * sd * 100.0, rel=1e-9)
+    h, speed = np.empty(6), 2.5
+    typical, longest = unnoticed_s(mean, cov, rows, 0.0, gate, speed, h)
+    assert longest == pytest.approx(3.0 * sd * 100.0 / speed, rel=1e-9)
     moved = mean.copy()
-    moved[1] += shift
+    moved[1] += longest * speed
     assert ((linearise(rows, moved, 0.0)[0] / sd) ** 2).sum() == pytest.approx(gate, rel=5e-3)
-    wider = unnoticed_shift(mean, np.eye(6), rows, 0.0, gate)
-    assert wider > shift
+    # in no known direction: gate = speed^2 t^2 (1/a^2 + 1/b^2) / 2, and the filter follows
+    a, b = 100.0 * sd, 40.0 * sd
+    expected = 2.0 * math.sqrt(gate / ((1 / a**2 + 1 / b**2) / 2)) / speed
+    assert typical == pytest.approx(expected, rel=1e-9)
+    wider = unnoticed_s(mean, np.eye(6), rows, 0.0, gate, speed, h)
+    assert wider[0] > typical
+    assert wider[1] > longest
 
 
-def test_unnoticed_shift_is_unbounded_along_a_single_bearing() -> None:
-    mean = np.array([100.0, 0, 0, 0, 0, 0])
-    rows = azimuth_row(0.0, 0.0, 0.01, mean)
-    assert math.isinf(unnoticed_shift(mean, np.eye(6), rows, 0.0, 9.0))
+def options(gate_probability: float = 0.9999, speed: float = 4.0) -> Array:
+    return options_of(
+        TrackerConfig(gate_probability=gate_probability, manoeuvre_speed_sd_mps=speed)
+    )
+
+
+@pytest.mark.parametrize("unheard_s", [0.1, 5.0])
+def test_level_of_a_manoeuvre_is_a_second_answer_and_how_far_it_is(unheard_s: float) -> None:
+    """Two position fixes, the second refused: the linear filter in NumPy."""
+    prior = np.array([10.0, 20.0, 3.0, -1.0, 0.0, 0.0])
+    cov = np.diag([0.04, 0.09, 0.2, 0.3, 1.0, 1.0])
+    R, fix = np.diag([0.25, 0.16]), np.array([10.8, 19.5])
+    first = linear_rows(fix, R, np.eye(2, 6), 0)
+    second = linear_rows(fix + 100.0, R, np.eye(2, 6), 1)
+    rows, accepted, mean = np.vstack([first, second]), np.array([1.0, 0.0]), prior + 0.1
+    gate = stats.chi2.ppf(0.9999, 2)
+    information = np.diag([2.0 / (0.04 + 0.25), 2.0 / (0.09 + 0.16)])
+    within_s = max(unheard_s, math.sqrt(gate / information.diagonal().min()) / 4.0)
+    wide = cov.copy()
+    for p in (0, 1):
+        wide[p, p] += 16.0 * within_s**2 / 3.0
+        wide[p, p + 2] += 16.0 * within_s / 2.0
+        wide[p + 2, p] += 16.0 * within_s / 2.0
+        wide[p + 2, p + 2] += 16.0
+    K = wide[:, :2] @ np.linalg.inv(wide[:2, :2] + R)
+    x, P = prior + K @ (fix - prior[:2]), wide - K @ wide[:2]
+    expected = np.linalg.norm(x[:2] - mean[:2]) + protection_level(P[:2, :2], 1e-4)
+    level = manoeuvre_level(prior, cov, rows, accepted, unheard_s, mean, options(), 1e-4)
+    assert level == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_manoeuvre_nobody_could_notice() -> None:
+    """Along a single bearing, or without a gate."""
+    mean, accepted = np.array([100.0, 0, 0, 0, 0, 0]), np.ones(1)
+    row = azimuth_row(0.0, 0.0, 0.01, mean)
+    level = manoeuvre_level(mean, np.eye(6), row, accepted, 0.1, mean, options(), 1e-4)
+    assert math.isinf(level)
+    fix = linear_rows(mean[:2], np.eye(2), np.eye(2, 6), 0)
+    for probability, finite in ((1.0, False), (0.9999, True)):
+        level = manoeuvre_level(
+            mean, np.eye(6), fix, accepted, 0.1, mean, options(probability), 1e-4
+        )
+        assert math.isfinite(level) is finite

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from netpos.evaluation.bounds import bound_covariances
 from netpos.evaluation.metrics import NS
+from netpos.evaluation.reproduce.integrity import protection_levels
 from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
 from netpos.filters.motion import N_CORE, NO_BIAS, SPEED_OF_LIGHT_MPS
 from netpos.messages.values import Array, ImuSample
@@ -43,7 +44,7 @@ class Track:
     """One run: N epochs with at least one measurement, up to the loss of the track if ``lost``.
 
     stamps_ns (N,); truth and mean (N, n) in the filter's units; cov and bound (N, n, n); nis, dof
-    (N,)
+    (N,); level (N,) the protection level [m]
     """
 
     stamps_ns: Ints
@@ -53,6 +54,7 @@ class Track:
     bound: Array
     nis: Array
     dof: Array
+    level: Array
     lost: bool
 
     @property
@@ -126,7 +128,19 @@ class Setup:
         truth = _truth(simulation.beacons(VUE), heard, len(prior))
         height_m = self.config.device_height_m
         bound = bound_covariances(*epochs[:3], truth, prior, height_m, motions, bias)
-        means, covs, nis, dof = (array[:done] for array in filled)
+        means, covs, nis, dof, taken = (array[:done] for array in filled)
+        level = protection_levels(
+            *epochs[:3],
+            means,
+            covs,
+            nis,
+            dof,
+            taken,
+            motions,
+            bias,
+            self._options,
+            self.config.integrity_risk,
+        )
         return Track(
             stamps_ns=epochs.stamps_ns[:done],
             truth=truth[:done],
@@ -135,20 +149,19 @@ class Setup:
             bound=bound[:done],
             nis=nis,
             dof=dof,
+            level=level,
             lost=done < heard.size,
         )
 
     def _compiled(
         self, epochs: Epochs, mean: Array, cov: Array
-    ) -> tuple[int, Array, Array, Array, Array]:
-        """Epochs done, means, covariances, NIS, degrees of freedom: all epochs in one kernel."""
+    ) -> tuple[int, Array, Array, Array, Array, Array]:
+        """Epochs done, means, covariances, NIS, degrees of freedom, accepted groups: all epochs in
+        one kernel."""
         mean, cov = self._grown(mean, cov, epochs)
         filled = _room(epochs.stamps_ns.size, mean.size)
-        taken = np.empty(epochs.stamps_ns.size)
         motion = self._motions[0]
-        done = run_epochs(
-            *epochs[:3], mean, cov, motion, epochs.bias, self._options, *filled, taken
-        )
+        done = run_epochs(*epochs[:3], mean, cov, motion, epochs.bias, self._options, *filled)
         return done, *filled
 
     def _grown(self, mean: Array, cov: Array, epochs: Epochs) -> tuple[Array, Array]:
@@ -157,7 +170,7 @@ class Setup:
 
     def _driven(
         self, epochs: Epochs, mean: Array, cov: Array, samples: list[ImuSample]
-    ) -> tuple[int, Array, Array, Array, Array, Array]:
+    ) -> tuple[int, Array, Array, Array, Array, Array, Array]:
         """As ``_compiled``, epoch by epoch with the IMU between them; also the motions
         (N, Parameter) with its increments. Without biases."""
         imu = ImuBuffer()
@@ -165,7 +178,7 @@ class Setup:
             imu.add(sample)
         count, config = epochs.stamps_ns.size, self.config
         filled = _room(count, mean.size + self._extra_sd.size)
-        means, covs, nis, dof = filled
+        means, covs, nis, dof, groups = filled
         motions = np.tile(self._motions[0], (count, 1))
         heard_ns = int(epochs.stamps_ns[0])
         estimate = estimates.start(config, heard_ns, mean, cov)
@@ -177,6 +190,7 @@ class Setup:
             unheard_s = (stamp - heard_ns) / NS
             nis[k], dof[k], taken = estimate.step(stamp, unheard_s, rejected, rows, NO_BIAS)
             means[k], covs[k], motions[k] = estimate.mean, estimate.cov, estimate.motion
+            groups[k] = taken.sum()
             rejected = 0 if 2 * taken.sum() >= taken.size else rejected + 1
             heard_ns = stamp if dof[k] else heard_ns
             if rejected >= config.max_rejected_epochs:
@@ -184,9 +198,10 @@ class Setup:
         return count, *filled, motions
 
 
-def _room(epochs: int, n: int) -> tuple[Array, Array, Array, Array]:
-    """Means, covariances, NIS and degrees of freedom, to be filled."""
-    return np.empty((epochs, n)), np.empty((epochs, n, n)), np.empty(epochs), np.empty(epochs)
+def _room(epochs: int, n: int) -> tuple[Array, Array, Array, Array, Array]:
+    """Means, covariances, NIS, degrees of freedom and accepted groups, to be filled."""
+    figures = np.empty((3, epochs))
+    return np.empty((epochs, n)), np.empty((epochs, n, n)), figures[0], figures[1], figures[2]
 
 
 def _truth(beacons: Beacons, heard: Ints, n: int) -> Array:

@@ -136,6 +136,10 @@ def _common(summary: Summary) -> Iterator[Row]:
     yield required(f"{name}: NEES, mean (expected 2)", "1", nees.mean, nees.consistent)
     yield shown(f"{name}: NEES, lower 95 % bound", "1", nees.bounds[0])
     yield shown(f"{name}: NEES, upper 95 % bound", "1", nees.bounds[1])
+    share, risk = summary.exceeded, setup_of(summary.experiment).config.integrity_risk
+    label = f"{name}: errors above the protection level (promised {risk:g})"
+    yield required(label, "1", share, share <= risk)
+    yield shown(f"{name}: protection level, mean", "m", summary.level_m)
     yield shown(f"{name}: posterior Cramér-Rao bound of the RMSE", "m", summary.bound_rmse_m)
 
 

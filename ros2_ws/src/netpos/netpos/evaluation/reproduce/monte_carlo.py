@@ -19,6 +19,7 @@ from netpos.messages.values import Array
 Ints = npt.NDArray[np.int64]
 
 DIVERGED_M = 5.0
+LEVEL_MAX_M = 1000.0  # counted of a protection level: where a direction is open it has no end
 BIN_M = 0.002  # of the histogram of errors
 BINS = 10_000
 
@@ -39,6 +40,8 @@ class Tally:
     nees_n_eff: float
     nis: float
     dof: float
+    exceeded: int
+    level: float
     bound2: float
     rate_hz: float
     ready_s: float | None
@@ -101,6 +104,8 @@ def tally(track: Track, position_sd_max_m: float, histogram: Ints, skip: int) ->
         nees_n_eff=effective_size(nees) if nees.size else 0.0,
         nis=float(track.nis[skip:].sum()),
         dof=float(track.dof[skip:].sum()),
+        exceeded=int((track.error_m > track.level)[skip:].sum()),
+        level=float(np.minimum(track.level, LEVEL_MAX_M)[skip:].sum()),
         bound2=bound2,
         rate_hz=float((elapsed.size - 1) / elapsed[-1]),
         ready_s=float(elapsed[ready[0]]) if ready.size else None,
@@ -147,7 +152,8 @@ class Summary:
     """Figures over all runs of an experiment.
 
     rmse_m over all scored estimates, mean_error_m what fokin2020:eq.34 calls RMSE; clock_sd_ns
-    about the mean; nees of the position (2 degrees of freedom); bound_rmse_m the posterior
+    about the mean; nees of the position (2 degrees of freedom); exceeded: share of estimates whose
+    error is above their protection level, the mean of which is level_m; bound_rmse_m the posterior
     Cramér-Rao bound of rmse_m; lost: runs that ended with a lost track; diverged: these, and runs
     with an error above 5 m; rate_hz and ready_s of the worst run, ready_s None where a run never
     got ready; error2 (runs, N) m^2 of all estimates for experiments with one route, NaN after a
@@ -165,6 +171,8 @@ class Summary:
     heading_rmse_deg: float | None
     nees: MeanTest
     nis_over_dof: float | None
+    exceeded: float
+    level_m: float
     bound_rmse_m: float
     diverged: int
     lost: int
@@ -228,6 +236,8 @@ class Summary:
                 bounds=chi2_mean_bounds(2, n_eff),
                 n_eff=n_eff,
             ),
+            exceeded=sum(t.exceeded for t in tallies) / n,
+            level_m=sum(t.level for t in tallies) / n,
             nis_over_dof=sum(t.nis for t in tallies) / dof if dof else None,
             bound_rmse_m=float(np.sqrt(sum(t.bound2 for t in tallies) / n)),
             diverged=sum(t.lost or t.error_max > DIVERGED_M for t in tallies),

@@ -71,7 +71,8 @@ class Secondary:
         mean, cov = estimate.prior[0].copy(), estimate.prior[1].copy()
         share = np.zeros_like(cov) if own is None else own.at(estimate, bias)
         motion = estimate.motion
-        add_jump(motion[Parameter.JUMP_SPEED], motion[Parameter.JUMP_TIME], cov)
+        jump = Parameter.JUMP_SPEED, Parameter.JUMP_TIME, Parameter.JUMP_SPREAD
+        add_jump(*(motion[part] for part in jump), cov)
         floor, height_m = self._options[Option.POSITION_GAIN : GATE], self._config.device_height_m
         accepted = np.zeros(len(rows))
         kf.update_shared(mean, cov, rows, height_m, self._options[GATE:], accepted, floor, share)

@@ -38,6 +38,7 @@ def _track(seed: int, epochs: int) -> Track:
         bound=np.tile(np.diag([0.3, 0.1, 1, 1, 1, 1]) ** 2, (epochs, 1, 1)),
         nis=rng.chisquare(4, epochs),
         dof=np.full(epochs, 4.0),
+        level=np.full(epochs, 0.8),
         lost=False,
     )
 
@@ -69,6 +70,9 @@ def test_figures_of_two_runs() -> None:
     assert ours.nis_over_dof == pytest.approx(
         np.concatenate([t.nis[SKIP:] for t in tracks]).mean() / 4
     )
+    assert 0.0 < ours.exceeded < 1.0
+    assert ours.exceeded == pytest.approx(np.mean(distance > 0.8))
+    assert ours.level_m == pytest.approx(0.8)
     assert ours.rate_hz == pytest.approx(4.0)
     assert (ours.diverged, ours.lost) == (0, 0)
 

@@ -1,0 +1,50 @@
+"""A manoeuvre nobody has noticed yet: how long it may have been going on, and what it does.
+
+A device that turns leaves its prediction slowly at first. Until a measurement fails its gate the
+filter follows in part, in the directions that are measured, and goes on straight in the others.
+The step of the velocity lies anywhere in the time in which it stays unnoticed, not in the last
+interval.
+"""
+
+from __future__ import annotations
+
+import math
+
+from netpos.filters.compile import leaf
+from netpos.filters.measurement import GATE_VARIANCE, innovation_row, innovation_variance
+from netpos.filters.motion import add_jump
+from netpos.messages.values import Array
+
+# The filter follows a manoeuvre as long as its gate passes it, so that it is noticed later.
+_FOLLOWED = 2.0
+
+
+@leaf
+def unnoticed_s(
+    mean: Array, cov: Array, rows: Array, height_m: float, gate: float, speed: float, h: Array
+) -> tuple[float, float]:
+    """Time [s] until a velocity step of ``speed`` [m/s] takes ``rows`` (m, ROW_WIDTH) as far off
+    the prediction mean (n,), cov (n, n) as ``gate``, a squared Mahalanobis distance, allows: for
+    a step in any direction, and for one in the direction they know least (inf: not at all).
+
+    h : (n,) scratch
+    """
+    xx = xy = yy = 0.0
+    for i in range(rows.shape[0]):
+        innovation_row(rows[i], mean, height_m, h)
+        noise = rows[i, GATE_VARIANCE]
+        variance = innovation_variance(rows[i], mean, cov, height_m, noise, h)
+        xx += h[0] * h[0] / variance
+        xy += h[0] * h[1] / variance
+        yy += h[1] * h[1] / variance
+    least = (xx + yy) / 2.0 - math.hypot((xx - yy) / 2.0, xy)
+    typical = math.sqrt(2.0 * gate / (xx + yy)) / speed if xx + yy > 0.0 else math.inf
+    longest = math.sqrt(gate / least) / speed if least > 1e-12 * (xx + yy) else math.inf
+    return _FOLLOWED * typical, longest
+
+
+@leaf
+def add_manoeuvre(speed: float, within_s: float, cov: Array) -> None:
+    """Add, in place, a velocity step of sd ``speed`` [m/s] per axis at any time of the last
+    ``within_s`` seconds, and the position it led to."""
+    add_jump(speed, within_s / 2.0, speed * within_s / math.sqrt(12.0), cov)

@@ -1,0 +1,43 @@
+"""The levels of a compiled run are those its tracker reports."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from netpos.evaluation.reproduce.experiment import VUE, Experiment, Setup
+from netpos.messages.values import Beacon, InitialPose
+from netpos.tracking import Tracker
+
+SEED = 5003
+
+
+@pytest.mark.parametrize("speed", [5.9, 0.0])
+def test_levels_are_those_of_the_tracker(speed: float) -> None:
+    """Past a turn of METIS; without manoeuvres the level is that of the covariance."""
+    experiment = Experiment(
+        name="past a turn",
+        scenario="metis_madrid",
+        changes=(("devices.0.beacon_interval_s", 0.1673), ("max_duration_s", 40.0)),
+        tracker=(("manoeuvre_speed_sd_mps", speed), ("isolate_rsus", False)),
+    )
+    setup = Setup(experiment)
+    track = setup.run(SEED)
+    simulation, tracker = setup.simulation.with_seed(SEED), Tracker(setup.config)
+    for info in simulation.rsus:
+        tracker.add_rsu(info)
+    outputs = []
+    for event in simulation.events():
+        items = [event] if isinstance(event, InitialPose) else []
+        if isinstance(event, Beacon) and event.vue_id == VUE:
+            items = list(simulation.measure(event))
+        for item in items:
+            assert tracker.add(item) is None
+        outputs += tracker.process()
+    outputs += tracker.flush()
+    told = {o.status.stamp_ns: o.status.protection_level_m for o in outputs}
+    reported = np.array([told[stamp] for stamp in track.stamps_ns.tolist()])
+    assert len(track.level) > 200
+    # the first epoch has no prediction; a group refused alone is not known to the run
+    apart = np.abs(track.level - reported) > 1e-9 * reported
+    assert apart[1:].sum() <= 2
+    assert (track.level[1:] > 0.0).all()
