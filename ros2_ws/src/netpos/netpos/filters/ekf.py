@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from netpos.filters.bearing import fuse_around, on_top
-from netpos.filters.compile import kernel, leaf
+from netpos.filters.compile import inlined, kernel, leaf, local_array
 from netpos.filters.fit import misfit
 from netpos.filters.fusion import (
     W_COV,
@@ -21,6 +21,7 @@ from netpos.filters.fusion import (
     fuse_by_factor,
     group_nis,
     is_definite,
+    keeps_digits,
     workspace,
 )
 from netpos.filters.gate import leave_odd_out
@@ -39,7 +40,14 @@ from netpos.filters.measurement import (
     curvature_variance,
     innovation_row,
 )
-from netpos.filters.motion import Model, Parameter, add_noise, propagate, transition
+from netpos.filters.motion import (
+    N_CORE,
+    Model,
+    Parameter,
+    add_noise,
+    propagate,
+    transition,
+)
 from netpos.messages.values import Array
 
 __all__ = [
@@ -63,40 +71,63 @@ def predict(mean: Array, cov: Array, dt: float, motion: Array, bias: Array) -> N
     """
     if dt <= 0.0:
         return
-    if int(motion[Parameter.MODEL]) == Model.CONSTANT_VELOCITY and motion[Parameter.EXTRAS] == 0.0:
-        _predict_constant_velocity(cov, dt, motion, bias)
-    else:
+    if int(motion[Parameter.MODEL]) != Model.CONSTANT_VELOCITY or motion[Parameter.EXTRAS] > 0.0:
         _predict_dense(mean, cov, dt, motion, bias)
+    elif mean.size == N_CORE:
+        _predict_core(cov, dt)
+    else:
+        _predict_biased(cov, dt, bias)
     propagate(mean, dt, motion, bias)
     add_noise(mean, dt, motion, bias, cov)
-    for i in range(mean.size):
-        for j in range(i):
-            cov[i, j] = cov[j, i] = (cov[i, j] + cov[j, i]) / 2.0
 
 
 @kernel
 def _predict_dense(mean: Array, cov: Array, dt: float, motion: Array, bias: Array) -> None:
     F = np.empty_like(cov)
     transition(mean, dt, motion, bias, F)
-    cov[:] = F @ cov @ F.T
+    moved = F @ cov @ F.T
+    cov[:] = (moved + moved.T) / 2.0
+
+
+@inlined
+def _shear(n: int, P: Array, dt: float) -> None:
+    """F P F' of a constant velocity by the few row and column operations F stands for."""
+    for p, v in ((0, 2), (1, 3), (4, 5)):
+        for j in range(n):
+            P[p, j] += dt * P[v, j]
+        for i in range(n):
+            P[i, p] += dt * P[i, v]
 
 
 @leaf
-def _predict_constant_velocity(cov: Array, dt: float, motion: Array, bias: Array) -> None:
-    """F P F' by the few row and column operations F stands for."""
+def _predict_core(cov: Array, dt: float) -> None:
+    """F P F' of a constant velocity without biases."""
+    n = N_CORE
+    P = local_array(N_CORE, N_CORE)
+    for a in range(n):
+        for b in range(n):
+            P[a, b] = cov[a, b]
+    _shear(n, P, dt)
+    for a in range(n):
+        for b in range(a + 1):
+            cov[a, b] = cov[b, a] = (P[a, b] + P[b, a]) / 2.0
+
+
+@leaf
+def _predict_biased(cov: Array, dt: float, bias: Array) -> None:
+    """F P F' of a constant velocity with biases."""
     n = cov.shape[0]
-    for p, v in ((0, 2), (1, 3), (4, 5)):
-        for j in range(n):
-            cov[p, j] += dt * cov[v, j]
-        for i in range(n):
-            cov[i, p] += dt * cov[i, v]
+    _shear(n, cov, dt)
     for b in range(bias.shape[1]):
         decay = math.exp(-dt / bias[1, b])
-        k = 6 + b
+        k = N_CORE + b
         for j in range(n):
             cov[k, j] *= decay
         for i in range(n):
             cov[i, k] *= decay
+    for a in range(n):
+        for b in range(a):
+            cov[a, b] = cov[b, a] = (cov[a, b] + cov[b, a]) / 2.0
 
 
 @leaf
@@ -173,7 +204,7 @@ def _least_misfit(
     return float(misfit(mean, cov, group, variance, height_m, x))
 
 
-@leaf
+@inlined
 def gate(
     mean: Array,
     cov: Array,
@@ -283,7 +314,7 @@ def _fuse_used(mean: Array, cov: Array, rows: Array, work: Array) -> float:
     distance = fuse(mean, cov, work[W_INNOVATION], H, work[W_VARIANCE], work[W_USE], work)
     if not coloured:
         nis = distance
-    if not is_definite(cov, work):
+    if not keeps_digits(cov, work):
         fuse_by_factor(mean, cov, rows.shape[0], work)
     return nis
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
-from netpos.filters.compile import kernel, leaf
+from netpos.filters.compile import inlined, kernel, leaf, local_array
 from netpos.filters.factor import factor
 from netpos.filters.motion import N_CORE
 from netpos.messages.values import Array
@@ -26,6 +24,9 @@ from netpos.messages.values import Array
     W_PRIOR,
     W_COV,
 ) = range(9)
+# A pivot of the posterior below this share of the prior's variance has lost its digits: the result
+# may be off by more than 1e-5 sd.
+_ROUNDING = 1e-11
 
 
 @kernel
@@ -34,60 +35,94 @@ def workspace(n: int, m: int) -> Array:
     return np.zeros((W_COV + 2 * n + 2 * m, max(n, m)))
 
 
-def _fuse_for(states: int) -> Callable[..., Any]:
-    """``fuse`` for a fixed number of states, known to the compiler; 0: any number."""
-
-    @leaf
-    def fuse_rows(
-        mean: Array,
-        cov: Array,
-        innovation: Array,
-        H: Array,
-        variance: Array,
-        use: Array,
-        work: Array,
-    ) -> float:
-        n = states if states > 0 else mean.size
-        step, Ph, K = work[W_STEP], work[W_PH], work[W_GAIN]
+@inlined
+def _project(
+    n: int, P: Array, h: Array, residual: float, step: Array, Ph: Array
+) -> tuple[float, float]:
+    """P h to ``Ph`` (n,); returns h P h' and what the rows before have left of ``residual``."""
+    if n == N_CORE and h[2] == 0.0 and h[3] == 0.0 and h[5] == 0.0:  # position and clock only
         for a in range(n):
-            step[a] = 0.0
-        distance = 0.0
-        for i in range(H.shape[0]):
-            if use[i] == 0.0:
-                continue
-            h, r = H[i], variance[i]
-            hPh, residual = 0.0, innovation[i]
+            Ph[a] = P[0, a] * h[0] + P[1, a] * h[1] + P[4, a] * h[4]
+        hPh = h[0] * Ph[0] + h[1] * Ph[1] + h[4] * Ph[4]
+        return hPh, residual - h[0] * step[0] - h[1] * step[1] - h[4] * step[4]
+    for a in range(n):
+        Ph[a] = 0.0
+    for b in range(n):
+        if h[b] != 0.0:
             for a in range(n):
-                row, total = cov[a], 0.0
-                for b in range(n):
-                    total += row[b] * h[b]
-                Ph[a] = total
-                hPh += h[a] * total
-                residual -= h[a] * step[a]
-            s = hPh + r
-            distance += residual * residual / s
-            for a in range(n):
-                K[a] = Ph[a] / s
-                step[a] += K[a] * residual
-            for a in range(n):
-                left = Ph[a] - K[a] * hPh - r * K[a]  # zero but for rounding: Joseph's term
-                row = cov[a]
-                for b in range(a, n):
-                    value = row[b] - K[a] * Ph[b] - left * K[b]
-                    row[b] = value
-                    cov[b, a] = value
+                Ph[a] += P[b, a] * h[b]
+            residual -= h[b] * step[b]
+    hPh = 0.0
+    for a in range(n):
+        hPh += h[a] * Ph[a]
+    return hPh, residual
+
+
+@inlined
+def _fuse_rows(
+    n: int,
+    mean: Array,
+    P: Array,
+    innovation: Array,
+    H: Array,
+    variance: Array,
+    use: Array,
+    step: Array,
+    Ph: Array,
+    K: Array,
+) -> float:
+    """``fuse`` on P (n, n), with vectors ``step``, ``Ph`` and ``K`` (n,) to work in."""
+    for a in range(n):
+        step[a] = 0.0
+    distance = 0.0
+    for i in range(H.shape[0]):
+        if use[i] == 0.0:
+            continue
+        hPh, residual = _project(n, P, H[i], innovation[i], step, Ph)
+        s = hPh + variance[i]
+        distance += residual * residual / s
         for a in range(n):
-            mean[a] += step[a]
-        return distance
-
-    return fuse_rows  # type: ignore[no-any-return]
-
-
-_fuse_core = _fuse_for(N_CORE)
-_fuse_any = _fuse_for(0)
+            K[a] = Ph[a] / s
+            step[a] += K[a] * residual
+        for a in range(n):
+            left = Ph[a] - K[a] * hPh - variance[i] * K[a]  # zero but for rounding: Joseph's
+            for b in range(a, n):
+                value = P[a, b] - K[a] * Ph[b] - left * K[b]
+                P[a, b] = value
+                P[b, a] = value
+    for a in range(n):
+        mean[a] += step[a]
+    return distance
 
 
 @leaf
+def _fuse_core(
+    mean: Array, cov: Array, innovation: Array, H: Array, variance: Array, use: Array
+) -> float:
+    """``fuse`` for the six core states."""
+    P = local_array(N_CORE, N_CORE)
+    step, Ph, K = local_array(N_CORE), local_array(N_CORE), local_array(N_CORE)
+    for a in range(N_CORE):
+        for b in range(N_CORE):
+            P[a, b] = cov[a, b]
+    distance = _fuse_rows(N_CORE, mean, P, innovation, H, variance, use, step, Ph, K)
+    for a in range(N_CORE):
+        for b in range(N_CORE):
+            cov[a, b] = P[a, b]
+    return float(distance)
+
+
+@leaf
+def _fuse_any(
+    mean: Array, cov: Array, innovation: Array, H: Array, variance: Array, use: Array, work: Array
+) -> float:
+    """``fuse`` for any number of states."""
+    step, Ph, K = work[W_STEP], work[W_PH], work[W_GAIN]
+    n = mean.size
+    return float(_fuse_rows(n, mean, cov, innovation, H, variance, use, step, Ph, K))
+
+
+@inlined
 def fuse(
     mean: Array, cov: Array, innovation: Array, H: Array, variance: Array, use: Array, work: Array
 ) -> float:
@@ -98,7 +133,7 @@ def fuse(
     are left out. Returns the squared Mahalanobis distance of the rows used.
     """
     if mean.size == N_CORE:
-        return float(_fuse_core(mean, cov, innovation, H, variance, use, work))
+        return float(_fuse_core(mean, cov, innovation, H, variance, use))
     return float(_fuse_any(mean, cov, innovation, H, variance, use, work))
 
 
@@ -112,26 +147,43 @@ def group_nis(cov: Array, innovation: Array, H: Array, variance: Array) -> float
     return float(innovation @ np.linalg.solve(S, innovation))
 
 
+@inlined
+def _pivots_exceed(n: int, cov: Array, share: float, prior: Array, A: Array) -> bool:
+    """Whether elimination of cov (n, n), in the upper triangle of ``A``, finds every pivot above a
+    share of the prior's variance."""
+    for a in range(n):
+        for b in range(a, n):
+            A[a, b] = cov[a, b]
+    for k in range(n):
+        if not A[k, k] > share * prior[k, k]:
+            return False
+        inverse = 1.0 / A[k, k]
+        for a in range(k + 1, n):
+            factor_ak = A[k, a] * inverse
+            for b in range(a, n):
+                A[a, b] -= factor_ak * A[k, b]
+    return True
+
+
+@leaf
+def _exceeds(cov: Array, share: float, work: Array) -> bool:
+    n, prior = cov.shape[0], work[W_COV:]
+    if n == N_CORE:
+        return bool(_pivots_exceed(N_CORE, cov, share, prior, local_array(N_CORE, N_CORE)))
+    return bool(_pivots_exceed(n, cov, share, prior, work[work.shape[0] - n :]))
+
+
 @leaf
 def is_definite(cov: Array, work: Array) -> bool:
     """Whether elimination finds every pivot positive; ``cov`` (n, n) stays as it is."""
-    n = cov.shape[0]
-    base = work.shape[0] - n
-    for a in range(n):
-        row = work[base + a]
-        for b in range(a, n):
-            row[b] = cov[a, b]
-    for k in range(n):
-        upper = work[base + k]
-        if not upper[k] > 0.0:
-            return False
-        inverse = 1.0 / upper[k]
-        for a in range(k + 1, n):
-            factor_ak = upper[a] * inverse
-            row = work[base + a]
-            for b in range(a, n):
-                row[b] -= factor_ak * upper[b]
-    return True
+    return bool(_exceeds(cov, 0.0, work))
+
+
+@leaf
+def keeps_digits(cov: Array, work: Array) -> bool:
+    """Whether elimination of ``cov`` (n, n), which stays as it is, finds every pivot above what
+    rounding leaves of the prior kept in the workspace."""
+    return bool(_exceeds(cov, _ROUNDING, work))
 
 
 @kernel

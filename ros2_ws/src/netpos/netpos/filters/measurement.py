@@ -40,7 +40,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from netpos.filters.compile import kernel, leaf
+from netpos.filters.compile import inlined, kernel, leaf
 from netpos.filters.step_velocity import curvature, reported
 from netpos.messages.values import Array
 
@@ -67,7 +67,7 @@ HEADING, LEVER, BLOCKED = 19, 20, 23
 ROW_WIDTH = 24
 
 
-@leaf
+@inlined
 def wrap(angle: float) -> float:
     """Angle wrapped to [-pi, pi); constant time for any finite input."""
     if -math.pi <= angle < math.pi:
@@ -76,13 +76,13 @@ def wrap(angle: float) -> float:
     return -math.pi if wrapped >= math.pi else wrapped
 
 
-@leaf
+@inlined
 def is_angle(row: Array) -> bool:
     """Whether differences of the row's predictions are wrapped."""
     return int(row[KIND]) <= Kind.ELEVATION
 
 
-@leaf
+@inlined
 def is_cyclic(row: Array) -> bool:
     """Whether innovations of the row are wrapped: an angle, or a phase known but for whole
     turns."""
@@ -141,7 +141,7 @@ def _turned_lever(row: Array, mean: Array) -> tuple[float, float]:
     return c * row[LEVER] - s * row[LEVER + 1], s * row[LEVER] + c * row[LEVER + 1]
 
 
-@leaf
+@inlined
 def _from_rsu(row: Array, mean: Array, height_m: float, h: Array) -> float:
     """Quantities of the offset between the RSU and the device's antenna."""
     x, y = mean[0], mean[1]
@@ -169,7 +169,7 @@ def _from_rsu(row: Array, mean: Array, height_m: float, h: Array) -> float:
     return float(value)
 
 
-@leaf
+@inlined
 def predict_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
     """Predicted value of one row at ``mean`` (n,); fills its Jacobian ``h`` (n,). ``height_m``:
     device height in map."""
@@ -202,14 +202,14 @@ def predict_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
     return value
 
 
-@leaf
+@inlined
 def innovation_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
     """Measured minus predicted value of one row, wrapped where it is an angle; fills ``h``."""
     innovation = row[VALUE] - predict_row(row, mean, height_m, h)
     return wrap(innovation) if is_cyclic(row) else float(innovation)
 
 
-@leaf
+@inlined
 def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> float:
     """Variance of what linearising ``row`` at ``mean`` (n,) leaves out, for a prior ``cov`` (n,
     n).

@@ -11,7 +11,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from netpos.filters.compile import leaf
+from netpos.filters.compile import inlined, leaf
 from netpos.messages.values import Array
 
 SPEED_OF_LIGHT_MPS = 299_792_458.0
@@ -133,7 +133,7 @@ def _inertial_velocity(mean: Array, dt: float, motion: Array) -> tuple[float, fl
     return wx, wy, motion[Parameter.SPEED_INCREMENT] - mean[N_CORE + 1] * dt
 
 
-@leaf
+@inlined
 def propagate(mean: Array, dt: float, motion: Array, bias: Array) -> None:
     """f: move ``mean`` (n,) by ``dt`` seconds in place; bias (2, k): stationary sd and time
     constant of each bias."""
@@ -237,7 +237,7 @@ def _inertial_jacobian(mean: Array, dt: float, motion: Array, F: Array) -> None:
         F[axis, 2 + axis] += dt / 2.0
 
 
-@leaf
+@inlined
 def add_noise(mean: Array, dt: float, motion: Array, bias: Array, cov: Array) -> None:
     """Add the process noise covariance over ``dt`` > 0 seconds to ``cov`` (n, n) in place.
 
@@ -273,7 +273,7 @@ def add_noise(mean: Array, dt: float, motion: Array, bias: Array, cov: Array) ->
         cov[k, k] += bias[0, i] ** 2 * (1.0 - math.exp(-2.0 * dt / bias[1, i]))
 
 
-@leaf
+@inlined
 def add_jump(sd: float, time_s: float, spread_m: float, cov: Array) -> None:
     """Add, in place, a velocity step of ``sd`` [m/s] per axis ``time_s`` ago, and the position it
     leads to, known but for ``spread_m`` (sd). Nothing happens for sd 0."""
@@ -286,7 +286,7 @@ def add_jump(sd: float, time_s: float, spread_m: float, cov: Array) -> None:
         cov[p + 2, p + 2] += sd * sd
 
 
-@leaf
+@inlined
 def _add_acceleration(dt: float, motion: Array, cov: Array) -> None:
     kind = int(motion[Parameter.NOISE])
     continuous = kind == ProcessNoise.CONTINUOUS
@@ -325,7 +325,7 @@ def _add_jerk(dt: float, q: float, cov: Array) -> None:
             cov[j, i] += value
 
 
-@leaf
+@inlined
 def _add_clock(dt: float, motion: Array, cov: Array) -> None:
     if int(motion[Parameter.NOISE]) != ProcessNoise.CONTINUOUS:
         cov[5, 5] += motion[Parameter.DRIFT_STEP] ** 2
@@ -334,7 +334,7 @@ def _add_clock(dt: float, motion: Array, cov: Array) -> None:
     add_walk(4, 5, dt, motion[Parameter.DRIFT_DENSITY] ** 2, cov)
 
 
-@leaf
+@inlined
 def add_walk(value: int, rate: int, dt: float, q: float, cov: Array) -> None:
     """Noise of a value whose rate does a random walk of density ``q``."""
     cov[value, value] += q * dt**3 / 3.0

@@ -166,6 +166,27 @@ def test_update_of_what_rounding_makes_indefinite_is_exact(seed: int) -> None:
     np.testing.assert_array_equal(cov, cov.T)
 
 
+@pytest.mark.parametrize("n", [6, 8])
+def test_no_update_is_off_by_what_rounding_loses(n: int) -> None:
+    """As above, most of which row by row end definite, and of those some off by 0.1 sd."""
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        scale = 10.0 ** rng.uniform(-1, 6, n)
+        A = rng.normal(size=(n, 2))
+        P = (A @ A.T + 1e-8 * np.eye(n)) * np.outer(scale, scale)
+        P = (P + P.T) / 2
+        H, R, x = np.zeros((3, n)), 10.0 ** rng.uniform(-6, -2, 3), rng.normal(size=n)
+        H[:, :6] = rng.normal(size=(3, 6))
+        nu = H @ np.linalg.cholesky(P) @ rng.normal(size=n)
+        rows = [linear_row(h[:6], v, r, 0) for h, v, r in zip(H, nu + H @ x, R, strict=True)]
+        mean, cov, *_ = updated(x, P, np.array(rows), 0.0, NO_GATE, 1)
+        expected_mean, expected_cov = exact_fuse(x, P, np.array(rows)[:, VALUE] - H @ x, H, R)
+        sd = np.sqrt(np.diag(expected_cov))
+        np.testing.assert_allclose((mean - expected_mean) / sd, 0.0, atol=1e-5)
+        correlation, expected = cov / np.outer(sd, sd), expected_cov / np.outer(sd, sd)
+        np.testing.assert_allclose(correlation, expected, atol=1e-5)
+
+
 @pytest.mark.parametrize("iterations", [1, 8])
 def test_what_is_known_exactly_stays_so(iterations: int) -> None:
     """A perfect clock: no variance, and a TOA is a range."""
@@ -191,6 +212,18 @@ def test_a_covariance_is_definite_up_to_a_correlation_of_one() -> None:
     Q = np.array([[1.0, -0.6, -0.6], [-0.6, 1.0, -0.6], [-0.6, -0.6, 1.0]])
     assert np.linalg.eigvalsh(Q)[0] < 0.0
     assert not fusion.is_definite(Q, work)
+
+
+@pytest.mark.parametrize("n", [6, 7])
+def test_a_variance_has_to_be_more_than_rounding_of_the_prior(n: int) -> None:
+    P, work = 2.0 * np.eye(n), ekf.workspace(n, 2)
+    for k in (0, n - 1):
+        work[fusion.W_COV + k, k] = 1.99e11
+        assert fusion.keeps_digits(P, work)
+        work[fusion.W_COV + k, k] = 2.01e11
+        assert not fusion.keeps_digits(P, work)
+        assert fusion.is_definite(P, work)
+        work[fusion.W_COV + k, k] = 0.0
 
 
 def test_joseph_form_survives_where_the_short_form_fails() -> None:
