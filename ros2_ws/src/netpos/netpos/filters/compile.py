@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from numba import njit, types
+import numpy as np
+from numba import config, njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np import arrayobj
@@ -24,8 +25,7 @@ inlined: Callable[..., Any] = njit(
 )
 
 
-@intrinsic(prefer_literal=True)
-def local_array(_context: Any, *shape: Any) -> Any:
+def _local_array(_context: Any, *shape: Any) -> Any:
     """Array of a shape known at compile time on the stack of the kernel that calls it, its entries
     undefined.
 
@@ -58,3 +58,13 @@ def local_array(_context: Any, *shape: Any) -> Any:
         return made._getvalue()
 
     return array(types.StarArgTuple(shape)), generate
+
+
+def _python_array(*shape: int) -> Any:
+    return np.empty(shape)
+
+
+# Without the compiler (NUMBA_DISABLE_JIT: debugging, scripts/mutate_kernels.py) an ordinary array.
+local_array: Callable[..., Any] = (
+    _python_array if config.DISABLE_JIT else intrinsic(prefer_literal=True)(_local_array)
+)
