@@ -210,12 +210,8 @@ def load(tracker: str, count: int, seconds: float, idle_s: float) -> dict[str, A
         for pub, device in zip(poses, devices, strict=True):
             pub.publish(device.pose(0))
         time.sleep(_SETTLE_S)
-        idle = cpu_of(process, lambda: time.sleep(idle_s)) / idle_s
         traffic = Traffic(probe, script, answers)
-        begin, own = time.perf_counter(), time.process_time()
-        spent = cpu_of(process, traffic.run)  # of the tracker, until it has answered all
-        elapsed = time.perf_counter() - begin
-        own = time.process_time() - own
+        cost = _cost(process, traffic, seconds, idle_s)
         handled = handled_messages(diagnostics, 2 * len(script))
         memory = process.memory_mb()
     return {
@@ -226,11 +222,23 @@ def load(tracker: str, count: int, seconds: float, idle_s: float) -> dict[str, A
         "epochs": len(script),
         "odometry": sum(traffic.received),
         "fewest_odometry": min(traffic.received),
-        "cpu_idle": idle,
-        "cpu_traffic": (spent - idle * elapsed) / seconds,
-        "cpu_probe": own / elapsed,
+        **cost,
         **traffic.lags(),
         "memory_mb": memory,
+    }
+
+
+def _cost(process: Measured, traffic: Traffic, seconds: float, idle_s: float) -> dict[str, float]:
+    """Processor time per second of the tracker, idle and beside that in ``traffic``, until it has
+    answered all; and of the probe."""
+    idle = cpu_of(process, lambda: time.sleep(idle_s)) / idle_s
+    begin, own = time.perf_counter(), time.process_time()
+    spent = cpu_of(process, traffic.run)
+    elapsed = time.perf_counter() - begin
+    return {
+        "cpu_idle": idle,
+        "cpu_traffic": (spent - idle * elapsed) / seconds,
+        "cpu_probe": (time.process_time() - own) / elapsed,
     }
 
 

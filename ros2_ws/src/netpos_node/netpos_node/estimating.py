@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 
 from nav_msgs.msg import Odometry
+from netpos.kernel_memory import give_back_compiler
 from netpos.messages import topics
 from netpos.messages.values import TrackStatus
 from netpos.tracking import TrackOutput
@@ -72,6 +73,7 @@ class EstimatingNode(Node):
         )
         gc.collect()
         gc.freeze()  # what is here stays: looking at it again stalls a tracker of many devices
+        give_back_compiler()
 
     def _wait_for_subscribers(self, wanted: int, extra: Iterable[Publisher] = ()) -> None:
         """Hear no measurement before the estimates are heard: what is given out is then seen.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
@@ -17,6 +19,7 @@ from netpos_node import (
     CODEC,
     LATCHED,
     STREAM,
+    choose_profiles,
     declare,
     declare_config,
     message_class,
@@ -271,3 +274,71 @@ def test_what_has_arrived_is_handed_over_in_its_order_until_a_signal(
 
     run(lambda: Listener(order, stop), spin)
     assert finished == [(True, [f"{name}{index}" for index, name in enumerate(order)])]
+
+
+_ENDPOINTS = """
+import os, sys
+import rclpy
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from netpos_node import BACKLOG, STREAM, choose_profiles
+
+if sys.argv[1] == "ours":
+    choose_profiles(os.environ)
+
+def resident_kb():
+    for line in open("/proc/self/status"):
+        if line.startswith("VmRSS:"):
+            return int(line.split()[1])
+
+rclpy.init(domain_id=36)
+node = rclpy.create_node("many")
+
+def add(i):
+    node.create_publisher(Odometry, f"/v{i}/odometry", STREAM)
+    node.create_subscription(PoseWithCovarianceStamped, f"/v{i}/pose", lambda _: None, BACKLOG)
+
+add(100)
+before = resident_kb()
+for i in range(50):
+    add(i)
+print((resident_kb() - before) / 100)
+rclpy.shutdown()
+"""
+
+
+def _kb_per_endpoint(profiles: str) -> float:
+    program = [sys.executable, "-c", _ENDPOINTS, profiles]
+    environment = {k: v for k, v in os.environ.items() if "FASTRTPS" not in k}
+    result = subprocess.run(program, capture_output=True, text=True, check=True, env=environment)
+    assert "XML" not in result.stderr, "Fast DDS has not understood fastdds.xml"
+    return float(result.stdout)
+
+
+def test_silent_endpoints_take_little_memory() -> None:
+    """Of a history of thousands of messages nothing is allocated ahead."""
+    ours, usual = _kb_per_endpoint("ours"), _kb_per_endpoint("usual")
+    assert ours < 60.0
+    assert ours < 0.5 * usual
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [
+        {"FASTRTPS_DEFAULT_PROFILES_FILE": "/mine.xml"},
+        {"FASTDDS_DEFAULT_PROFILES_FILE": "/mine.xml"},
+        {"RMW_FASTRTPS_USE_QOS_FROM_XML": "0"},
+    ],
+)
+def test_profiles_of_the_user_stand(chosen: dict[str, str]) -> None:
+    environment = {"HOME": "/", **chosen}
+    choose_profiles(environment)
+    assert environment == {"HOME": "/", **chosen}
+
+
+def test_profiles_are_ours_where_nothing_is_chosen() -> None:
+    environment: dict[str, str] = {}
+    choose_profiles(environment)
+    assert environment.pop("RMW_FASTRTPS_USE_QOS_FROM_XML") == "1"
+    (file,) = environment.values()
+    assert os.path.isfile(file)

@@ -49,9 +49,11 @@ def messages_in_order(storage: Any, topics: Mapping[int, str]) -> Iterator[Found
 
 def _messages_of(file: Any, chunk: Any, number: int, topics: Mapping[int, str]) -> list[Found]:
     file.seek(chunk.chunk_start_offset + _HEAD.size)
-    body = file.read(chunk.chunk_length - _HEAD.size)
-    raw = unpack(Chunk.read(ReadDataStream(BytesIO(body))))
-    offsets = _indexed(file, chunk, topics) if chunk.message_index_offsets else _walked(raw)
+    record = Chunk.read(ReadDataStream(BytesIO(file.read(chunk.chunk_length - _HEAD.size))))
+    raw = unpack(record)
+    # Without a checksum, records that follow one another to the end are the only proof of them.
+    sound = record.uncompressed_crc and chunk.message_index_offsets
+    offsets = _indexed(file, chunk, topics) if sound else _walked(raw)
     found: list[Found] = []
     place = number << 40
     for at in offsets:
@@ -64,9 +66,9 @@ def _messages_of(file: Any, chunk: Any, number: int, topics: Mapping[int, str]) 
     return found
 
 
-def _indexed(file: Any, chunk: Any, channels: Container[int]) -> list[int]:
+def _indexed(file: Any, chunk: Any, channels: Container[int]) -> set[int]:
     """Where the messages of ``channels`` begin in the records of a chunk, by its index."""
-    found: list[int] = []
+    found: set[int] = set()
     for channel, offset in chunk.message_index_offsets.items():
         if channel not in channels:
             continue
@@ -74,18 +76,18 @@ def _indexed(file: Any, chunk: Any, channels: Container[int]) -> list[int]:
         opcode, _, owner, size = _INDEX.unpack(file.read(_INDEX.size))
         if (opcode, owner) != (Opcode.MESSAGE_INDEX, channel):
             raise ValueError("a chunk has no index where it should be")
-        found += struct.unpack(f"<{size // 8}Q", file.read(size))[1::2]
+        found.update(struct.unpack(f"<{size // 8}Q", file.read(size))[1::2])
     return found
 
 
-def _walked(raw: bytes) -> list[int]:
+def _walked(raw: bytes) -> set[int]:
     """Where the messages begin in the records of a chunk."""
-    found: list[int] = []
+    found: set[int] = set()
     position = 0
     while position < len(raw):
         opcode, size = _HEAD.unpack_from(raw, position)
         if opcode == Opcode.MESSAGE:
-            found.append(position)
+            found.add(position)
         position += _HEAD.size + size
     if position != len(raw):
         raise ValueError("a record exceeds its chunk")

@@ -11,6 +11,9 @@ from netpos.tracking.config import TrackerConfig
 from netpos.tracking.output import track_state
 
 
+_NO_STEPS = StepCalibration()
+
+
 @dataclass(slots=True)
 class TrackOutput:
     """What a track says at one epoch; odometry is None until the first fix, clock until the first
@@ -77,5 +80,5 @@ def track_status(
         sources=epoch.sources,
         position_sd_m=position_sd_m,
         protection_level_m=level_m,
-        steps=steps or StepCalibration(),
+        steps=steps or _NO_STEPS,
     )

@@ -8,7 +8,6 @@ square of the change as its variance.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -31,9 +30,7 @@ class Steadiness:
 
     def copy(self) -> Steadiness:
         """An independent copy."""
-        twin = copy.copy(self)
-        twin._last = self._last.copy()
-        return twin
+        return Steadiness(self.config, self._last.copy())
 
     def density(self, stamp_ns: int, velocities: Iterable[Velocity] = ()) -> float | None:
         """Density [m/s^2/sqrt(Hz)] for the prediction to ``stamp_ns``, where ``velocities`` are

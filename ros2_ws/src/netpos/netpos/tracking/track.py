@@ -281,7 +281,7 @@ class Track:
             yaw, speed, uncovered_s = self.imu.increments(estimate.stamp_ns, stamp_ns)
             blind = uncovered_s > _IMU_HOLE_S
             estimate.drive(yaw, speed, _BLIND_GYRO if blind else self._config.gyro_noise_density)
-        velocities = [item for item in items if isinstance(item, Velocity)]
+        velocities = (item for item in items if isinstance(item, Velocity))
         density = self._state.steadiness.density(stamp_ns, velocities)
         if density is not None:
             estimate.shake(density)

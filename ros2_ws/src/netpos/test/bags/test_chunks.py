@@ -113,3 +113,26 @@ def test_wrong_checksum_is_damage(tmp_path: Path) -> None:
     file.write_bytes(data)
     with BagReader(file) as reader, pytest.raises(BagError, match="netpos recover"):
         list(reader.messages())
+
+
+@pytest.mark.parametrize("damage", ["opcode", "channel", "offset", "beyond", "twice"])
+def test_an_index_that_does_not_fit_is_damage(tmp_path: Path, damage: str) -> None:
+    """The messages have their checksum, where they are is told by an index that has none."""
+    with BagWriter(tmp_path / "run") as bag:
+        for i in range(3):
+            bag.write("/clock", codec().clock_to_msg(i), i)
+    file = tmp_path / "run" / "run_0.mcap"
+    with BagReader(file) as reader:
+        (chunk,) = reader._reader.storage.chunks
+        assert len(list(reader.messages())) == 3
+    ((_, at),) = chunk.message_index_offsets.items()
+    place = {"opcode": at, "channel": at + 9}.get(damage, at + 15 + 8)
+    data = bytearray(file.read_bytes())
+    data[place] ^= 1
+    if damage == "beyond":
+        data[place + 6] = 1
+    if damage == "twice":
+        data[place : place + 8] = data[place + 16 : place + 24]
+    file.write_bytes(data)
+    with BagReader(file) as reader, pytest.raises(BagError, match="netpos recover"):
+        list(reader.messages())

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from netpos.filters import ekf
 from netpos.filters.measurement import (
+    AXES,
     BIAS,
     COMMON,
     GATE_VARIANCE,
@@ -22,7 +23,17 @@ from netpos.filters.measurement import (
     Kind,
     linearise,
 )
-from netpos.filters.rows import Coupling, linear_rows, rsu_axes, rsu_rows, scalar_values, speed_row
+from netpos.filters.rows import (
+    Coupling,
+    kind_names,
+    linear_rows,
+    put_measurement,
+    rsu_axes,
+    rsu_place,
+    rsu_rows,
+    scalar_kinds,
+    speed_row,
+)
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
@@ -98,12 +109,50 @@ def test_spherical_rows_keep_values_and_variances() -> None:
     info = random_info(np.random.default_rng(1), AngleConvention.SPHERICAL)
     m = full_measurement(info, np.array([30.0, 20.0, 1.0]), 7.0)
     c = speed_of_light
-    assert list(scalar_values(m, info.angle_convention)) == [
-        (Kind.AZIMUTH, m.azimuth_rad, 0.01),
-        (Kind.ELEVATION, m.elevation_rad, 0.02),
-        (Kind.TOA, pytest.approx(c * m.toa_s), pytest.approx(c**2 * 1e-18)),
-        (Kind.RANGE, m.range_m, 0.25),
+    rows = rsu_rows(m, info, rsu_axes(info), 0)[:4]
+    assert rows[:, [KIND, VALUE, VARIANCE]].tolist() == [
+        [Kind.AZIMUTH, m.azimuth_rad, 0.01],
+        [Kind.ELEVATION, m.elevation_rad, 0.02],
+        [Kind.TOA, pytest.approx(c * m.toa_s), pytest.approx(c**2 * 1e-18)],
+        [Kind.RANGE, m.range_m, 0.25],
     ]
+    np.testing.assert_array_equal(rows[:, GATE_VARIANCE], rows[:, VARIANCE])
+
+
+@pytest.mark.parametrize("convention", list(AngleConvention))
+def test_kinds_are_those_of_the_rows(convention: AngleConvention) -> None:
+    """Of every combination of scalar fields, with and without a position."""
+    info = random_info(np.random.default_rng(4), convention)
+    full = full_measurement(info, np.array([30.0, 20.0, 1.0]), 7.0)
+    for fields in range(1, 64):
+        m = RsuMeasurement(
+            **{n: getattr(full, n) for n in full.__slots__} | {"fields": Field(fields)}
+        )
+        rows = rsu_rows(m, info, rsu_axes(info), 0)
+        kinds = [Kind(int(kind)) for kind in rows[:, KIND]]
+        position = [Kind.LINEAR] * 2 if fields & Field.POSITION else []
+        assert kinds == [*scalar_kinds(fields, convention), *position]
+        names = kind_names(fields, convention)
+        assert names == tuple(kind.name for kind in kinds if kind is not Kind.LINEAR)
+
+
+def test_rows_are_put_where_they_belong() -> None:
+    """Behind what is there, with every column set, and none beyond."""
+    info = random_info(np.random.default_rng(5), AngleConvention.SPHERICAL)
+    m = full_measurement(info, np.array([30.0, 20.0, 1.0]), 7.0)
+    m.lever_arm = (0.1, -0.2, 0.3)
+    rows = np.full((12, ROW_WIDTH), np.nan)
+    axes = rsu_axes(info)
+    end = put_measurement(rows, 3, m, False, rsu_place(info, axes), 2, 6)
+    assert end == 9
+    assert np.isnan(rows[:3]).all()
+    assert np.isnan(rows[end:]).all()
+    np.testing.assert_array_equal(rows[3:end], rsu_rows(m, info, axes, 2, heading=6))
+    assert np.isfinite(rows[3:end]).all()
+    np.testing.assert_array_equal(rows[3:end, LEVER : LEVER + 3], [m.lever_arm] * 6)
+    np.testing.assert_array_equal(rows[3:end, HEADING], 6)
+    np.testing.assert_array_equal(rows[3:7, ORIGIN:AXES], [info.position] * 4)
+    np.testing.assert_array_equal(rows[3:7, AXES:HEADING], [axes] * 4)
 
 
 def test_cone_variance_is_that_of_the_sine() -> None:
@@ -121,7 +170,8 @@ def test_cone_variance_is_that_of_the_sine() -> None:
             elevation_rad=-angle,
             elevation_var=1e-4,
         )
-        (kind_y, y, var_y), (kind_z, z, var_z) = scalar_values(m, info.angle_convention)
+        rows = rsu_rows(m, info, rsu_axes(info), 0)
+        (kind_y, y, var_y), (kind_z, z, var_z) = rows[:, [KIND, VALUE, VARIANCE]].tolist()
         assert (kind_y, kind_z) == (Kind.COSINE_Y, Kind.COSINE_Z)
         assert (y, z) == (pytest.approx(math.sin(angle)), pytest.approx(-math.sin(angle)))
         sampled = np.sin(angle + 0.02 * rng.normal(size=400_000)).var()

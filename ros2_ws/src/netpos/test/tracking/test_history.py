@@ -126,7 +126,8 @@ def state(tracker: Tracker) -> list[Any]:
     estimate = [s.estimate.stamp_ns, s.estimate.mean.tobytes(), s.estimate.cov.tobytes()]
     biases = [s.biases.sd, s.biases.tau_s, s.biases._slots, s.biases._last_ns, s.bias.tobytes()]
     counts = [s.accepted, dict(s.rejected), s.rejected_in_row, s.last_accepted_ns, s.has_clock]
-    return [estimate, biases, counts, s.yaw, list(s.nis_window._window)]
+    window = [list(s.nis_window._nis), list(s.nis_window._dofs)]
+    return [estimate, biases, counts, s.yaw, window]
 
 
 def config_of(name: str, **change: Any) -> dict[str, Any]:

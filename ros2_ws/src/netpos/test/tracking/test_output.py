@@ -99,7 +99,7 @@ def test_moving_along_the_heading_is_forward() -> None:
 
 def test_clock_state_in_seconds() -> None:
     cov = spd(4)
-    clock = output.clock_state(77, "vue_9", state(0.0, 0.0), cov)
+    clock = output.clock_state(77, "vue_9", state(0.0, 0.0)[4:6], cov[4:6, 4:6])
     assert (clock.stamp_ns, clock.vue_id) == (77, "vue_9")
     assert clock.offset_s == pytest.approx(30.0 / speed_of_light, rel=1e-14)
     assert clock.drift == pytest.approx(0.5 / speed_of_light, rel=1e-14)
