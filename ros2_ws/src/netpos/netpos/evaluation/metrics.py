@@ -58,7 +58,9 @@ class Figures:
     deviation of the clock offset error about its mean; clock_offset_rmse_ns: about zero. nees_*:
     horizontal position, 2 degrees of freedom, bounds for nees_n_eff independent epochs.
     nis_mean: mean NIS of epochs with measurements; nis_dof_mean: its expectation. rejected: all
-    measurements rejected up to the end. bound_ratio: rmse_m over the posterior Cramer-Rao bound.
+    measurements rejected up to the end. protection_exceeded: share of the estimates with a
+    horizontal error above the protection level told with them; protection_level_m: its median.
+    bound_ratio: rmse_m over the posterior Cramer-Rao bound.
     """
 
     n: int
@@ -79,6 +81,8 @@ class Figures:
     nees_consistent: bool | None = None
     nis_mean: float | None = None
     rejected: int | None = None
+    protection_exceeded: float | None = None
+    protection_level_m: float | None = None
     bound_ratio: float | None = None
     rmse_3d_m: float | None = None
     north_rmse_m: float | None = None
@@ -298,6 +302,19 @@ def _rejections(statuses: Sequence[TrackStatus]) -> dict[str, Any]:
     return {"rejected": sum(last.rejected.values()), "rejected_by_reason": dict(last.rejected)}
 
 
+def _integrity(pairs: Pairs, statuses: Sequence[TrackStatus]) -> dict[str, Any]:
+    told = {s.stamp_ns: s.protection_level_m for s in statuses if s.protection_level_m >= 0.0}
+    levels = np.array([told.get(stamp, np.nan) for stamp in pairs.estimate.stamp_ns.tolist()])
+    known = np.isfinite(levels)
+    if not known.any():
+        return {}
+    exceeded = pairs.horizontal_error[known] > levels[known]
+    return {
+        "protection_exceeded": float(exceeded.mean()),
+        "protection_level_m": float(np.median(levels[known])),
+    }
+
+
 def score(
     run: Run, *, skip: int = SKIP_EPOCHS, max_truth_gap_s: float = MAX_TRUTH_GAP_S
 ) -> Scored:
@@ -340,5 +357,6 @@ def score(
         **_output(ready_ns),
         **_consistency(scored, run.statuses, from_ns),
         **_rejections(run.statuses),
+        **_integrity(scored, run.statuses),
     )
     return Scored(figures=figures, pairs=pairs, counted=scored, from_ns=from_ns)

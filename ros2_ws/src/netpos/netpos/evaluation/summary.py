@@ -32,6 +32,8 @@ _ROWS = (
     ("NIS, mean", "", "nis_mean", ".2f"),
     ("NIS, expected", "", "nis_dof_mean", ".2f"),
     ("measurements rejected", "", "rejected", "d"),
+    ("error above protection level", "", "protection_exceeded", ".1e"),
+    ("protection level, median", "m", "protection_level_m", ".2f"),
     ("error / bound", "", "bound_ratio", ".2f"),
     ("output rate", "Hz", "output_rate_hz", ".2f"),
     ("longest gap", "s", "longest_gap_s", ".2f"),

@@ -327,3 +327,20 @@ def test_no_truth_is_an_error() -> None:
 def test_skip_must_not_be_negative() -> None:
     with pytest.raises(ValueError, match="skip must be >= 0, got -1"):
         score(run_of(straight(3), straight(3)), skip=-1)
+
+
+def test_errors_above_the_protection_level_are_counted() -> None:
+    """Of ten estimates 0.3 m off one has a level below that, one none and one no status."""
+    truth = straight(10)
+    estimate = [moved(o, 0.3, 0.0) for o in truth]
+    levels = [0.2, -1.0, *([0.5] * 7)]
+    told = [
+        status(0.1 * k, TrackState.TRACKING, protection_level_m=level)
+        for k, level in enumerate(levels)
+    ]
+    figures = score(run_of(truth, estimate, statuses=told), skip=0).figures
+    assert figures.protection_exceeded == pytest.approx(1 / 8)
+    assert figures.protection_level_m == 0.5
+    figures = score(run_of(truth, estimate), skip=0).figures
+    assert figures.protection_exceeded is None
+    assert figures.protection_level_m is None
