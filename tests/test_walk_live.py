@@ -146,7 +146,9 @@ def test_the_run_script_dead_reckons_who_walks(
     scenario: str, graph: Graph, tmp_path: Path
 ) -> None:
     """run_graph.sh starts a pdr_node; the tracker fuses its velocities and says what it learned of
-    the person, the same live, offline and in a replay."""
+    the person. A velocity that comes more than ``history_s`` late is not used: on a busy machine
+    some are missing live, and what is learned agrees within half its sd. A replay of what was
+    computed without delays is the same to the last bit."""
     bag_path = tmp_path / "run"
     started = script(graph, "run_graph", scenario, bag_path, str(RATE))
     netpos("run", scenario, "--offline", "--bag", tmp_path / "offline")
@@ -157,13 +159,15 @@ def test_the_run_script_dead_reckons_who_walks(
     assert len(steps) == 32
     fused = [s for s in status if "step_velocity" in s.sources]
     assert len(fused) > 200
-    netpos("replay", bag_path, "--out", tmp_path / "again")
     learned = steps_learned(bag_path)
     assert 0.8 < learned[0] < 1.2
     assert 0.0 < learned[1] < 0.09  # 0.1 at the start
     assert 0.0 < learned[3] < 0.05
-    for other in ("offline", "again"):
-        np.testing.assert_allclose(steps_learned(tmp_path / other), learned, atol=1e-6)
+    offline = steps_learned(tmp_path / "offline")
+    assert abs(offline[0] - learned[0]) < 0.5 * learned[1]
+    assert abs(offline[2] - learned[2]) < 0.5 * learned[3]
+    netpos("replay", tmp_path / "offline", "--out", tmp_path / "again")
+    assert steps_learned(tmp_path / "again") == offline
 
 
 def steps_learned(bag: Path) -> tuple[float, ...]:
