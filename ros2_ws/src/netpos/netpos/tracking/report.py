@@ -10,7 +10,6 @@ from netpos.messages.values import ClockState, NetworkTrack, Odometry, StepCalib
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.output import track_state
 
-
 _NO_STEPS = StepCalibration()
 
 
