@@ -41,6 +41,8 @@ KERNELS = {
         "test_srukf.py -knot+ten_thousand",
     ),
 }
+# Changes that change nothing but time: what they skip has no effect.
+EQUIVALENT = {("srukf", "fuse", "left out: continue")}
 TIMEOUT_S = 120
 SWAPS: dict[type[ast.operator], type[ast.operator]] = {
     ast.Add: ast.Sub,
@@ -133,6 +135,8 @@ def main(rooms: list[str]) -> int:
             if is_noticed(getattr(module, node.name), copy.deepcopy(node), tests):
                 raise SystemExit(f"{room}: the tests fail without any change")
             for line, what, changed in mutants(node):
+                if (room, node.name, what) in EQUIVALENT:
+                    continue
                 total += 1
                 if not is_noticed(getattr(module, node.name), changed, tests):
                     survivors += 1

@@ -226,6 +226,24 @@ def test_a_variance_has_to_be_more_than_rounding_of_the_prior(n: int) -> None:
         work[fusion.W_COV + k, k] = 0.0
 
 
+def test_a_row_that_says_next_to_nothing_leaves_the_factor_as_it_is() -> None:
+    """Potter's denominator does not cancel where a row is worth 1e-12 of the prior."""
+    rng = np.random.default_rng(2)
+    P, h, x, work = random_spd(rng, 6), rng.normal(size=6), rng.normal(size=6), ekf.workspace(6, 1)
+    work[fusion.W_PRIOR], work[fusion.W_COV : fusion.W_COV + 6] = x, P
+    work[fusion.W_COV + 6] = h
+    work[fusion.W_INNOVATION, 0], work[fusion.W_VARIANCE, 0], work[fusion.W_USE, 0] = (
+        1.0,
+        1e12,
+        1.0,
+    )
+    mean, cov = np.empty(6), np.empty((6, 6))
+    fusion.fuse_by_factor(mean, cov, 1, work)
+    Ph, s = P @ h, h @ P @ h + 1e12
+    np.testing.assert_allclose(cov, P - np.outer(Ph, Ph) / s, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(mean, x + Ph / s, rtol=1e-9)
+
+
 def test_joseph_form_survives_where_the_short_form_fails() -> None:
     """The same precise value ten times: the variance ends at r / 10, never at 0 or below."""
     P, x = np.diag([1e9] * 6), np.zeros(6)

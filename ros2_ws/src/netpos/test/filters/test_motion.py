@@ -314,6 +314,14 @@ def test_predict_symmetrises_what_rounding_made_unsymmetric(model: Model, extras
     np.testing.assert_array_equal(cov, cov.T)
 
 
+def test_predict_symmetrises_beside_biases() -> None:
+    P = 2.0 * np.eye(6 + BIASES.shape[1])
+    P[2, 5], P[5, 2] = 1.0 + 1e-9, 1.0 - 1e-9
+    _, cov = predicted(np.zeros(len(P)), P, 0.5, motion_parameters(), BIASES)
+    np.testing.assert_allclose([cov[2, 5], cov[5, 2]], 1.0, rtol=1e-15)
+    np.testing.assert_array_equal(cov, cov.T)
+
+
 @pytest.mark.parametrize(("model", "extras"), STILL)
 @pytest.mark.parametrize("dt", [0.0, -1e-9, -1.0])
 def test_predict_does_nothing_without_time(dt: float, model: Model, extras: int) -> None:
