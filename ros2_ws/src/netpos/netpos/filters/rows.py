@@ -88,12 +88,6 @@ def scalar_kinds(fields: int, convention: AngleConvention) -> tuple[Kind, ...]:
     )
 
 
-@lru_cache(256)
-def kind_names(fields: int, convention: AngleConvention) -> tuple[str, ...]:
-    """Names of ``scalar_kinds``."""
-    return tuple(kind.name for kind in scalar_kinds(fields, convention))
-
-
 @leaf
 def _cosine_var(angle: float, variance: float) -> float:
     """Variance of sin(angle), at end-fire no smaller than the second-order term."""

@@ -25,7 +25,6 @@ from netpos.filters.measurement import (
 )
 from netpos.filters.rows import (
     Coupling,
-    kind_names,
     linear_rows,
     put_measurement,
     rsu_axes,
@@ -132,8 +131,6 @@ def test_kinds_are_those_of_the_rows(convention: AngleConvention) -> None:
         kinds = [Kind(int(kind)) for kind in rows[:, KIND]]
         position = [Kind.LINEAR] * 2 if fields & Field.POSITION else []
         assert kinds == [*scalar_kinds(fields, convention), *position]
-        names = kind_names(fields, convention)
-        assert names == tuple(kind.name for kind in kinds if kind is not Kind.LINEAR)
 
 
 def test_rows_are_put_where_they_belong() -> None:

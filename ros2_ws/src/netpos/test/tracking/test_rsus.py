@@ -148,3 +148,21 @@ def test_inflated_mean_has_the_variance_of_the_mean_of_coloured_noise() -> None:
     states.accepted(rsu, measured(stamp_ns=10**9))
     factor = states.coupling(rsu, measured(stamp_ns=10**9 + int(dt * 1e9))).inflation[Kind.RANGE]
     assert factor / n == pytest.approx(of_mean, rel=2e-3)
+
+
+def test_a_copy_goes_its_own_way() -> None:
+    """A track goes back to it: what is heard afterwards must not be in it, nor the reverse."""
+    first, second = biased("a"), biased("b")
+    states = BiasStates()
+    states.coupling(first, measured())
+    states.accepted(first, measured())
+    twin = states.copy()
+    kept = twin.arrays()
+    states.coupling(second, measured())
+    states.accepted(first, measured(stamp_ns=5))
+    np.testing.assert_array_equal(twin.arrays(), kept)
+    assert twin.coupling(first, measured()).bias == states.coupling(first, measured()).bias
+    assert set(twin._last_ns.values()) == {1}
+    one = twin.coupling(second, measured())
+    assert one.bias == states.coupling(second, measured()).bias
+    assert len(twin.sd) == len(states.sd)

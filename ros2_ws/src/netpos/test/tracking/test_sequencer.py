@@ -354,3 +354,16 @@ def test_an_initial_pose_is_not_waited_for_longer_than_hold() -> None:
         assert sequencer.release() == []
     assert sequencer.add(RsuMeasurement(stamp_ns=1100, rsu_id="a", vue_id="v", expected=1)) is None
     assert [epoch.stamp_ns for epoch in sequencer.release()] == [1000]
+
+
+def test_applied_epochs_are_forgotten_after_the_history() -> None:
+    """However long it runs, late items are known as repeated within the history, and what is
+    kept of it is bounded."""
+    sequencer = Sequencer(0, history_ns=1000 * MS)
+    for stamp in range(10, 60_000, 10):
+        assert sequencer.add(rsu(stamp)) is None
+        assert len(sequencer.release()) == 1
+        assert len(sequencer._applied) <= 152
+    assert sequencer.add(rsu(58_990)) == "duplicate"
+    assert sequencer.add(rsu(58_995)) is None
+    assert sequencer.add(rsu(58_989)) == "late"
