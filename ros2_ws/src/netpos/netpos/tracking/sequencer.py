@@ -109,7 +109,6 @@ class Sequencer:
         self.newest_ns = 0
         """Newest stamp heard; 0 before the first."""
         self._released_ns = -1
-        self._forget_ns = 0
         self._last_of: dict[tuple[str, str], int] = {}
         self._suspect_ns: int | None = None
         self._late_in_row = 0
@@ -222,11 +221,10 @@ class Sequencer:
         return epoch
 
     def _forget_applied(self, before_ns: int) -> None:
-        """Drop epochs older than the history, from time to time: looking at all costs more."""
-        if before_ns >= self._forget_ns:
-            for old in [s for s in self._applied if s < before_ns]:
-                del self._applied[old]
-            self._forget_ns = before_ns + self._history_ns // 2
+        """Drop epochs older than the history; one that a late item made goes with those that were
+        there before it."""
+        while self._applied and (oldest := next(iter(self._applied))) < before_ns:
+            del self._applied[oldest]
 
     def _ready(self, epoch: Epoch) -> bool:
         stamp, newest = epoch.stamp_ns, self.newest_ns

@@ -363,7 +363,7 @@ def test_applied_epochs_are_forgotten_after_the_history() -> None:
     for stamp in range(10, 60_000, 10):
         assert sequencer.add(rsu(stamp)) is None
         assert len(sequencer.release()) == 1
-        assert len(sequencer._applied) <= 152
+        assert len(sequencer._applied) <= 101
     assert sequencer.add(rsu(58_990)) == "duplicate"
     assert sequencer.add(rsu(58_995)) is None
     assert sequencer.add(rsu(58_989)) == "late"
