@@ -27,6 +27,10 @@ class Steadiness:
 
     config: TrackerConfig
     _last: dict[str, Velocity] = field(default_factory=dict)
+    _explained: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._explained = float(gate_thresholds(self.config.gate_probability)[2])
 
     def copy(self) -> Steadiness:
         """An independent copy."""
@@ -57,6 +61,6 @@ class Steadiness:
             return 0.0
         change = velocity.velocity - last.velocity
         distance2 = float(change @ np.linalg.solve(velocity.cov + last.cov, change))
-        if distance2 <= gate_thresholds(self.config.gate_probability)[2]:
+        if distance2 <= self._explained:
             return 0.0
         return float(change @ change) / 2.0 / ((velocity.stamp_ns - last.stamp_ns) * 1e-9)
