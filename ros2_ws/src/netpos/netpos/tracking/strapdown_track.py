@@ -17,8 +17,9 @@ import numpy as np
 
 from netpos.filters.error_state import MEMORY, Imu, Sensors, advance, correct, doubt_standstill
 from netpos.filters.measurement import GROUP, KIND, VARIANCE, Kind
-from netpos.filters.space import CLOCK, SpaceKind
+from netpos.filters.space import CLOCK, SpaceKind, place_rows
 from netpos.filters.space_conditioning import condition_in_space
+from netpos.inertial.strapdown import ERR, NAV
 from netpos.messages.values import Array, InitialPose, Odometry, RsuMeasurement
 from netpos.tracking import output
 from netpos.tracking.batch import Batch, mostly_accepted
@@ -87,6 +88,14 @@ class _State:
 def warm_up(config: TrackerConfig) -> None:
     """Compile, or load, the kernels before the first measurement."""
     compile_kernels(sensors_of(config))
+    nav, cov = with_clock(config, np.zeros(NAV), np.eye(ERR))
+    rows = place_rows(np.zeros(3), np.eye(3), (0.0, 0.0, 0.0))
+    fits_in_space(rows, nav, cov)
+    if config.robust != "none" or config.nlos_probability > 0.0:
+        condition_in_space(
+            nav, cov, rows, ROBUST.index(config.robust), config.robust_parameter,
+            config.nlos_probability, config.nlos_mean_excess_m,
+        )  # fmt: skip
 
 
 def track_of(

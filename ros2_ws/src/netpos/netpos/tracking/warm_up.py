@@ -21,6 +21,7 @@ def warm_up(network: str | None = None) -> None:
     _angles_and_ranges()
     if network is None:
         warm_up_anchors()
+        Tracker(TrackerConfig(motion_model="strapdown", robust="huber"))
     if network != "":
         _fixes_of_a_network()
 
