@@ -92,8 +92,8 @@ class Sequencer:
         ``history_ns``: how much older than the newest applied epoch an item may be.
         ``future_ns``: a stamp this far ahead of all others counts once a second one confirms it.
         ``live_ns``: a channel this far behind the newest stamp is not waited for.
-        ``tick_ns``: an epoch, without items if need be, at every multiple of it that the IMU
-        reaches; 0: none.
+        ``tick_ns``: once an RSU was heard, an epoch, without items if need be, at every multiple
+        of it that the IMU reaches; 0: none.
         """
         self._hold_ns = hold_ns
         self._needs_pose = needs_pose
@@ -141,7 +141,7 @@ class Sequencer:
 
     def mark(self, channel: str, stamp_ns: int) -> None:
         """Note that a channel has reached a stamp."""
-        if channel == IMU and self._tick_ns > 0:
+        if channel == IMU and self._tick_ns > 0 and RSU in self._watermark:
             self._tick(self._watermark.get(channel, stamp_ns), stamp_ns)
         self._watermark[channel] = max(stamp_ns, self._watermark.get(channel, stamp_ns))
         self.newest_ns = max(stamp_ns, self.newest_ns)

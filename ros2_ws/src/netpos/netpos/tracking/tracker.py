@@ -169,7 +169,9 @@ class Tracker:
                     sequencer.applied(epoch)
                 if not epochs:
                     outputs.append(revised)
-            outputs += [track.step(epoch) for epoch in epochs]
+            found = [(epoch, track.step(epoch)) for epoch in epochs]
+            # Before a first fix there is nothing to tell of between epochs.
+            outputs += [said for epoch, said in found if epoch.items or said.odometry]
         return outputs
 
     def _fault(self, item: Item) -> str | None:

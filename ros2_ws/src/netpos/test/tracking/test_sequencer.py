@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from netpos.messages.values import GroundSpeed, InitialPose, RsuMeasurement, Velocity
-from netpos.tracking.sequencer import Epoch, Item, Sequencer, channel_and_source
+from netpos.tracking.sequencer import IMU, Epoch, Item, Sequencer, channel_and_source
 
 MS = 1_000_000
 HOLD = 250 * MS
@@ -367,3 +367,23 @@ def test_applied_epochs_are_forgotten_after_the_history() -> None:
     assert sequencer.add(rsu(58_990)) == "duplicate"
     assert sequencer.add(rsu(58_995)) is None
     assert sequencer.add(rsu(58_989)) == "late"
+
+
+def test_ticks_are_epochs_once_an_rsu_was_heard_and_wait_for_it() -> None:
+    """Every 20 ms of IMU, held for an RSU that measures once a second, 0.1 s late."""
+    sequencer = Sequencer(hold_ns=500_000_000, history_ns=0, tick_ns=20_000_000)
+    second, released = 1_000_000_000, []
+    for k in range(100, 310):
+        stamp = k * 10_000_000
+        sequencer.mark(IMU, stamp)
+        if k % 100 == 10:
+            assert sequencer.add(rsu(k // 100 * 1000, expected=1)) is None
+        released += sequencer.release()
+        if k < 210:
+            assert all(epoch.stamp_ns < 2 * second for epoch in released)
+    stamps = [epoch.stamp_ns for epoch in released]
+    assert stamps == sorted(set(stamps))
+    assert stamps[0] == second
+    assert [e.stamp_ns for e in released if e.items] == [second, 2 * second]
+    ticks = [s for s in stamps if 1_100_000_000 < s < 2 * second]
+    assert ticks == list(range(1_120_000_000, 2 * second, 20_000_000))
