@@ -29,7 +29,8 @@ KERNELS = {
     "ekf": (
         "predict _predict_core _shear _predict_biased _predict_dense _small_nis _large_nis "
         "_passes gate update _fuse_used _odd_one_out _coloured_nis",
-        "test_motion.py test_ekf.py test_ekf_contradiction.py test_ekf_iteration.py",
+        "test_motion.py test_ekf.py test_ekf_gate.py test_ekf_contradiction.py "
+        "test_ekf_iteration.py",
     ),
     "fusion": (
         "_project _fuse_rows _fuse_core _fuse_any fuse group_nis _eliminate is_definite "

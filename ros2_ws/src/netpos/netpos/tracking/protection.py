@@ -14,11 +14,10 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import chdtri
 
-from netpos.filters import ekf
 from netpos.filters.compile import kernel, leaf
-from netpos.filters.fusion import workspace
-from netpos.filters.gate import accepted_rows
+from netpos.filters.fusion import fuse, workspace
 from netpos.filters.manoeuvre import add_manoeuvre, unnoticed_s
+from netpos.filters.measurement import GROUP, VARIANCE, curvature_variance, innovation_row
 from netpos.messages.values import Array
 from netpos.tracking.engine import GATE, Option
 
@@ -26,7 +25,6 @@ _ANGLES = 16
 _COS2 = np.cos(np.linspace(0.0, np.pi / 2, _ANGLES + 1)) ** 2
 _WEIGHT = np.append(np.append(0.5, np.ones(_ANGLES - 1)), 0.5) / _ANGLES
 _ITERATIONS = 20
-_NO_GATE = np.array([np.inf])
 RISK_MIN, RISK_MAX = 1e-15, 0.5
 
 
@@ -156,10 +154,30 @@ def manoeuvre_level(
     if math.isinf(longest_s):
         return math.inf
     add_manoeuvre(speed, max(unheard_s, longest_s), P)
-    used = rows[accepted_rows(rows, accepted)]
-    if used.shape[0] > 0:
-        work, taken = workspace(x.size, used.shape[0]), np.empty(accepted.size)
-        iterations = int(options[Option.ITERATIONS])
-        ekf.update(x, P, used, height_m, _NO_GATE, iterations, taken, work)
+    _apply_about(mean, x, P, rows, accepted, height_m)
     apart = math.hypot(x[0] - mean[0], x[1] - mean[1])
     return float(apart + gaussian_radius(P[0, 0], P[0, 1], P[1, 1], risk))
+
+
+@kernel
+def _apply_about(
+    about: Array, mean: Array, cov: Array, rows: Array, accepted: Array, height_m: float
+) -> None:
+    """Apply the accepted groups of ``rows`` (m, ROW_WIDTH) in place, linearised at ``about`` (n,),
+    an answer already known, and once more at what comes of it, with the curvature that is left."""
+    n, m = mean.size, rows.shape[0]
+    H, innovation, variance = np.empty((m, n)), np.empty(m), rows[:, VARIANCE].copy()
+    use, work = np.empty(m), workspace(n, m)
+    prior, prior_cov, last = mean.copy(), cov.copy(), about
+    for again in range(2):
+        for i in range(m):
+            use[i] = accepted[int(rows[i, GROUP])]
+            innovation[i] = innovation_row(rows[i], last, height_m, H[i])
+            for a in range(n):
+                innovation[i] += H[i, a] * (last[a] - prior[a])
+            if again:
+                variance[i] += curvature_variance(rows[i], last, cov, height_m)
+        mean[:] = prior
+        cov[:] = prior_cov
+        fuse(mean, cov, innovation, H, variance, use, work)
+        last = mean.copy()

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters import ekf, srukf
+from engine_cases import opened, start
+from netpos.filters import ekf
 from netpos.filters.measurement import (
     GATE_VARIANCE,
     GROUP,
@@ -16,7 +17,7 @@ from netpos.filters.measurement import (
     curvature_variance,
     linearise,
 )
-from netpos.filters.motion import NO_BIAS, SPEED_OF_LIGHT_MPS, noise
+from netpos.filters.motion import NO_BIAS, SPEED_OF_LIGHT_MPS
 from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, InitialPose, RsuInfo, RsuMeasurement
 from netpos.scenario import Simulation, load_scenario
@@ -48,16 +49,6 @@ def rows_of(state: Array, rng: np.random.Generator, wrong: tuple[int, ...] = ())
         )
         blocks.append(rsu_rows(m, info, rsu_axes(info), group))
     return np.vstack(blocks)
-
-
-def opened(cov: Array, sd: float, unheard_s: float) -> Array:
-    """A velocity step of ``sd`` at a time in the past: G G' sd^2 with G = [s, 1] per axis."""
-    out = cov.copy()
-    for p in (0, 1):
-        g = np.zeros(len(cov))
-        g[p], g[p + 2] = sd * unheard_s, sd
-        out += np.outer(g, g)
-    return out
 
 
 def turned(mean: Array, cov: Array, rows: Array, unheard_s: float, options: Array) -> Array:
@@ -115,13 +106,6 @@ def plain_step(
     if not best[4].any():
         return prior, prior_cov, best[2], best[3], best[4]
     return best
-
-
-def start(speed: float = 8.0) -> tuple[Array, Array]:
-    mean = np.array([20.0, 0.0, speed, 0.0, 10.0, 0.0])
-    A = np.random.default_rng(5).normal(size=(6, 6))
-    scale = np.array([1.0, 1.0, 0.5, 0.5, 2.0, 0.5])
-    return mean, np.outer(scale, scale) * (0.2 * A @ A.T / 6 + np.eye(6))
 
 
 def compiled_step(
@@ -346,108 +330,6 @@ def test_a_run_equals_the_tracker(metis: Any, name: str, rtol: float) -> None:
             np.testing.assert_array_equal(np.array(got), want)
         else:
             np.testing.assert_allclose(np.array(got), want, rtol=rtol, atol=1e-9)
-
-
-# the parts
-
-
-def test_opening_a_factor_is_opening_its_covariance() -> None:
-    config = TrackerConfig(filter="srukf")
-    options = options_of(config)
-    _, cov = start()
-    for sd, unheard_s in ((3.0, 0.0), (5.0, 0.1), (5.0, 30.0), (1e-3, 2.0)):
-        L = srukf.factor(cov)
-        engine.open_velocity(L, sd, unheard_s, options)
-        plain = cov.copy()
-        engine.open_velocity(plain, sd, unheard_s, options_of(TrackerConfig()))
-        np.testing.assert_allclose(plain, opened(cov, sd, unheard_s), rtol=1e-14)
-        np.testing.assert_allclose(L @ L.T, plain, rtol=1e-12, atol=1e-13)
-        assert (np.triu(L, 1) == 0.0).all()
-
-
-@pytest.mark.parametrize("within_s", [0.0, 0.1, 4.0])
-def test_a_manoeuvre_at_any_time(within_s: float) -> None:
-    """The second moments of a step at a uniform time, for covariance and factor."""
-    _, cov = start()
-    root = options_of(TrackerConfig(filter="srukf", manoeuvre_speed_sd_mps=3.0))
-    plain = options_of(TrackerConfig(manoeuvre_speed_sd_mps=3.0))
-    nodes, weights = np.polynomial.legendre.leggauss(3)
-    steps = [opened(cov, 3.0, within_s * (x + 1.0) / 2.0) for x in nodes]
-    expected = sum(w / 2.0 * step for w, step in zip(weights, steps, strict=True))
-    L, P = srukf.factor(cov), cov.copy()
-    engine.allow_manoeuvre(P, within_s, plain)
-    engine.allow_manoeuvre(L, within_s, root)
-    np.testing.assert_allclose(P, expected, rtol=1e-12, atol=1e-14)
-    np.testing.assert_allclose(L @ L.T, expected, rtol=1e-12, atol=1e-13)
-
-
-@pytest.mark.parametrize(("opened_sd", "turn"), [(0.0, 0.0), (5.0, 0.0), (0.0, 3.0), (5.0, 3.0)])
-def test_a_smoother_is_told_of_both_steps(opened_sd: float, turn: float) -> None:
-    """What ``noise`` adds from the note is what the looks added."""
-    motion = motions_of(TrackerConfig())[0]
-    without, noted = np.zeros((6, 6)), np.zeros((6, 6))
-    noise(np.zeros(6), 0.1, motion, NO_BIAS, without)
-    engine.note_jump(motion, opened_sd, 1.3, turn, 0.7)
-    noise(np.zeros(6), 0.1, motion, NO_BIAS, noted)
-    expected = opened(without, opened_sd, 1.3)
-    if turn > 0.0:
-        options = options_of(TrackerConfig(manoeuvre_speed_sd_mps=turn))
-        engine.allow_manoeuvre(expected, 0.7, options)
-    np.testing.assert_allclose(noted, expected, rtol=1e-12, atol=1e-14)
-
-
-@pytest.mark.parametrize(
-    ("change", "sound"),
-    [
-        ({}, True),
-        ({"mean": (0, 0.999e9)}, True),
-        ({"mean": (0, -1.001e9)}, False),
-        ({"mean": (1, math.nan)}, False),
-        ({"mean": (2, 2.99e8)}, True),
-        ({"mean": (2, 3.0e8)}, False),
-        ({"cov": (0, 1, 0.999999)}, True),
-        ({"cov": (0, 1, 1.0)}, False),
-        ({"cov": (2, 3, -1.0)}, False),
-        ({"cov": (4, 5, 1.0)}, True),
-    ],
-)
-def test_what_can_be_a_device(change: dict[str, Any], sound: bool) -> None:
-    """A clock may be known exactly; a position and a velocity may not."""
-    mean, cov = np.zeros(6), np.eye(6)
-    if "mean" in change:
-        at, value = change["mean"]
-        mean[at] = value
-    if "cov" in change:
-        i, j, value = change["cov"]
-        cov[i, j] = cov[j, i] = value
-    assert engine.is_sound(mean, cov) is sound
-
-
-def test_what_is_carried_and_the_covariance() -> None:
-    _, cov = start()
-    root, plain = options_of(TrackerConfig(filter="srukf")), options_of(TrackerConfig())
-    L = engine.to_spread(cov, root)
-    np.testing.assert_allclose(L, np.linalg.cholesky(cov), rtol=1e-12)
-    np.testing.assert_allclose(engine.to_cov(L, root), cov, rtol=1e-12)
-    copied = engine.to_spread(cov, plain)
-    assert copied is not cov
-    np.testing.assert_array_equal(copied, cov)
-
-
-@pytest.mark.parametrize("name", ["ekf", "iekf", "ukf", "srukf", "kf"])
-def test_predict_does_nothing_for_no_time(name: str) -> None:
-    config = TrackerConfig(filter=name)
-    options, motion = options_of(config), motions_of(config)[0]
-    mean, cov = start()
-    x, S = mean.copy(), engine.to_spread(cov, options)
-    for dt in (0.0, -1.0):
-        engine.predict(x, S, dt, motion, NO_BIAS, options)
-        np.testing.assert_array_equal(x, mean)
-        np.testing.assert_array_equal(S, engine.to_spread(cov, options))
-    engine.predict(x, S, 0.5, motion, NO_BIAS, options)
-    ekf.predict(mean, cov, 0.5, motion, NO_BIAS)  # linear: all the same
-    np.testing.assert_allclose(x, mean, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(engine.to_cov(S, options), cov, rtol=1e-7, atol=1e-9)
 
 
 def test_rows_are_what_the_tests_say() -> None:
