@@ -81,9 +81,9 @@ class Figures:
     nees_consistent: bool | None = None
     nis_mean: float | None = None
     rejected: int | None = None
+    bound_ratio: float | None = None
     protection_exceeded: float | None = None
     protection_level_m: float | None = None
-    bound_ratio: float | None = None
     rmse_3d_m: float | None = None
     north_rmse_m: float | None = None
     east_rmse_m: float | None = None
