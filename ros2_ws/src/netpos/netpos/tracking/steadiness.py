@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from copy import copy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -34,7 +35,9 @@ class Steadiness:
 
     def copy(self) -> Steadiness:
         """An independent copy."""
-        return Steadiness(self.config, self._last.copy())
+        twin = copy(self)
+        twin._last = self._last.copy()
+        return twin
 
     def density(self, stamp_ns: int, velocities: Iterable[Velocity] = ()) -> float | None:
         """Density [m/s^2/sqrt(Hz)] for the prediction to ``stamp_ns``, where ``velocities`` are
