@@ -51,9 +51,17 @@ def gaussian_radius(xx: float, xy: float, yy: float, risk: float) -> float:
         excess = math.log(total) - 0.5 * u - log_risk
         step = excess * total / slope
         u = max(u - step, 0.0)
-        if abs(step) <= 1e-11 * u:
+        if abs(step) <= 1e-6 * u:  # the next one would be its square
             break
     return math.sqrt(u * large)
+
+
+@leaf
+def radius_limit(xx: float, xy: float, yy: float, risk: float) -> float:
+    """What ``gaussian_radius`` never exceeds: the radius of a circular error that is everywhere as
+    large as this one is along its longer axis."""
+    large = (xx + yy) / 2.0 + math.hypot((xx - yy) / 2.0, xy)
+    return math.sqrt(-2.0 * math.log(risk) * max(large, 0.0))
 
 
 def protection_level(cov2: Array, risk: float, inflation: float = 1.0) -> float:

@@ -18,8 +18,10 @@ from netpos.tracking.models import options_of
 from netpos.tracking.protection import (
     RISK_MIN,
     NisWindow,
+    gaussian_radius,
     manoeuvre_level,
     protection_level,
+    radius_limit,
 )
 from scipy import integrate, optimize, stats
 
@@ -68,6 +70,15 @@ def test_limits(risk: float) -> None:
     line = protection_level(rotated(2.0, 0.0, 1.1), risk)
     assert line == pytest.approx(2.0 * stats.norm.isf(risk / 2), rel=1e-5)
     assert protection_level(np.zeros((2, 2)), risk) == 0.0
+
+
+@pytest.mark.parametrize("risk", RISKS)
+def test_no_radius_exceeds_that_of_a_circle(risk: float) -> None:
+    for ratio in (1.0, 0.5, 0.0):
+        cov = rotated(3.0, 3.0 * ratio, 0.7)
+        sides = cov[0, 0], cov[0, 1], cov[1, 1], risk
+        assert radius_limit(*sides) == pytest.approx(3.0 * math.sqrt(-2.0 * math.log(risk)))
+        assert gaussian_radius(*sides) <= radius_limit(*sides) * (1.0 + 1e-12)
 
 
 def test_monte_carlo() -> None:

@@ -13,7 +13,7 @@ from netpos.filters.measurement import GROUP
 from netpos.filters.motion import Parameter
 from netpos.messages.values import Array
 from netpos.tracking.engine import GATE, GATE_SIZE, Option
-from netpos.tracking.protection import gaussian_radius, manoeuvre_level
+from netpos.tracking.protection import gaussian_radius, manoeuvre_level, radius_limit
 
 _WINDOW, _TAIL = 50, 1e-3  # of ``NisWindow``
 _BOUND = np.append(0.0, chdtri(np.arange(1.0, 64.0 * _WINDOW), _TAIL))
@@ -57,9 +57,8 @@ def protection_levels(
         if k >= _WINDOW:
             sum_nis, sum_dof = sum_nis - full_nis[k - _WINDOW], sum_dof - full_dof[k - _WINDOW]
         cov = covs[k]
-        level[k] = gaussian_radius(cov[0, 0], cov[0, 1], cov[1, 1], risk)
-        if sum_nis > _BOUND[int(sum_dof)]:
-            level[k] *= math.sqrt(sum_nis / sum_dof)
+        optimism = math.sqrt(sum_nis / sum_dof) if sum_nis > _BOUND[int(sum_dof)] else 1.0
+        level[k] = 0.0
         if options[Option.MANOEUVRE_SPEED] > 0.0 and k > 0:
             unheard_s = (stamps_ns[k] - heard_ns) * 1e-9
             x, P = means[k - 1].copy(), covs[k - 1].copy()
@@ -67,10 +66,12 @@ def protection_levels(
             motion[Parameter.JUMP_SPEED] = 0.0
             ekf.predict(x, P, (stamps_ns[k] - stamps_ns[k - 1]) * 1e-9, motion, bias)
             accepted[:] = 1.0 if taken[k] > 0 else 0.0
-            moved = manoeuvre_level(x, P, own, accepted, unheard_s, means[k], options, risk)
+            level[k] = manoeuvre_level(x, P, own, accepted, unheard_s, means[k], options, risk)
             if taken[k] == 0:
-                moved += options[Option.MANOEUVRE_SPEED] * unheard_s
-            level[k] = max(level[k], moved)
+                level[k] += options[Option.MANOEUVRE_SPEED] * unheard_s
+        if level[k] < optimism * radius_limit(cov[0, 0], cov[0, 1], cov[1, 1], risk):
+            radius = gaussian_radius(cov[0, 0], cov[0, 1], cov[1, 1], risk)
+            level[k] = max(level[k], optimism * radius)
         if taken[k] > 0:
             heard_ns = stamps_ns[k]
     return level
