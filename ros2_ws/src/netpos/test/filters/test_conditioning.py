@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import partial
 
+import filter_rows
 import numpy as np
 import pytest
 from filter_rows import NO_GATE, random_spd
@@ -12,15 +13,12 @@ from netpos.filters import ekf, robust
 from netpos.filters.conditioning import Robust, condition
 from netpos.filters.measurement import (
     AXES,
-    BIAS,
     BLOCKED,
-    COMMON,
     GATE_VARIANCE,
     GROUP,
     HEADING,
     KIND,
     ORIGIN,
-    ROW_WIDTH,
     VALUE,
     VARIANCE,
     Kind,
@@ -33,12 +31,8 @@ OTHERS = [k for k in Kind if k not in {Kind.TOA, Kind.RANGE}]
 
 
 def row(kind: Kind, value: float, variance: float, group: int, origin: Array) -> Array:
-    out = np.zeros(ROW_WIDTH)
-    out[[KIND, VALUE, VARIANCE, GATE_VARIANCE]] = kind, value, variance, variance / 2.0
-    out[[BIAS, COMMON, GROUP, HEADING]] = -1, -1, group, -1
-    out[ORIGIN:AXES] = origin
-    out[AXES:HEADING] = np.eye(3).reshape(-1)
-    return out
+    """A row whose gate takes half of its variance for noise."""
+    return filter_rows.row(kind, value, variance, group, origin, gate_variance=variance / 2.0)
 
 
 def conditioned(

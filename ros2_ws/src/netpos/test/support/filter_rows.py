@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from netpos.filters.measurement import (
     AXES,
@@ -28,19 +30,36 @@ def random_spd(rng: np.random.Generator, n: int) -> Array:
     return A @ A.T + 0.1 * np.eye(n)
 
 
-def row(kind: Kind, value: float, variance: float, group: int, origin: Array) -> Array:
-    """One row of an upright RSU at ``origin`` without biases."""
+def make_cov(rng: np.random.Generator, n: int, scale: float = 1.0) -> Array:
+    """Random positive definite (n, n) of condition below about 1e3."""
+    A = rng.normal(size=(n, n))
+    return scale * (A @ A.T / n + 0.3 * np.eye(n))
+
+
+def row(
+    kind: Kind,
+    value: float,
+    variance: float,
+    group: int = 0,
+    origin: Sequence[float] | Array = (0.0, 0.0, 0.0),
+    *,
+    axes: Sequence[float] = (1, 0, 0, 0, 1, 0, 0, 0, 1),
+    gate_variance: float | None = None,
+    bias: int = -1,
+    h: Sequence[float] | Array | None = None,
+) -> Array:
+    """One row; ``h`` (6,) for LINEAR, which has no origin and axes."""
     out = np.zeros(ROW_WIDTH)
-    out[[KIND, VALUE, VARIANCE, GATE_VARIANCE]] = kind, value, variance, variance
-    out[[BIAS, COMMON, GROUP, HEADING]] = -1, -1, group, -1
-    out[ORIGIN:AXES] = origin
-    out[AXES:HEADING] = np.eye(3).reshape(-1)
+    out[KIND], out[VALUE], out[VARIANCE], out[GROUP] = kind, value, variance, group
+    out[GATE_VARIANCE] = variance if gate_variance is None else gate_variance
+    out[BIAS], out[COMMON], out[HEADING] = bias, -1, -1
+    if h is not None:
+        out[ORIGIN : ORIGIN + 6] = h
+    else:
+        out[ORIGIN:AXES], out[AXES:HEADING] = origin, axes
     return out
 
 
 def linear_row(h: Array, value: float, variance: float, group: int) -> Array:
     """One row of value ``h`` (6,) times the state."""
-    out = row(Kind.LINEAR, value, variance, group, np.zeros(3))
-    out[ORIGIN:HEADING] = 0.0
-    out[ORIGIN : ORIGIN + 6] = h
-    return out
+    return row(Kind.LINEAR, value, variance, group, h=h)
