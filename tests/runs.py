@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import yaml
 from graph import Graph, Process, claim_domain
 from netpos.bags import BagReader, codec, typestore
@@ -25,6 +26,8 @@ ODOMETRY, CLOCK_STATE, TRACK_STATUS, TRUTH = (
 )
 ESTIMATES = (ODOMETRY, CLOCK_STATE, TRACK_STATUS)
 RUN_S = 120.0
+PATIENT = {"hold_s": 10.0}
+"""Tracker parameters for a run compared bit by bit: longer than a busy machine stalls a node."""
 
 
 @contextmanager
@@ -70,11 +73,18 @@ def netpos(*arguments: str | Path) -> str:
 
 
 def changed_scenario(
-    path: Path, base: str, device: dict[str, Any] | None = None, **changes: Any
+    path: Path,
+    base: str,
+    device: dict[str, Any] | None = None,
+    *,
+    tracker: dict[str, Any] | None = None,
+    **changes: Any,
 ) -> Path:
-    """Write a scenario like ``base`` with other values; ``device`` changes its first device."""
+    """Write a scenario like ``base`` with other values; ``device`` changes its first device,
+    ``tracker`` single parameters."""
     content = yaml.safe_load(scenario_files()[base].read_text(encoding="utf-8"))
     content["devices"][0].update(device or {})
+    content.setdefault("tracker", {}).update(tracker or {})
     content.update(changes)
     # a number such as 5.0e-08 has a dot and a signed exponent, so any YAML reader sees a number
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
@@ -106,6 +116,25 @@ def payloads(bag: Path, topics: Collection[str]) -> dict[str, list[bytes]]:
             anew = typestore().serialize_cdr(entry.message, entry.type_name)
             found[entry.topic].append(bytes(anew))
     return found
+
+
+def assert_same(found: Path, expected: Path, topics: Collection[str], at_least: int = 1) -> None:
+    """Bags hold the same messages of these topics, bit by bit, and ``at_least`` so many of each.
+
+    A failure tells the first difference: whole messages would bury it.
+    """
+    for topic in topics:
+        mine, theirs = messages(found, topic), messages(expected, topic)
+        assert len(theirs) >= at_least, f"{topic}: {len(theirs)} messages expected"
+        bits = payloads(found, [topic])[topic], payloads(expected, [topic])[topic]
+        pairs = enumerate(zip(*bits, strict=False))
+        differing = next((i for i, (a, b) in pairs if a != b), None)
+        if differing is not None:
+            pytest.fail(
+                f"{topic}: message {differing} of {len(mine)} and {len(theirs)} differs:\n"
+                f"{mine[differing]}\n{theirs[differing]}"
+            )
+        assert len(mine) == len(theirs), topic
 
 
 def horizontal_errors(truth: list[Any], odometry: list[Any]) -> dict[int, float]:

@@ -7,16 +7,16 @@ from pathlib import Path
 import pytest
 from netpos.evaluation.smoothing import smoothing_gains
 from netpos.messages.topics import ODOMETRY_SMOOTHED, of_vue
-from netpos.scenario import load_scenario
 from runs import (
     ODOMETRY,
+    PATIENT,
     VUE,
+    assert_same,
     changed_scenario,
     finish,
     graphs,
     messages,
     netpos,
-    payloads,
     script,
     stamps,
 )
@@ -32,9 +32,8 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     scenario = changed_scenario(
         folder / "lagging.yaml",
         "metis_madrid",
-        {},
+        tracker={**PATIENT, "fixed_lag_s": LAG_S},
         max_duration_s=20.0,
-        tracker=dict(load_scenario("metis_madrid").tracker) | {"fixed_lag_s": LAG_S},
     )
     live, offline = folder / "live", folder / "offline"
     with graphs(folder) as (graph,):
@@ -44,10 +43,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def test_live_equals_offline(recordings: tuple[Path, Path]) -> None:
-    live, offline = (payloads(bag, (SMOOTHED, ODOMETRY)) for bag in recordings)
-    assert len(live[SMOOTHED]) > 200
-    assert live[SMOOTHED] == offline[SMOOTHED]
-    assert live[ODOMETRY] == offline[ODOMETRY]
+    assert_same(*recordings, (SMOOTHED, ODOMETRY), at_least=200)
 
 
 def test_every_epoch_but_the_last_second_is_smoothed_once(recordings: tuple[Path, Path]) -> None:

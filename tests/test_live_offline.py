@@ -13,7 +13,8 @@ from runs import (
     ESTIMATES,
     INFOS,
     MEASUREMENTS,
-    ODOMETRY,
+    PATIENT,
+    assert_same,
     changed_scenario,
     finish,
     graphs,
@@ -43,7 +44,11 @@ def pairs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pair]:
     device: dict[str, Any] = {"imu": {"rate_hz": 100.0}, "magnetometer": {"rate_hz": 50.0}}
     device["route"] = {"kind": "metis_random", "corner_radius_m": 3.0}
     metis = changed_scenario(
-        folder / "metis_short.yaml", "metis_madrid", device, max_duration_s=12.0
+        folder / "metis_short.yaml",
+        "metis_madrid",
+        device,
+        tracker=PATIENT,
+        max_duration_s=12.0,
     )
     made = {
         name: Pair(
@@ -69,21 +74,12 @@ def pairs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pair]:
 def test_same_simulation_and_measurements(pairs: dict[str, Pair], name: str) -> None:
     pair = pairs[name]
     topics = (INFOS, MEASUREMENTS, *pair.topics)
-    offline, live = payloads(pair.offline, topics), payloads(pair.live, topics)
-    for topic in topics:
-        assert offline[topic], topic
-        assert len(live[topic]) == len(offline[topic]), topic
-        assert live[topic] == offline[topic], topic
+    assert_same(pair.live, pair.offline, topics)
 
 
 @pytest.mark.parametrize("name", ["fast_pass", "metis"])
 def test_same_estimates(pairs: dict[str, Pair], name: str) -> None:
-    offline = payloads(pairs[name].offline, ESTIMATES)
-    live = payloads(pairs[name].live, ESTIMATES)
-    assert len(offline[ODOMETRY]) >= 40
-    for topic in ESTIMATES:
-        assert len(live[topic]) == len(offline[topic]), topic
-        assert live[topic] == offline[topic], topic
+    assert_same(pairs[name].live, pairs[name].offline, ESTIMATES, at_least=40)
 
 
 def test_a_seed_of_its_own_gives_other_noise(pairs: dict[str, Pair], tmp_path: Path) -> None:
@@ -103,7 +99,7 @@ def test_a_live_recording_replays_to_its_own_estimates(
     for pair in pairs.values():
         again = tmp_path / pair.live.name
         netpos("replay", pair.live, "--out", again)
-        assert payloads(again, ESTIMATES) == payloads(pair.live, ESTIMATES)
+        assert_same(again, pair.live, ESTIMATES)
 
 
 def test_a_live_recording_notes_run_and_qos(pairs: dict[str, Pair]) -> None:

@@ -10,7 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from runs import MEASUREMENTS, ODOMETRY, TRACK_STATUS, finish, graphs, netpos, payloads, script
+from runs import (
+    MEASUREMENTS,
+    ODOMETRY,
+    TRACK_STATUS,
+    assert_same,
+    finish,
+    graphs,
+    netpos,
+    script,
+)
 
 # 2-D RMSE [m] of a plain azimuth-only filter on the same runs
 BLE_REFERENCE_M = {"uc1_run1": 1.04, "uc1_run2": 0.96, "uc2_run1": 0.69}
@@ -87,11 +96,7 @@ def test_ble_angles_through_the_live_graph(ble: dict[str, Replayed]) -> None:
     with graphs(live.parent) as (graph,):
         finish(script(graph, "play_bag", offline.imported, live, "10"))
     topics = (MEASUREMENTS, ODOMETRY, TRACK_STATUS)
-    wanted, found = payloads(offline.replayed, topics), payloads(live, topics)
-    for topic in topics:
-        assert wanted[topic]
-        assert len(found[topic]) == len(wanted[topic]), topic
-        assert found[topic] == wanted[topic], topic
+    assert_same(live, offline.replayed, topics)
     figures = scored(live)
     for name in ("n", "rmse_m", "p95_m", "nees_mean", "nis_mean", "rejected"):
         assert figures[name] == offline.figures[name], name

@@ -18,12 +18,12 @@ from runs import (
     MEASUREMENTS,
     ODOMETRY,
     TRUTH,
+    assert_same,
     changed_scenario,
     finish,
     graphs,
     messages,
     netpos,
-    payloads,
     script,
 )
 from scipy.spatial.transform import Rotation
@@ -120,16 +120,12 @@ def test_live_replay_equals_offline_replay(
 ) -> None:
     replay = replays[name]
     topics = [*replay.estimates, MEASUREMENTS]
-    offline, live = payloads(replay.offline, topics), payloads(replay.live[rate], topics)
-    for topic in topics:
-        assert len(offline[topic]) >= 40, topic
-        assert len(live[topic]) == len(offline[topic]), topic
-        assert live[topic] == offline[topic], topic
+    assert_same(replay.live[rate], replay.offline, topics, at_least=40)
 
 
 def test_offline_replay_equals_the_run_it_was_recorded_in(replays: dict[str, Replays]) -> None:
     replay = replays["fast_pass"]
-    assert payloads(replay.offline, ESTIMATES) == payloads(replay.source, ESTIMATES)
+    assert_same(replay.offline, replay.source, ESTIMATES)
 
 
 def test_the_second_sensor_counts(replays: dict[str, Replays]) -> None:
@@ -153,7 +149,7 @@ def test_a_live_replay_replays_to_its_own_estimates(
     with BagReader(replay.source) as bag:
         settings = [f"--set={line.replace(': ', '=')}" for line in _lines(bag.metadata["tracker"])]
     netpos("replay", replay.live["10"], "--out", again, *settings)
-    assert payloads(again, ESTIMATES) == payloads(replay.live["10"], ESTIMATES)
+    assert_same(again, replay.live["10"], ESTIMATES)
 
 
 def test_a_live_replay_keeps_the_time_of_the_bag(replays: dict[str, Replays]) -> None:

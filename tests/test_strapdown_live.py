@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 from netpos.bags import codec
-from netpos.scenario import load_scenario
 from runs import (
     INFOS,
     MEASUREMENTS,
     ODOMETRY,
+    PATIENT,
     TRACK_STATUS,
     TRUTH,
+    assert_same,
     changed_scenario,
     finish,
     graphs,
@@ -23,7 +24,6 @@ from runs import (
 )
 
 SEED = "3"
-TRACKER = load_scenario("blocked_5g_drive").tracker
 
 
 def test_odometry_between_epochs_and_the_clock_are_the_same_live_and_offline(
@@ -45,7 +45,7 @@ def test_odometry_between_epochs_and_the_clock_are_the_same_live_and_offline(
                 "toa_sd_s": 3.336e-9,
             },
         },
-        tracker={**TRACKER, "odometry_rate_hz": 50.0},
+        tracker={**PATIENT, "odometry_rate_hz": 50.0},
     )
     live, offline = tmp_path / "live", tmp_path / "offline"
     with graphs(tmp_path) as (graph,):
@@ -53,37 +53,32 @@ def test_odometry_between_epochs_and_the_clock_are_the_same_live_and_offline(
         netpos("run", drive, "--offline", "--seed", SEED, "--bag", offline)
         finish(started)
     topics = (ODOMETRY, TRACK_STATUS, "/vue_1/clock_state")
-    mine, theirs = payloads(live, topics), payloads(offline, topics)
-    for topic in topics:
-        assert len(theirs[topic]) > 1000, topic
-        assert mine[topic] == theirs[topic], topic
+    assert_same(live, offline, topics, at_least=1000)
     again, sparse = tmp_path / "again", tmp_path / "sparse"
     netpos("replay", live, "--out", again)
-    assert payloads(again, topics) == mine
+    assert_same(again, live, topics)
     netpos("replay", live, "--out", sparse, "--set", "odometry_rate_hz=0", "--smooth")
     at_epochs = payloads(sparse, (ODOMETRY,))[ODOMETRY]
     assert len(at_epochs) < 30
-    assert set(at_epochs) <= set(mine[ODOMETRY])
+    assert set(at_epochs) <= set(payloads(live, (ODOMETRY,))[ODOMETRY])
     assert len(messages(sparse, "/vue_1/odometry_smoothed")) == len(at_epochs)
 
 
 def test_a_drive_in_space_is_the_same_live_and_offline(tmp_path: Path) -> None:
     """Every message alike, bit by bit; position, height and attitude are those of the truth."""
-    drive = changed_scenario(tmp_path / "drive.yaml", "blocked_5g_drive", max_duration_s=40.0)
+    drive = changed_scenario(
+        tmp_path / "drive.yaml", "blocked_5g_drive", tracker=PATIENT, max_duration_s=40.0
+    )
     live, offline = tmp_path / "live", tmp_path / "offline"
     with graphs(tmp_path) as (graph,):
         started = script(graph, "run_graph", drive, live, "4", SEED)
         netpos("run", drive, "--offline", "--seed", SEED, "--bag", offline)
         finish(started)
     topics = (INFOS, MEASUREMENTS, ODOMETRY, TRACK_STATUS, TRUTH, "/vue_1/imu", "/vue_1/beacon")
-    mine, theirs = payloads(live, topics), payloads(offline, topics)
-    for topic in topics:
-        assert theirs[topic], topic
-        assert len(mine[topic]) == len(theirs[topic]), topic
-        assert mine[topic] == theirs[topic], topic
+    assert_same(live, offline, topics)
     again = tmp_path / "again"
     netpos("replay", live, "--out", again)
-    assert payloads(again, (ODOMETRY,))[ODOMETRY] == mine[ODOMETRY]
+    assert_same(again, live, (ODOMETRY,))
     truth = {o.stamp_ns: o for o in map(codec().odometry_from_msg, messages(live, TRUTH))}
     found = [codec().odometry_from_msg(m) for m in messages(live, ODOMETRY)]
     assert len(found) >= 20

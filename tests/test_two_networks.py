@@ -10,17 +10,19 @@ from diagnostic_msgs.msg import DiagnosticArray
 from graph import wait_until
 from nav_msgs.msg import Odometry
 from netpos.messages.fields import stamp_ns
+from netpos.scenario import load_scenario
 from netpos_msgs.msg import TrackStatus
 from runs import (
     MEASUREMENTS,
     ODOMETRY,
+    PATIENT,
     TRACK_STATUS,
+    assert_same,
     changed_scenario,
     finish,
     graphs,
     messages,
     netpos,
-    payloads,
     script,
 )
 
@@ -34,7 +36,13 @@ FUSED = (ODOMETRY, TRACK_STATUS)
 def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """The scenario live, offline, and the offline bag through live trackers."""
     folder = tmp_path_factory.mktemp("two_networks")
-    short = changed_scenario(folder / "short.yaml", "two_networks", max_duration_s=25.0)
+    short = changed_scenario(
+        folder / "short.yaml",
+        "two_networks",
+        tracker=PATIENT,
+        max_duration_s=25.0,
+        fusion={**load_scenario("two_networks").fusion, **PATIENT},
+    )
     made = {name: folder / name for name in ("live", "offline", "played", "replayed")}
     netpos("run", short, "--offline", "--bag", made["offline"])
     with graphs(folder, 2) as (first, second):
@@ -49,11 +57,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.mark.parametrize("name", ["live", "played", "replayed"])
 def test_same_tracks_and_same_fused_odometry(bags: dict[str, Path], name: str) -> None:
     topics = (MEASUREMENTS, *TRACKS, *OWN, *FUSED)
-    expected, found = payloads(bags["offline"], topics), payloads(bags[name], topics)
-    for topic in topics:
-        assert len(expected[topic]) >= 40, topic
-        assert len(found[topic]) == len(expected[topic]), topic
-        assert found[topic] == expected[topic], topic
+    assert_same(bags[name], bags["offline"], topics, at_least=40)
 
 
 def test_both_networks_are_in_the_fused_track(bags: dict[str, Path]) -> None:

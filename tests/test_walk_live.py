@@ -16,7 +16,7 @@ from netpos.messages.values import ImuSample
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.offline import simulate_to_bag
 from netpos_msgs.msg import Step
-from runs import TRACK_STATUS, changed_scenario, finish, graphs, messages, netpos, script
+from runs import PATIENT, TRACK_STATUS, changed_scenario, finish, graphs, messages, netpos, script
 
 RATE = 4
 
@@ -31,7 +31,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> str:
         "pauses_s": [2.0, 0.7, 0.7, 0.7, 1.5],
     }
     path = tmp_path_factory.mktemp("walk") / "lap.yaml"
-    return str(changed_scenario(path, "pedestrian_walk", {"route": route}))
+    return str(changed_scenario(path, "pedestrian_walk", {"route": route}, tracker=PATIENT))
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from threading import Thread
 from typing import Any
 
+import numpy as np
 import pytest
 import rclpy
 from netpos.messages.values import Beacon, ImuSample
@@ -17,7 +18,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from vue_sim.conversions import publication, publications
-from vue_sim.node import VueSimNode
+from vue_sim.node import Pace, VueSimNode
 
 RATE = 50.0
 
@@ -89,6 +90,50 @@ def test_a_listener_hears_the_whole_scenario(ros: None) -> None:
             break
     player.join()
     assert heard == list(range(501))
+
+
+class Wall:
+    """A wall clock that a test moves."""
+
+    now_s = 100.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        assert seconds > 0.0
+        self.now_s += seconds
+
+
+def test_simulated_time_stands_still_while_the_machine_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The first value waits for nothing, and what a stall took is not caught up with."""
+    wall, pace = Wall(), Pace(rate=2.0)
+    monkeypatch.setattr("vue_sim.node.time", wall)
+    due_s = []
+    for simulated_s, busy_s in ((1.0, 0.0), (2.0, 0.0), (3.0, 0.0), (4.0, 0.0), (5.0, 3.0)):
+        wall.now_s += busy_s
+        pace.wait(simulated_s)
+        due_s.append(wall.now_s)
+    pace.wait(6.0)
+    np.testing.assert_allclose(due_s, [100.0, 100.5, 101.0, 101.5, 104.5])
+    assert wall.now_s == pytest.approx(105.0)
+    assert pace.lost_s == pytest.approx(2.5)
+    for simulated_s in (6.0, 6.0):  # all of an instant at once
+        pace.wait(simulated_s)
+    assert wall.now_s == pytest.approx(105.0)
+
+
+def test_a_short_delay_is_made_up_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    wall, pace = Wall(), Pace(rate=1.0)
+    monkeypatch.setattr("vue_sim.node.time", wall)
+    pace.wait(0.0)
+    wall.now_s += 1.04
+    pace.wait(1.0)
+    pace.wait(2.0)
+    assert wall.now_s == pytest.approx(102.0)
+    assert pace.lost_s == 0.0
 
 
 @pytest.mark.parametrize(

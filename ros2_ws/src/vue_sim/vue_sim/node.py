@@ -24,6 +24,33 @@ _INPUTS = (BEACON, INITIAL_POSE)  # what others need from the first message on
 _STEPS_INPUTS = (IMU, MAG)  # what dead reckoning needs of who walks
 _POLL_S = 0.02
 _DELIVERY_S = 5
+_STALL_S = 0.05  # further behind than this, what is lost is not caught up with
+
+
+class Pace:
+    """Simulated time against the wall clock.
+
+    After a stall it goes on at its rate: a burst of all that was due meanwhile would reach the
+    other nodes as if each of them had been stalled.
+    """
+
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
+        self._started_s: float | None = None
+        self.lost_s = 0.0
+        """Wall time [s] by which the simulation is behind its rate."""
+
+    def wait(self, simulated_s: float) -> None:
+        """Return when so much of simulated time is due; the first call is never early."""
+        now_s = time.monotonic()
+        if self._started_s is None:
+            self._started_s = now_s - simulated_s / self._rate
+        late_s = now_s - self._started_s - simulated_s / self._rate
+        if late_s < 0.0:
+            time.sleep(-late_s)
+        elif late_s > _STALL_S:
+            self._started_s += late_s
+            self.lost_s += late_s
 
 
 class VueSimNode(Node):
@@ -49,18 +76,18 @@ class VueSimNode(Node):
             f"{scenario.duration_s:.1f} s at rate {rate:g}"
         )
         self._hand_over_initial_poses()
-        started_s = time.monotonic()
+        pace = Pace(rate)
         for item in timeline(self._simulation, self._settings.clock_hz):
             if isinstance(item, InitialPose):
                 continue
             topic, stamp_ns, message = publication(item)
-            _sleep_until(started_s + (stamp_ns - scenario.start_ns) * 1e-9 / rate)
+            pace.wait((stamp_ns - scenario.start_ns) * 1e-9)
             if not self.context.ok():
                 return
             self._pubs[topic].publish(message)
         for publisher in self._pubs.values():
             publisher.wait_for_all_acked(Duration(seconds=_DELIVERY_S))
-        self.get_logger().info(f"{scenario.name} is over")
+        self.get_logger().info(f"{scenario.name} is over{_told(pace.lost_s)}")
         while not self._settings.shutdown_at_end and self.context.ok():
             time.sleep(_POLL_S)
 
@@ -92,10 +119,9 @@ class VueSimNode(Node):
             )
 
 
-def _sleep_until(due_s: float) -> None:
-    left_s = due_s - time.monotonic()
-    if left_s > 0:
-        time.sleep(left_s)
+def _told(lost_s: float) -> str:
+    """What to say of stalls."""
+    return f"; {lost_s:.1f} s behind its rate: this machine had no time" if lost_s else ""
 
 
 def _play(node: Node) -> None:

@@ -91,7 +91,7 @@ class Sequencer:
 
         ``history_ns``: how much older than the newest applied epoch an item may be.
         ``future_ns``: a stamp this far ahead of all others counts once a second one confirms it.
-        ``live_ns``: a channel this far behind the newest stamp is not waited for.
+        ``live_ns``: a channel this far, or ``hold_ns``, behind the newest stamp is not waited for.
         ``tick_ns``: once an RSU was heard, an epoch, without items if need be, at every multiple
         of it that the IMU reaches; 0: none.
         """
@@ -100,7 +100,7 @@ class Sequencer:
         self._history_ns = history_ns
         self._future_ns = future_ns
         # Between measurements of one a second, and their way here, ticks wait for them.
-        self._live_ns = live_ns + (hold_ns if tick_ns > 0 else 0)
+        self._live_ns = max(live_ns, hold_ns) + (hold_ns if tick_ns > 0 else 0)
         self._tick_ns = tick_ns
         self._pending: dict[int, Epoch] = {}
         self._applied: dict[int, Epoch] = {}

@@ -130,9 +130,12 @@ def test_a_live_channel_is_waited_for() -> None:
     assert len(epoch.items) == 2
 
 
-def test_a_channel_silent_for_more_than_a_second_is_not_waited_for() -> None:
-    for silence_ns, waits in ((1_000_000_000, True), (1_000_000_001, False)):
-        s = Sequencer(5000 * MS)
+@pytest.mark.parametrize(("hold_ms", "limit_ms"), [(250, 1000), (5000, 5000)])
+def test_a_channel_silent_for_a_second_and_the_hold_is_not_waited_for(
+    hold_ms: int, limit_ms: int
+) -> None:
+    for silence_ns, waits in ((limit_ms * MS, True), (limit_ms * MS + 1, False)):
+        s = Sequencer(hold_ms * MS)
         s.add(velocity(50))
         s.release()
         s.add(replace(rsu(50, expected=1), stamp_ns=50 * MS + silence_ns))
