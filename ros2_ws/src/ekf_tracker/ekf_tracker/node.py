@@ -10,7 +10,7 @@ from netpos.messages import topics
 from netpos.tracking import Tracker, TrackOutput
 from netpos.tracking.warm_up import warm_up, warm_up_anchors
 from netpos_msgs.msg import NetworkTrack, RsuInfo, RsuMeasurement
-from netpos_node import CDR, CODEC, LATCHED, STREAM, run
+from netpos_node import CDR, CODEC, LATCHED, STREAM, run, take_waiting
 from netpos_node.estimating import EstimatingNode, spin
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu
@@ -57,7 +57,7 @@ class EkfTrackerNode(EstimatingNode):
             warm_up_anchors()
 
     def _on_measurement(self, cdr: bytes) -> None:
-        self._take_waiting(*self._inputs[0])  # descriptions of RSUs come first
+        take_waiting(*self._inputs[0])  # descriptions of RSUs come first
         measurement = CDR.measurement(cdr)
         if measurement is None:
             measurement = CODEC.measurement_from_msg(deserialize_message(cdr, RsuMeasurement))

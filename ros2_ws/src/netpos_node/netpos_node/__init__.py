@@ -17,6 +17,7 @@ import rclpy
 from netpos.bags import cdr_codec
 from netpos.messages.codec import Codec
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.duration import Duration
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.executors import ExternalShutdownException
 from rclpy.experimental import EventsExecutor
@@ -24,6 +25,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import uninstall_signal_handlers
+from rclpy.subscription import Subscription
 
 Config = TypeVar("Config")
 
@@ -128,6 +130,20 @@ def spin_until_stopped(node: Node, finish: Callable[[], None]) -> None:
     while not stopping:
         executor.spin_once(timeout_sec=0.05)
     finish()
+
+
+def take_waiting(subscription: Subscription, on_message: Callable[[Any], None]) -> None:
+    """Hand over all that has arrived of a subscription."""
+    kind = subscription.msg_type, subscription.raw
+    with subscription.handle:
+        while taken := subscription.handle.take_message(*kind):
+            on_message(taken[0])
+
+
+def see_delivered(node: Node) -> None:
+    """Wait until what a node has published is acknowledged, a second per topic at most."""
+    for publisher in node.publishers:
+        publisher.wait_for_all_acked(Duration(seconds=1))
 
 
 def declare(node: Node, name: str, default: Any, text: str) -> Any:

@@ -21,10 +21,17 @@ from rclpy.subscription import Subscription
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 
-from netpos_node import BACKLOG, CDR, STREAM, spin_until_stopped, wait_until_heard
+from netpos_node import (
+    BACKLOG,
+    CDR,
+    STREAM,
+    see_delivered,
+    spin_until_stopped,
+    take_waiting,
+    wait_until_heard,
+)
 
 _SILENCE_S = 2.0  # long: a stalled machine must not look like the end of the measurements
-_DELIVERY_S = 1
 _PATIENCE_S = 30.0
 
 
@@ -107,13 +114,6 @@ class EstimatingNode(Node):
         subscription = self.create_subscription(msg_type, topic, on_message, qos, raw=raw)
         self._inputs.append((subscription, on_message))
 
-    @staticmethod
-    def _take_waiting(subscription: Subscription, on_message: Callable[[Any], None]) -> None:
-        kind = subscription.msg_type, subscription.raw
-        with subscription.handle:
-            while taken := subscription.handle.take_message(*kind):
-                on_message(taken[0])
-
     # outputs
 
     def _add_outputs(self, vue_id: str, network: str = "", *, smoothed: bool = False) -> None:
@@ -155,10 +155,9 @@ class EstimatingNode(Node):
     def finish(self) -> None:
         """Give out what still follows from all that has arrived, and see it delivered."""
         for waiting in self._inputs:
-            self._take_waiting(*waiting)
+            take_waiting(*waiting)
         self._publish(self._core.flush())
-        for publisher in self.publishers:
-            publisher.wait_for_all_acked(Duration(seconds=_DELIVERY_S))
+        see_delivered(self)
 
     # time and services
 

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from operator import itemgetter
 from typing import Any
 
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from netpos.inertial.pdr import PedestrianDeadReckoning
 from netpos.messages import topics
+from netpos.messages.fields import stamp_ns
 from netpos_msgs.msg import Step
-from netpos_node import BACKLOG, CODEC, STREAM, run, wait_until_heard
+from netpos_node import (
+    BACKLOG,
+    CODEC,
+    STREAM,
+    run,
+    see_delivered,
+    spin_until_stopped,
+    take_waiting,
+    wait_until_heard,
+)
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, MagneticField
 
@@ -31,8 +43,10 @@ class PdrNode(Node):
             TwistWithCovarianceStamped, topics.of_vue(vue, topics.STEP_VELOCITY), STREAM
         )
         self._wait_for_subscribers(parameters.subscribers)
-        self.create_subscription(Imu, topics.of_vue(vue, topics.IMU), self._on_imu, BACKLOG)
-        self.create_subscription(
+        self._imu_sub = self.create_subscription(
+            Imu, topics.of_vue(vue, topics.IMU), self._on_imu, BACKLOG
+        )
+        self._mag_sub = self.create_subscription(
             MagneticField, topics.of_vue(vue, topics.MAG), self._on_magnetic_field, BACKLOG
         )
 
@@ -58,7 +72,26 @@ class PdrNode(Node):
         sample = CODEC.magnetic_field_from_msg(msg)
         self._core.add_magnetic_field(sample.stamp_ns, sample.magnetic_field)
 
+    def finish(self) -> None:
+        """Give out what still follows from all that has arrived, and see it delivered."""
+        waiting: list[tuple[int, Callable[[Any], None], Any]] = []
+        for sub, handler in (
+            (self._mag_sub, self._on_magnetic_field),
+            (self._imu_sub, self._on_imu),
+        ):
+            taken: list[Any] = []
+            take_waiting(sub, taken.append)
+            waiting += [(stamp_ns(msg.header.stamp), handler, msg) for msg in taken]
+        for _, handler, msg in sorted(waiting, key=itemgetter(0)):
+            handler(msg)
+        see_delivered(self)
+
+
+def _spin(node: Node) -> None:
+    assert isinstance(node, PdrNode)
+    spin_until_stopped(node, node.finish)
+
 
 def main() -> None:
     """Entry point of ``ros2 run pdr_node pdr_node``."""
-    run(PdrNode)
+    run(PdrNode, _spin)

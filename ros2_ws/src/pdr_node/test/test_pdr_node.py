@@ -13,10 +13,12 @@ from netpos.inertial.pdr_output import StepEvent, StepVelocity
 from netpos.inertial.pdr_values import frame_of, step_value, velocity_value
 from netpos.inertial.steps import StepConfig
 from netpos.messages.values import ImuSample, MagneticSample
-from netpos_node import CODEC
+from netpos_node import BACKLOG, CODEC, wait_until_heard
 from nodes import Kept, nodes_of
 from pdr_node.node import PdrNode
+from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from sensor_msgs.msg import Imu, MagneticField
 
 DOMAIN = 36
 G = 9.80665
@@ -29,9 +31,8 @@ def make() -> Iterator[Any]:
         yield node
 
 
-def walk(node: PdrNode, magnetic: bool, stop_s: float = 16.0) -> tuple[list[Any], list[Any]]:
-    """3 s of rest, then 1.8 steps per second, heading 30 deg; steps and velocities published."""
-    node._step_pub, node._velocity_pub = Kept(), Kept()  # type: ignore[assignment]
+def samples(magnetic: bool, stop_s: float) -> Iterator[Any]:
+    """Messages of 3 s of rest, then 1.8 steps per second, heading 30 deg."""
     rng = np.random.default_rng(3)
     yaw = math.radians(30.0)
     c, s = math.cos(yaw), math.sin(yaw)
@@ -48,14 +49,41 @@ def walk(node: PdrNode, magnetic: bool, stop_s: float = 16.0) -> tuple[list[Any]
         )
         if magnetic:
             mag = MagneticSample(stamp_ns=stamp, vue_id="vue_1", magnetic_field=field)
-            node._on_magnetic_field(CODEC.magnetic_field_to_msg(mag))
-        node._on_imu(CODEC.imu_to_msg(sample))
+            yield CODEC.magnetic_field_to_msg(mag)
+        yield CODEC.imu_to_msg(sample)
+
+
+def walk(node: PdrNode, magnetic: bool, stop_s: float = 16.0) -> tuple[list[Any], list[Any]]:
+    """Steps and velocities published of ``samples``."""
+    node._step_pub, node._velocity_pub = Kept(), Kept()  # type: ignore[assignment]
+    for msg in samples(magnetic, stop_s):
+        (node._on_imu if isinstance(msg, Imu) else node._on_magnetic_field)(msg)
     return node._step_pub.messages, node._velocity_pub.messages  # type: ignore[attr-defined]
 
 
 def test_frame_of() -> None:
     assert frame_of("vue_1", "map") == "map"
     assert frame_of("vue_1", "relative") == "vue_1/pdr_start"
+
+
+def test_what_waits_when_the_node_is_stopped_is_used(make: Any) -> None:
+    """Ten seconds of samples that nobody took yet: the same steps and velocities as in order."""
+    expected = walk(make(), magnetic=True, stop_s=10.0)
+    node = make()
+    node._step_pub, node._velocity_pub = Kept(), Kept()
+    publishers = {
+        Imu: node.create_publisher(Imu, "/vue_1/imu", BACKLOG),
+        MagneticField: node.create_publisher(MagneticField, "/vue_1/mag", BACKLOG),
+    }
+    unheard = {p.topic_name: p for p in publishers.values()}
+    assert not wait_until_heard(unheard, dict.fromkeys(unheard, 1), 20.0, settle_s=0.0)
+    for msg in samples(magnetic=True, stop_s=10.0):
+        publishers[type(msg)].publish(msg)
+    for publisher in publishers.values():
+        assert publisher.wait_for_all_acked(Duration(seconds=20))
+    node.finish()
+    assert len(expected[0]) > 5
+    assert (node._step_pub.messages, node._velocity_pub.messages) == expected
 
 
 def test_step_conversion() -> None:
