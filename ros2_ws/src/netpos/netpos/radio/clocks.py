@@ -37,6 +37,19 @@ class ClockModel:
     drift_step_sd: float = Field(default=6.3e-8, ge=0)
     beta: float = Field(default=1.0, gt=0, le=1)
 
+    def densities(self, step_s: float) -> tuple[float, float]:
+        """White [s/sqrt(s)] and random-walk [(s/s)/sqrt(s)] frequency noise of the continuous
+        clock whose offsets at instants ``step_s`` apart have the law of this one's (beta 1).
+
+        The second differences of the offsets here are eta T, white. Those of a continuous clock
+        (w, q) have the variance 2 w^2 T + 2/3 q^2 T^3 and the covariance -w^2 T + q^2 T^3 / 6 with
+        the next: white, too, where w^2 = q^2 T^2 / 6.
+        """
+        return (
+            self.drift_step_sd * math.sqrt(step_s / 6.0),
+            self.drift_step_sd / math.sqrt(step_s),
+        )
+
 
 def simulate_clock(
     model: ClockModel, stamps_ns: npt.NDArray[np.int64], seed: int, name: str

@@ -44,6 +44,27 @@ def test_fixed_start() -> None:
     np.testing.assert_allclose(offset[-1], 20e-6 + 25e-6 * 399 * 0.08365)
 
 
+@pytest.mark.parametrize("step_s", [0.0167, 1.0, 3.0])
+def test_a_continuous_clock_has_the_same_offsets(step_s: float) -> None:
+    """Covariance of the second differences of six offsets, which hold all but the start: of a
+    state moved by F and Q, and of eta T."""
+    model = ClockModel()
+    white, walk = model.densities(step_s)
+    F = np.array([[1.0, step_s], [0.0, 1.0]])
+    across = walk**2 * step_s**2 / 2
+    Q = np.array([[white**2 * step_s + walk**2 * step_s**3 / 3, across], [across, 0.0]])
+    Q[1, 1] = walk**2 * step_s
+    # each offset as a sum of the noises (2 each) of the steps before it
+    offsets = np.zeros((6, 12))
+    for n in range(6):
+        for k in range(n + 1):
+            offsets[n, 2 * k : 2 * k + 2] = np.linalg.matrix_power(F, n - k)[0]
+    second = np.diff(offsets, n=2, axis=0)
+    covariance = second @ np.kron(np.eye(6), Q) @ second.T
+    expected = (model.drift_step_sd * step_s) ** 2 * np.eye(4)
+    np.testing.assert_allclose(covariance, expected, atol=1e-12 * expected[0, 0])
+
+
 def test_bad_model_is_refused() -> None:
     with pytest.raises(ValueError, match="drift_sd"):
         ClockModel(drift_sd=-1.0)

@@ -48,8 +48,6 @@ FIX, FIX_HEIGHT, LOOSE, LOOSE_DIAGONAL, LOOSE_FIXED, TIGHT, VEHICLE = (
 VARIANTS = (FIX, FIX_HEIGHT, LOOSE, LOOSE_DIAGONAL, LOOSE_FIXED, TIGHT, VEHICLE)
 RANGE_SD_M = 1.0
 FEW_STATIONS = 2
-# Of the device's clock, as it is simulated [(s/s)/sqrt(s)].
-CLOCK_WALK_DENSITY = 6.3e-8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,9 +90,9 @@ class Run:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tally:
     """Sums over the epochs of some runs, of one variant. square: north, east, down error^2 [m^2];
-    solved of n epochs; nees: its sums for position (3) and position, velocity, attitude (9);
-    outage_m: (k, 2) horizontal and 3-D errors at the end of the outages; clock_m2: error^2 and
-    variance of the clock's offset [m^2], 0 without one."""
+    solved of n epochs; nees: its sums for position (3), position, velocity, attitude (9) and the
+    clock's offset (1); outage_m: (k, 2) horizontal and 3-D errors at the end of the outages;
+    clock_m2: error^2 and variance of the clock's offset [m^2]. Without a clock its sums are 0."""
 
     n: int
     solved: int
@@ -133,8 +131,9 @@ class Tally:
         return error, said
 
     def nees_test(self, states: int) -> MeanTest:
-        """Mean NEES of the position (``states`` 3) or of all but the biases (9)."""
-        which = {3: 0, 9: 1}[states]
+        """Mean NEES of the position (``states`` 3), of all but the biases (9) or of the clock's
+        offset (1)."""
+        which = {3: 0, 9: 1, 1: 2}[states]
         n_eff = float(self.n_eff[which])
         return MeanTest(
             mean=float(self.nees[which] / self.n),
@@ -163,8 +162,11 @@ def changes_of(case: Case) -> dict[str, Any]:
 
 def config_of(case: Case) -> TrackerConfig:
     """The scenario's own tracker parameters, and those of the clock."""
-    parameters = {"clock_walk_density": CLOCK_WALK_DENSITY}
-    return TrackerConfig.from_mapping({**simulation_of(case).scenario.tracker, **parameters})
+    scenario = simulation_of(case).scenario
+    device = scenario.devices[0]
+    white, walk = device.clock.densities(device.beacon_interval_s)
+    parameters = {"clock_white_density": white, "clock_walk_density": walk}
+    return TrackerConfig.from_mapping({**scenario.tracker, **parameters})
 
 
 def epochs_of(simulation: Simulation, case: Case) -> Epochs:
@@ -266,8 +268,8 @@ def _tally_fixes(done: Run, fixes: Fixes) -> Tally:
         n=good.size,
         solved=int(good.sum()),
         square=(error**2).sum(axis=0),
-        nees=np.zeros(2),
-        n_eff=np.zeros(2),
+        nees=np.zeros(3),
+        n_eff=np.zeros(3),
         outage_m=np.zeros((0, 2)),
         clock_m2=np.zeros(2),
     )
@@ -288,6 +290,8 @@ def error_of(done: Run, result: Drive) -> Array:
 def _tally_drive(done: Run, result: Drive) -> Tally:
     error = error_of(done, result)
     values = [nees(error[:, :k], result.cov[:, :k, :k])[0] for k in (3, 9)]
+    offset, offset_var = _clock(done, result)
+    values.append(nees(offset[:, None], offset_var[:, None, None])[0])
     silent = ~done.heard
     ends = np.flatnonzero(silent[:-1] & done.heard[1:])
     ends = ends[ends >= OUTAGE_EVERY_S // 2]  # of whole outages
@@ -297,18 +301,17 @@ def _tally_drive(done: Run, result: Drive) -> Tally:
         solved=int(np.isfinite(error).all(axis=1).sum()),
         square=(ned(error[:, :3]) ** 2).sum(axis=0),
         nees=np.array([v.sum() for v in values]),
-        n_eff=np.array([effective_size(v) for v in values]),
+        n_eff=np.array([effective_size(v) if v.size else 0.0 for v in values]),
         outage_m=np.column_stack(at_end),
-        clock_m2=_clock_square(done, result),
+        clock_m2=np.array([(offset**2).sum(), offset_var.sum()]),
     )
 
 
-def _clock_square(done: Run, result: Drive) -> Array:
-    """(2,) sums over the epochs of squared error and of variance of the clock's offset [m^2]."""
+def _clock(done: Run, result: Drive) -> tuple[Array, Array]:
+    """(N,) error [m] and variance [m^2] of the clock's offset; 0 without one."""
     if result.cov.shape[1] <= CLOCK:
-        return np.zeros(2)
-    error = result.nav[:, CLOCK + 1] - done.clock_m
-    return np.array([(error**2).sum(), result.cov[:, CLOCK, CLOCK].sum()])
+        return np.zeros(len(result.nav)), np.zeros(len(result.nav))
+    return result.nav[:, CLOCK + 1] - done.clock_m, result.cov[:, CLOCK, CLOCK]
 
 
 def tally_seeds(case: Case, seeds: range) -> dict[str, Tally]:

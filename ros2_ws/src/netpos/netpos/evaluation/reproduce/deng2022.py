@@ -190,10 +190,11 @@ def _one_way(tallies: dict[str, Tally]) -> Iterator[Row]:
         error, said = tally.clock_ns
         yield shown(f"{label}: RMS clock offset", "ns", error)
         yield shown(f"{label}: clock offset sd as stated", "ns", said)
-        test = tally.nees_test(3)
-        careful = test.mean <= test.bounds[1]
-        ok = careful if variant == VEHICLE else test.consistent
-        yield required(f"{label}: NEES of position (expected 3)", "1", test.mean, ok)
+        for states, what in ((3, "position"), (1, "clock offset")):
+            test = tally.nees_test(states)
+            careful = test.mean <= test.bounds[1]
+            ok = careful if variant == VEHICLE else test.consistent
+            yield required(f"{label}: NEES of {what} (expected {states})", "1", test.mean, ok)
 
 
 def _real(work: Work) -> Iterator[Row]:

@@ -25,6 +25,7 @@ from netpos.evaluation.reproduce.blocked_drive import (
 )
 from netpos.evaluation.reproduce.frame import Work
 from netpos.filters.position_fix import FixStatus
+from netpos.filters.space import CLOCK
 from scipy.spatial.transform import Rotation
 
 SEED = 5001
@@ -117,8 +118,11 @@ def test_every_cell_has_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
             found += [rows[f"{label}: RMS {axis}"] for axis in ("north", "east", "down")]
             assert tuple(row.paper for row in found) == cells
             assert all(row.ok is not None for row in found)
+    one_way = f"{deng2022.ONE_WAY.name}, SINS, {TIGHT}"
     for axis in ("north", "east", "down"):
-        assert rows[f"{deng2022.ONE_WAY.name}, SINS, {TIGHT}: RMS {axis}"].ours is not None
+        assert rows[f"{one_way}: RMS {axis}"].ours is not None
+    for what in ("position (expected 3)", "clock offset (expected 1)"):
+        assert rows[f"{one_way}: NEES of {what}"].ok is not None
     real = [row for row in outcome.rows if row.name.startswith("Real")]
     assert len(real) == 22
     assert all(row.ours is None for row in real)
@@ -156,8 +160,20 @@ def test_one_way_times_find_the_clock() -> None:
     assert set(found) == {FIX, FIX_HEIGHT, TIGHT, VEHICLE}
     error, said = found[TIGHT].clock_ns
     assert said < 6.0
-    assert error < 3.0 * said
+    assert error == pytest.approx(said, rel=0.2)
+    assert found[TIGHT].nees_test(1).consistent
     assert np.hypot(*found[TIGHT].rms_m[:2]) < 3.0
+
+
+def test_the_clock_is_judged_by_its_own_variance() -> None:
+    done = run(deng2022.ONE_WAY, SEED + 2)
+    found = tally_seeds(deng2022.ONE_WAY, range(SEED + 2, SEED + 3))[VEHICLE]
+    result = done.drives[VEHICLE]
+    error, sd = result.nav[:, CLOCK + 1] - done.clock_m, np.sqrt(result.cov[:, CLOCK, CLOCK])
+    assert found.nees_test(1).mean == pytest.approx(np.mean((error / sd) ** 2))
+    to_ns = 1e9 / 299_792_458.0
+    assert found.clock_ns[0] == pytest.approx(to_ns * np.sqrt(np.mean(error**2)))
+    assert found.clock_ns[1] == pytest.approx(to_ns * np.sqrt(np.mean(sd**2)))
 
 
 def test_smoothing_bridges_outages() -> None:
