@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "ros2_ws" / "src"
 LIBRARY = SOURCE / "netpos" / "netpos"
 NODE_PACKAGES = ("rsu_sensor", "vue_sim", "pdr_node", "ekf_tracker", "track_fusion")
-MAX_LINES = 450
+MAX_LINES = 400
 
 # A room may import itself and the rooms named here; nothing imports backwards.
 MAY_IMPORT: dict[str, set[str]] = {
@@ -139,4 +139,4 @@ def test_files_stay_short() -> None:
         for folder in folders
         for path in python_files(folder)
     }
-    assert {name: lines for name, lines in lengths.items() if lines >= MAX_LINES} == {}
+    assert {name: lines for name, lines in lengths.items() if lines > MAX_LINES} == {}

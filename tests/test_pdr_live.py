@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from geometry_msgs.msg import TwistWithCovarianceStamped
-from graph import Collector, wait_until
+from graph import Collector, Graph, wait_until
 from nav_msgs.msg import Odometry
 from netpos.bags import BagWriter, codec
 from netpos.messages.fields import stamp_ns
@@ -96,6 +96,14 @@ class Heard:
     status: dict[str, list[Any]]
 
 
+def send_last(graph: Graph, status: Collector) -> None:
+    """One more measurement: what was refused shows in the status of the next epoch."""
+    out = graph.publisher("/rsu/measurements", RsuMeasurementMessage)
+    wait_until(lambda: out.get_subscription_count() > 0, "the tracker to listen")
+    out.publish(CODEC.measurement_to_msg(heard(LAST_NS)))
+    wait_until(lambda: stamp_ns(status.messages[-1].header.stamp) == LAST_NS, "the last status")
+
+
 @pytest.fixture(scope="module")
 def walked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Heard]:
     folder = tmp_path_factory.mktemp("pdr")
@@ -140,12 +148,7 @@ def walked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Heard]:
             lambda: last in [m.header.stamp for m in odometry["vue_1"].messages[-1:]],
             "the last odometry",
         )
-        # what was refused shows in the status of the next epoch
-        out = graph.publisher("/rsu/measurements", RsuMeasurementMessage)
-        wait_until(lambda: out.get_subscription_count() > 0, "the tracker to listen")
-        out.publish(CODEC.measurement_to_msg(heard(LAST_NS)))
-        statuses = status["vue_2"].messages
-        wait_until(lambda: stamp_ns(statuses[-1].header.stamp) == LAST_NS, "the last status")
+        send_last(graph, status["vue_2"])
         found = ({vue: list(c.messages) for vue, c in group.items()} for group in listened)
         yield Heard(*found)
 

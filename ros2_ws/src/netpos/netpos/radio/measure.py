@@ -238,6 +238,43 @@ def _phase(stamp_ns: int, k: int, cosine: float, sites: Sites, sd: float) -> flo
 
 
 @njit(cache=True)
+def _measure(
+    stamp_ns: int,
+    position: Array,
+    clock_offset_s: float,
+    k: int,
+    sites: Sites,
+    errors: Errors,
+    values: Array,
+    variances: Array,
+) -> float:
+    """Fill ``values`` and ``variances`` (5,) with what RSU k measures of a beacon; returns the
+    received power [dBm]."""
+    x, y, z = _in_axes(position, k, sites)
+    distance = math.sqrt(x * x + y * y + z * z)
+    azimuth = math.atan2(y, x)
+    elevation = math.atan2(z, math.hypot(x, y)) if z != 0.0 else z
+    var, rssi_dbm = _variances(azimuth, elevation, distance, errors)
+    noise = draw_normals(stamp_ns, 0, 0, sites.noise_key[k])
+    values[AZIMUTH] = _wrap(azimuth + math.sqrt(var[AZIMUTH]) * noise[AZIMUTH])
+    values[ELEVATION] = elevation + math.sqrt(var[ELEVATION]) * noise[ELEVATION]
+    rsu_clock_s = clock_error(stamp_ns * 1e-9, sites.clock_tones[k])
+    to_master = distance
+    if sites.baseline_m[k] > 0.0:
+        to_master = math.hypot(math.hypot(x, z), y + sites.baseline_m[k] / 2.0)
+        sd = math.sqrt(errors.fixed[PHASE])
+        values[PHASE] = _phase(stamp_ns, k, y / distance, sites, sd)
+        variances[PHASE] = errors.fixed[PHASE]
+    delay = to_master / SPEED_OF_LIGHT_MPS + clock_offset_s - rsu_clock_s
+    values[TOA] = delay + math.sqrt(var[TOA]) * noise[TOA]
+    ranged = to_master * (1.0 + sites.range_scale[k]) + sites.range_offset_m[k]
+    values[RANGE] = ranged + math.sqrt(var[RANGE]) * noise[RANGE]
+    for quantity in range(4):
+        variances[quantity] = var[quantity]
+    return float(rssi_dbm)
+
+
+@njit(cache=True)
 def observe(
     stamps_ns: Ints,
     positions: Array,
@@ -268,26 +305,14 @@ def observe(
             heard_by[i] = min(heard_by[i], most)
             rsu[i, heard_by[i] :] = -1
         for j in range(heard_by[i]):
-            k = rsu[i, j]
-            x, y, z = _in_axes(position, k, sites)
-            distance = math.sqrt(x * x + y * y + z * z)
-            azimuth = math.atan2(y, x)
-            elevation = math.atan2(z, math.hypot(x, y)) if z != 0.0 else z
-            var, rssi[i, j] = _variances(azimuth, elevation, distance, errors)
-            noise = draw_normals(stamps_ns[i], 0, 0, sites.noise_key[k])
-            values[i, j, AZIMUTH] = _wrap(azimuth + math.sqrt(var[AZIMUTH]) * noise[AZIMUTH])
-            values[i, j, ELEVATION] = elevation + math.sqrt(var[ELEVATION]) * noise[ELEVATION]
-            rsu_clock_s = clock_error(stamps_ns[i] * 1e-9, sites.clock_tones[k])
-            to_master = distance
-            if sites.baseline_m[k] > 0.0:
-                to_master = math.hypot(math.hypot(x, z), y + sites.baseline_m[k] / 2.0)
-                sd = math.sqrt(errors.fixed[PHASE])
-                values[i, j, PHASE] = _phase(stamps_ns[i], k, y / distance, sites, sd)
-                variances[i, j, PHASE] = errors.fixed[PHASE]
-            delay = to_master / SPEED_OF_LIGHT_MPS + clock_offsets_s[i] - rsu_clock_s
-            values[i, j, TOA] = delay + math.sqrt(var[TOA]) * noise[TOA]
-            ranged = to_master * (1.0 + sites.range_scale[k]) + sites.range_offset_m[k]
-            values[i, j, RANGE] = ranged + math.sqrt(var[RANGE]) * noise[RANGE]
-            for quantity in range(4):
-                variances[i, j, quantity] = var[quantity]
+            rssi[i, j] = _measure(
+                stamps_ns[i],
+                position,
+                clock_offsets_s[i],
+                rsu[i, j],
+                sites,
+                errors,
+                values[i, j],
+                variances[i, j],
+            )
     return Observations(heard_by, rsu, values, variances, rssi)

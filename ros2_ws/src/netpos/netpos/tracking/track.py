@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -352,23 +353,14 @@ class Track:
         self._predict(epoch.stamp_ns)
         state, config = self._state, self._config
         estimate, rejected = state.estimate, total(self.refused, state.rejected)
+        status_of = partial(
+            track_status, config, self._vue_id, epoch, accepted=state.accepted, rejected=rejected
+        )
         if estimate is None:
-            status = track_status(
-                config,
-                self._vue_id,
-                epoch,
-                accepted=state.accepted,
-                rejected=rejected,
-                heard_ns=None,
-            )
+            status = status_of(heard_ns=None)
             return TrackOutput(None, None, status, network=config.network)
         mean, cov = estimate.mean, estimate.cov
-        status = track_status(
-            config,
-            self._vue_id,
-            epoch,
-            accepted=state.accepted,
-            rejected=rejected,
+        status = status_of(
             heard_ns=state.last_accepted_ns,
             position_sd_m=output.largest_sd(cov),
             level_m=self._level(epoch.stamp_ns, estimate),

@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from netpos.bags import BagError, BagReader, codec
+from imported_bag import values
+from netpos.bags import BagError, BagReader
 from netpos.bags.importers import import_uwb_trolley
 from netpos.bags.importers.uwb_trolley import TAGS_M, LinkErrors
-from netpos.messages.values import Field, Odometry, RsuInfo, RsuMeasurement
+from netpos.messages.values import Field, Odometry
 from netpos.tracking import TrackerConfig
 from netpos.tracking.settings import bag_settings
 
@@ -44,19 +45,6 @@ def trolley_folder(path: Path, uwb: str = UWB, motion: str = MOTION) -> Path:
     (path / "UWB_test.csv").write_text(uwb)
     (path / "motion_capture_test.csv").write_text(motion)
     return path
-
-
-def values(bag: Path) -> tuple[list[RsuInfo], list[RsuMeasurement], list[Odometry]]:
-    make = codec()
-    with BagReader(bag) as reader:
-        infos = [make.rsu_info_from_msg(e.message) for e in reader.messages(["/rsu/info"])]
-        measured = [
-            make.measurement_from_msg(e.message) for e in reader.messages(["/rsu/measurements"])
-        ]
-        truth = [
-            make.odometry_from_msg(e.message) for e in reader.messages(["/vue_1/ground_truth"])
-        ]
-    return infos, measured, truth
 
 
 def heading(odometry: Odometry) -> float:

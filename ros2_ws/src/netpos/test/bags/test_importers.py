@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from netpos.bags import BagError, BagReader, codec
+from imported_bag import values
+from netpos.bags import BagError
 from netpos.bags.importers import import_ble_aoa, import_uwb_anchors
 from netpos.bags.importers.common import truth_of_poses
-from netpos.messages.values import Array, Field, Odometry, RsuInfo, RsuMeasurement
+from netpos.messages.values import Array, Field, Odometry
 from scipy.spatial.transform import Rotation
 
 DATA = Path(os.environ.get("NETPOS_DATA", Path(__file__).parents[6] / "shared" / "data"))
@@ -38,26 +39,6 @@ timestamp,x,y,z,heading_degrees
 1.125e+9,0.0,0.25,0.0,99.0
 1.25e+9,0.0,0.5,0.1,108.0
 """
-
-
-def values(bag: Path) -> tuple[list[RsuInfo], list[RsuMeasurement], list[Odometry]]:
-    make = codec()
-    with BagReader(bag) as reader:
-        infos = [make.rsu_info_from_msg(e.message) for e in reader.messages(["/rsu/info"])]
-        measured = [
-            make.measurement_from_msg(e.message) for e in reader.messages(["/rsu/measurements"])
-        ]
-        truth = [
-            make.odometry_from_msg(e.message) for e in reader.messages(["/vue_1/ground_truth"])
-        ]
-        stamps = [e.log_time_ns for e in reader.messages()]
-        assert stamps == sorted(stamps)
-        first = next(iter(reader.messages()))
-        assert first.topic == "/rsu/info"
-        for entry in reader.messages():
-            stamp = entry.message.header.stamp
-            assert entry.log_time_ns == stamp.sec * 10**9 + stamp.nanosec
-    return infos, measured, truth
 
 
 def ble_folder(path: Path, beacons: str = BEACONS, truth: str = TRUTH) -> Path:

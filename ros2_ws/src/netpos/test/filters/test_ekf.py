@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from fractions import Fraction
 
 import numpy as np
 import pytest
-from ekf_update import fused, updated
+from ekf_update import exact_fuse, fused, updated
 from filter_rows import NO_GATE, linear_row, random_spd
 from netpos.filters import ekf, fusion
 from netpos.filters.measurement import (
     GROUP,
     VALUE,
 )
-from netpos.messages.values import Array
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -76,22 +74,6 @@ def test_fuse_stays_positive_definite_when_ill_conditioned(order: int) -> None:
         np.testing.assert_array_equal(P, P.T)
         np.linalg.cholesky(P)
     assert np.isfinite(x).all()
-
-
-def exact_fuse(x: Array, P: Array, nu: Array, H: Array, R: Array) -> tuple[Array, Array]:
-    """The batch update in rational arithmetic: no rounding at all."""
-    x, P, nu, H, R = (
-        np.vectorize(Fraction, otypes=[object])(A) for A in (x, P, nu, H, np.diag(R))
-    )
-    PH = P @ H.T
-    M = np.hstack([H @ PH + R, nu[:, None], PH.T])
-    for i in range(len(M)):
-        M[i] = M[i] / M[i, i]
-        for j in range(len(M)):
-            if j != i:
-                M[j] = M[j] - M[j, i] * M[i]
-    solved = M[:, len(M) :]
-    return (x + PH @ solved[:, 0]).astype(float), (P - PH @ solved[:, 1:]).astype(float)
 
 
 @pytest.mark.parametrize("seed", range(3))

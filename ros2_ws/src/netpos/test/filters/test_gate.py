@@ -91,6 +91,20 @@ def test_without_an_odd_one_all_are_used(name: str, values: list[float], row: Ma
     assert (accepted == 1.0).all()
 
 
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize(
+    ("limits", "taken"), [([0, 2.1, 3.9, 99], [1, 0, 1]), ([0, 1.9, 4.1, 99], [0, 1, 0])]
+)
+def test_every_group_has_the_limit_of_its_own_size(
+    name: str, limits: list[float], taken: list[float], row: Maker
+) -> None:
+    """Groups of one, two and one rows, each row with a squared distance of 2."""
+    rows = [row(Kind.LINEAR, 2.0, 1.0, g, h=np.eye(6)[i]) for i, g in enumerate((0, 1, 1, 2))]
+    accepted = np.full(3, 9.0)
+    FILTERS[name](np.zeros(6), np.eye(6), np.array(rows), np.array(limits, float), accepted)
+    assert accepted.tolist() == taken
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_the_choice_is_that_of_trying_all(seed: int, row: Maker) -> None:
     """Random groups of one to three rows, some refused already, against every subset's chi-square

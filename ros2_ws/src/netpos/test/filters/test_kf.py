@@ -120,6 +120,19 @@ def test_floor_under_the_gain(axis: int, scale: float, row: Maker, random_cov: M
     assert mean[axis] == pytest.approx(2.0 * start[axis, axis] / (start[axis, axis] + 1.0))
 
 
+@pytest.mark.parametrize("scale", [0.1, 10.0, -3.0])
+@pytest.mark.parametrize(("share", "raised"), [(0.999, False), (1.001, True)])
+def test_floor_is_compared_with_the_gain_per_metre(
+    share: float, raised: bool, scale: float, row: Maker
+) -> None:
+    """Just under and just over P / (P + R), whatever unit the row has."""
+    mean, cov, gain = np.zeros(6), 4.0 * np.eye(6), 4.0 / (4.0 + 9.0)
+    rows = np.array([row(Kind.LINEAR, 2.0 * scale, 9.0 * scale**2, h=scale * np.eye(6)[0])])
+    floor = np.array([share * gain, 0.0, 0.0])
+    kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), floor)
+    assert mean[0] == pytest.approx(2.0 * gain * (share if raised else 1.0), rel=1e-12)
+
+
 def test_floor_needs_one_position_alone(row: Maker) -> None:
     """Velocities, clocks and mixtures keep the Kalman gain; six states have no acceleration."""
     floor = np.array([0.5, 0.5, 0.5])

@@ -1,4 +1,4 @@
-"""Values, Jacobians and curvature of the measurement models."""
+"""Values and Jacobians of the measurement models."""
 
 from __future__ import annotations
 
@@ -8,90 +8,30 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from measurement_rows import closed_form, random_row, random_state
 from netpos.filters.measurement import (
     AXES,
     BIAS,
     BLOCKED,
     COMMON,
-    GATE_VARIANCE,
     HEADING,
     KIND,
     LEVER,
     ORIGIN,
     ROW_WIDTH,
     VALUE,
-    VARIANCE,
     Kind,
-    curvature_variance,
     is_angle,
     linearise,
     predict_row,
     wrap,
 )
 from netpos.filters.rows import rsu_axes, rsu_rows
-from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
-from scipy.spatial.transform import Rotation
+from netpos.messages.values import Field, RsuInfo, RsuMeasurement
 
 ANGLE_KINDS = (Kind.AZIMUTH, Kind.ELEVATION)
 CYCLIC_KINDS = (*ANGLE_KINDS, Kind.PHASE)
-
-
 DIRECTION_KINDS = (*ANGLE_KINDS, Kind.COSINE_Y, Kind.COSINE_Z)
-
-
-def random_info(rng: np.random.Generator, convention: AngleConvention) -> RsuInfo:
-    return RsuInfo(
-        rsu_id="r",
-        position=rng.uniform(-20, 20, 3),
-        quaternion=Rotation.random(random_state=int(rng.integers(1 << 30))).as_quat(),
-        angle_convention=convention,
-    )
-
-
-def random_state(rng: np.random.Generator, n: int = 9) -> Array:
-    scale = np.array([40.0, 40.0, 8.0, 8.0, 100.0, 5.0, *([0.5] * (n - 6))])
-    return rng.normal(size=n) * scale
-
-
-def random_row(rng: np.random.Generator, kind: Kind, heading: int = -1) -> Array:
-    """A row of an RSU with tilted axes (LINEAR: random H), own bias 6, common bias 8, and the
-    device's antenna off its centre, which counts sideways only with a heading."""
-    row = np.zeros(ROW_WIDTH)
-    row[KIND], row[VALUE], row[VARIANCE], row[GATE_VARIANCE] = kind, 0.3, 1.0, 1.0
-    row[BIAS], row[COMMON] = 6, 8
-    info = random_info(rng, AngleConvention.SPHERICAL)
-    row[ORIGIN:AXES] = info.position
-    row[AXES:HEADING] = rsu_axes(info)
-    row[HEADING], row[LEVER:BLOCKED] = heading, rng.uniform(-2, 2, 3)
-    return row
-
-
-def closed_form(row: Array, x: Array, height_m: float) -> float:
-    """h written with SciPy and NumPy only."""
-    if row[KIND] == Kind.STEP_VELOCITY:
-        turn = Rotation.from_euler("z", x[8])
-        reported = turn.inv().apply([x[2], x[3], 0.0])[:2] / np.exp(x[6])
-        return float(row[ORIGIN + 2 : ORIGIN + 4] @ reported)
-    antenna = np.append(x[:2], height_m + row[LEVER + 2])
-    if row[HEADING] >= 0:
-        turn = Rotation.from_euler("z", x[int(row[HEADING])])
-        antenna += turn.apply([row[LEVER], row[LEVER + 1], 0.0])
-    d = antenna - row[ORIGIN:AXES]
-    ux, uy, uz = Rotation.from_matrix(row[AXES:HEADING].reshape(3, 3)).apply(d)
-    r = float(np.linalg.norm(d))
-    value = {
-        Kind.AZIMUTH: lambda: np.arctan2(uy, ux),
-        Kind.ELEVATION: lambda: np.arcsin(uz / r),
-        Kind.TOA: lambda: r + x[4],
-        Kind.RANGE: lambda: r,
-        Kind.LINEAR: lambda: row[ORIGIN : ORIGIN + 6] @ [*antenna[:2], *x[2:6]],
-        Kind.SPEED: lambda: abs(complex(x[2], x[3])),
-        Kind.COSINE_Y: lambda: uy / r,
-        Kind.COSINE_Z: lambda: uz / r,
-        Kind.PHASE: lambda: ux / r,  # an array of one radian along the x axis
-        Kind.UNWRAPPED_PHASE: lambda: ux / r,
-    }[Kind(int(row[KIND]))]()
-    return float(value) + x[6] + x[8]
 
 
 @pytest.mark.parametrize("heading", [-1, 7])
@@ -297,113 +237,3 @@ def test_innovation_is_measured_minus_predicted_for_every_row() -> None:
         single = np.empty(9)
         predict_row(row, x, 0.5, single)
         np.testing.assert_array_equal(h, single)
-
-
-def hessian(row: Array, x: Array, height_m: float) -> Array:
-    """Second derivatives by position (2, 2), numerically."""
-    eps, e = 1e-3, np.eye(9)
-
-    def f(p: Array) -> float:
-        return closed_form(row, x + p, height_m)
-
-    return np.array(
-        [
-            [
-                f(eps * (e[i] + e[j]))
-                - f(eps * (e[i] - e[j]))
-                - f(eps * (e[j] - e[i]))
-                + f(-eps * (e[i] + e[j]))
-                for j in range(2)
-            ]
-            for i in range(2)
-        ]
-    ) / (4 * eps**2)
-
-
-def half_trace(row: Array, x: Array, cov: Array, height_m: float) -> float:
-    """Variance of the second-order term of a Gaussian prior."""
-    product = hessian(row, x, height_m) @ cov[:2, :2]
-    return 0.5 * float(np.trace(product @ product))
-
-
-def level_row(kind: Kind, origin: Array) -> Array:
-    row = random_row(np.random.default_rng(0), kind)
-    row[ORIGIN:AXES], row[AXES:HEADING] = origin, np.eye(3).reshape(-1)
-    row[LEVER:BLOCKED] = 0.0
-    return row
-
-
-def test_an_antenna_above_the_device_is_a_higher_device() -> None:
-    row, x = level_row(Kind.RANGE, np.array([1.0, 1.0, 4.0])), np.full(9, 2.0)
-    plain = curvature_variance(row, x, np.eye(9), 1.5)
-    row[LEVER + 2] = 1.5
-    assert curvature_variance(row, x, np.eye(9), 0.0) == pytest.approx(plain, rel=1e-12)
-
-
-@pytest.mark.parametrize("kind", [Kind.RANGE, Kind.TOA])
-@pytest.mark.parametrize("seed", range(5))
-def test_curvature_of_a_level_range_is_exact(kind: Kind, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    row, x = level_row(kind, np.array([1.0, -2.0, 3.0])), random_state(rng)
-    A = rng.normal(size=(9, 9))
-    expected = half_trace(row, x, A @ A.T, 3.0)
-    assert curvature_variance(row, x, A @ A.T, 3.0) == pytest.approx(expected, rel=1e-4)
-
-
-def test_curvature_of_a_range_from_above_is_that_across_the_line_of_sight() -> None:
-    """rho 3, height 4: sideways the range bends with 1/5."""
-    row, x = level_row(Kind.RANGE, np.zeros(3)), np.zeros(9)
-    x[:2] = 0.0, 3.0
-    cov = np.diag([2.0, 1e-9, *np.ones(7)])
-    assert curvature_variance(row, x, cov, -4.0) == pytest.approx(
-        half_trace(row, x, cov, -4.0), rel=1e-4
-    )
-    assert curvature_variance(row, x, cov, -4.0) == pytest.approx(0.5 * (2.0 / 5.0) ** 2, rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("kind", "target"),
-    [
-        (Kind.AZIMUTH, (3.0, 4.0, 7.0)),
-        (Kind.ELEVATION, (3.0, 4.0, 5.0)),
-        (Kind.COSINE_Y, (5.0, 0.0, 0.0)),
-    ],
-)
-def test_curvature_of_angles_is_exact_for_an_equal_spread_where_they_bend_most(
-    kind: Kind, target: tuple[float, float, float]
-) -> None:
-    row, x = level_row(kind, np.array([1.0, 1.0, 1.0])), np.zeros(9)
-    x[:2] = target[0] + 1.0, target[1] + 1.0
-    cov, height = 0.3 * np.eye(9), target[2] + 1.0
-    assert curvature_variance(row, x, cov, height) == pytest.approx(
-        half_trace(row, x, cov, height), rel=1e-4
-    )
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_curvature_of_azimuth_bounds_the_second_order_term(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    row, x, A = level_row(Kind.AZIMUTH, np.zeros(3)), random_state(rng), rng.normal(size=(9, 9))
-    cov = A @ A.T
-    d2 = x[0] ** 2 + x[1] ** 2
-    assert curvature_variance(row, x, cov, 2.0) >= half_trace(row, x, cov, 2.0) * (1 - 1e-4)
-    frobenius2 = np.linalg.norm(cov[:2, :2]) ** 2
-    assert curvature_variance(row, x, cov, 2.0) == pytest.approx(frobenius2 / 2 / d2**2)
-    slant2 = d2 + 4.0
-    for kind in (Kind.ELEVATION, Kind.COSINE_Y, Kind.COSINE_Z):
-        row[KIND] = kind
-        assert curvature_variance(row, x, cov, 2.0) == pytest.approx(frobenius2 / 2 / slant2**2)
-
-
-def test_curvature_at_the_rsu_is_finite_and_linear_rows_have_none() -> None:
-    cov, x = np.eye(9), np.zeros(9)
-    for kind, floor in ((Kind.AZIMUTH, 1e12), (Kind.COSINE_Y, 1e12), (Kind.ELEVATION, 1e12)):
-        assert curvature_variance(level_row(kind, np.zeros(3)), x, cov, 0.0) == pytest.approx(
-            floor
-        )
-    assert curvature_variance(level_row(Kind.RANGE, np.zeros(3)), x, cov, 0.0) == 0.0
-    x[0] = 1e-4
-    value = curvature_variance(level_row(Kind.RANGE, np.zeros(3)), x, cov, 0.0)
-    assert value == pytest.approx(0.5 * (1e-8 / 1e-6) ** 2 / 1e-6)
-    for kind in (Kind.LINEAR, Kind.SPEED):
-        assert curvature_variance(level_row(kind, np.ones(3)), x, cov, 0.0) == 0.0

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from measurement_rows import random_info, random_state
 from netpos.filters import ekf
 from netpos.filters.measurement import (
     AXES,
@@ -38,20 +39,6 @@ from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 
 ALL_FIELDS = Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE | Field.POSITION
-
-
-def random_info(rng: np.random.Generator, convention: AngleConvention) -> RsuInfo:
-    return RsuInfo(
-        rsu_id="r",
-        position=rng.uniform(-20, 20, 3),
-        quaternion=Rotation.random(random_state=int(rng.integers(1 << 30))).as_quat(),
-        angle_convention=convention,
-    )
-
-
-def random_state(rng: np.random.Generator, n: int = 9) -> Array:
-    scale = np.array([40.0, 40.0, 8.0, 8.0, 100.0, 5.0, *([0.5] * (n - 6))])
-    return rng.normal(size=n) * scale
 
 
 @pytest.mark.parametrize("seed", range(5))

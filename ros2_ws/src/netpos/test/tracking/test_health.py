@@ -3,80 +3,24 @@
 from __future__ import annotations
 
 import math
-import pickle
-from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-import numpy as np
 import pytest
+from health_stream import (
+    NS_PER_M,
+    SD,
+    Behaviour,
+    Errors,
+    Stream,
+    first_isolated,
+    honest,
+    isolated,
+    liar,
+    ns,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from netpos.tracking.health import HealthConfig, RsuHealth, RsuState
-
-GATE = 18.42  # chi2.ppf(0.9999, 2)
-SD = {"azimuth": math.radians(1.5), "toa": 0.6, "range": 0.5}
-NS_PER_M = 1e9 / 299_792_458.0
-Errors = Mapping[str, float]
-Behaviour = Callable[[float, str], Errors | None]  # extra error by kind; None: not heard
-
-
-def honest(_t: float, _vue: str) -> Errors:
-    return {}
-
-
-def liar(start: float, stop: float = math.inf, **errors: float) -> Behaviour:
-    return lambda t, _: errors if start <= t < stop else {}
-
-
-def ns(t: float) -> int:
-    return round(t * 1e9)
-
-
-class Stream:
-    """Observations as a tracker with a chi-square gate would make them; the truth is known."""
-
-    def __init__(self, seed: int = 1, kinds: tuple[str, ...] = ("azimuth", "toa"), **config: Any):
-        self.health = RsuHealth(HealthConfig(**config))
-        self.rng = np.random.default_rng(seed)
-        self.kinds = kinds
-
-    def run(
-        self,
-        start: float,
-        stop: float,
-        rsus: Mapping[str, Behaviour],
-        vues: Iterable[str] = ("v",),
-        rate: float = 10.0,
-    ) -> RsuHealth:
-        for k in range(round(start * rate), round(stop * rate)):
-            for vue in vues:
-                for name, behaviour in rsus.items():
-                    errors = behaviour(k / rate, vue)
-                    if errors is not None:
-                        self.observe(name, vue, k / rate, errors)
-        return self.health
-
-    def observe(self, name: str, vue: str, t: float, errors: Errors) -> None:
-        values = {
-            kind: (self.rng.normal(0, SD[kind]) + errors.get(kind, 0.0), SD[kind])
-            for kind in self.kinds
-        }
-        accepted = sum((v / sd) ** 2 for v, sd in values.values()) <= GATE
-        self.health.observe(name, vue, ns(t), accepted, values)
-
-
-def isolated(health: RsuHealth, t: float, names: Iterable[str] = "abcdef") -> set[str]:
-    return {name for name in names if health.isolated(name, ns(t))}
-
-
-def first_isolated(stream: Stream, rsus: Mapping[str, Behaviour], stop: float, **kw: Any) -> float:
-    """First second at which anything is isolated; inf where nothing is."""
-    for t in range(int(stop)):
-        stream.run(t, t + 1, rsus, **kw)
-        if isolated(stream.health, t + 1):
-            return t + 1
-    return math.inf
-
 
 # honest RSUs
 
@@ -276,131 +220,6 @@ def test_a_silent_rsu_is_suspect_while_its_device_is_heard() -> None:
     assert stream.health.report("a", ns(12.9)).text == "ok"
     report = stream.health.report("a", ns(40))
     assert (report.state, report.text) == (RsuState.OK, "no device heard for 27 s")
-
-
-# re-admission
-
-
-def test_an_rsu_that_is_consistent_again_is_readmitted() -> None:
-    stream = Stream()
-    rsus = {"a": honest, "b": liar(5.0, 20.0, azimuth=0.35), "c": honest}
-    stream.run(0, 24, rsus)
-    assert isolated(stream.health, 24) == {"b"}
-    text = stream.health.report("b", ns(24)).text
-    assert text.startswith("isolated: azimuth off by ")
-    assert text.endswith("; consistent again for 2 s")
-    back = next(t for t in range(25, 40) if not isolated(stream.run(t - 1, t, rsus), t))
-    assert 27 <= back <= 29  # 5 s of consistent slots, 2 s to settle
-    stream.run(back, 60, rsus)
-    assert stream.health.report("b", ns(60)).text == "ok"
-
-
-def test_a_lie_now_and_then_keeps_it_isolated() -> None:
-    stream = Stream()
-    rsus = dict.fromkeys("abc", honest)
-    rsus["b"] = lambda t, _: {"toa": 30.0} if t < 15.0 or t % 5.0 < 2.0 else {}
-    stream.run(0, 15, rsus)
-    for t in range(15, 60):
-        stream.run(t, t + 1, rsus)
-        assert isolated(stream.health, t + 1) == {"b"}
-
-
-def test_isolation_lapses_with_nothing_to_compare_with() -> None:
-    """The others have gone: refusing the only RSU would be no comparison any more."""
-    stream = Stream()
-    rsus = {"a": honest, "b": liar(5.0, toa=30.0), "c": honest}
-    stream.run(0, 20, rsus)
-    assert isolated(stream.health, 20) == {"b"}
-    alone = {"b": rsus["b"]}
-    stream.run(20, 51, alone)
-    assert isolated(stream.health, 51) == {"b"}
-    stream.run(51, 52, alone)
-    assert isolated(stream.health, 52) == set()  # more than 30 s at the end of a slot, settled
-
-
-# time and order
-
-
-def test_order_of_arrival_does_not_matter() -> None:
-    """Shuffled within a second, with rewound and repeated observations: the same answers."""
-    rng = np.random.default_rng(9)
-    records = []
-    for k in range(400):
-        for name in "abcd":
-            lies = name == "b" and 8 <= k / 10 < 22
-            value = float(rng.normal(0, 0.5) + 30.0 * lies)
-            records.append((k / 10, name, abs(value) < 2.0, {"range": (value, 0.5)}))
-
-    def answers(order: Iterable[int], wrong_first: bool) -> list[Any]:
-        health = RsuHealth()
-        seen = set()
-        for i in order:
-            t, name, accepted, values = records[i]
-            if wrong_first:
-                health.observe(name, "v", ns(t), not accepted, {"range": (99.0, 1.0)})
-                health.rewind("w", 0)
-            health.observe(name, "v", ns(t), accepted, values)
-            seen.add((t, health.isolated("b", ns(t))))
-        health.isolated("a", ns(60))
-        return [sorted(seen), *health.reports(ns(45))]
-
-    straight = answers(range(len(records)), False)
-    assert {flag for _, flag in straight[0]} == {False, True}
-    arrival = [t + float(rng.uniform(0, 1.0)) for t, *_ in records]
-    shuffled = [int(i) for i in np.argsort(arrival)]
-    assert answers(shuffled, False) == straight
-    assert answers(shuffled, True) == straight
-
-
-def test_rewind_drops_one_device_from_a_stamp_on() -> None:
-    health = RsuHealth()
-    for vue in "vw":
-        for k in range(20):
-            health.observe("a", vue, ns(k / 10), True, {})
-    health.rewind("v", ns(0.75))
-    health.isolated("a", ns(10))
-    assert health.report("a", ns(10)).measurements == 8 + 20
-
-
-def test_too_late_is_counted() -> None:
-    health = RsuHealth()
-    health.observe("a", "v", ns(10.0), True, {})
-    health.observe("a", "v", ns(7.999), False, {})
-    health.observe("a", "v", ns(8.0), False, {})
-    health.isolated("a", ns(20))
-    report = health.report("a", ns(20))
-    assert (report.late, report.measurements, report.accept_ratio) == (1, 2, 0.5)
-
-
-def test_reports_change_nothing() -> None:
-    """The clock of whoever asks is not that of the stamps."""
-    stream, asked = Stream(), Stream()
-    rsus = {"a": honest, "b": liar(3.0, toa=30.0), "c": honest}
-    for t in range(12):
-        stream.run(t, t + 1, rsus)
-        asked.run(t, t + 1, rsus)
-        asked.health.reports(ns(1e6))
-    assert asked.health.reports(ns(12)) == stream.health.reports(ns(12))
-
-
-def test_reset_forgets() -> None:
-    stream = Stream()
-    rsus = {"a": honest, "b": liar(0.0, toa=30.0), "c": honest}
-    stream.run(100, 120, rsus)
-    assert isolated(stream.health, 120) == {"b"}
-    stream.health.reset()
-    assert stream.health.reports(ns(120)) == []
-    assert isolated(stream.run(0, 2, rsus), 2) == set()
-
-
-def test_memory_is_bounded() -> None:
-    def size(seconds: int) -> int:
-        stream = Stream(3)
-        for t in range(seconds):
-            stream.run(t, t + 1, dict.fromkeys("abc", honest), vues=[f"v{t}"])
-        return len(pickle.dumps(stream.health))
-
-    assert size(300) < 1.1 * size(100)
 
 
 # whatever the gates say

@@ -3,119 +3,34 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from antenna_square import (
+    ANTENNAS,
+    CORNERS,
+    T0_NS,
+    circle,
+    errors,
+    followed,
+    heading_error,
+    measure,
+    standing,
+    tracker,
+    yaw_of,
+)
 from netpos.filters.measurement import HEADING, LEVER, linearise
 from netpos.filters.rows import Coupling, rsu_axes, rsu_rows
 from netpos.messages.values import (
     AngleConvention,
     Array,
     Field,
-    InitialPose,
-    Odometry,
     RsuInfo,
     RsuMeasurement,
 )
-from netpos.tracking import Tracker, TrackerConfig, TrackOutput
 from scipy.constants import speed_of_light
 from scipy.stats import chi2
-
-T0_NS = 1_000_000_000
-HEIGHT_M = 1.0
-CORNERS = {
-    f"a{k}": np.array([x, y, HEIGHT_M])
-    for k, (x, y) in enumerate(((-10.0, -10.0), (10.0, -10.0), (10.0, 10.0), (-10.0, 10.0)))
-}
-ANTENNAS = {"left": (0.5, 0.4, 0.0), "right": (0.5, -0.4, 0.0), "back": (-0.6, 0.0, 0.0)}
-AHEAD = {"left": (3.0, 1.0, 0.0), "right": (3.0, -1.0, 0.0)}
-Path = Callable[[float], tuple[float, float, float]]
-
-
-def standing(yaw: float) -> Path:
-    return lambda _: (1.0, 2.0, yaw)
-
-
-def circle(t_s: float) -> tuple[float, float, float]:
-    """Left around the middle at 0.3 rad/s, facing outwards: never the way it moves."""
-    angle = 0.3 * t_s
-    return 4.0 * math.cos(angle), 4.0 * math.sin(angle), angle
-
-
-def measure(
-    path: Path,
-    t_s: float,
-    rng: np.random.Generator | None = None,
-    sd: float = 0.05,
-    antennas: dict[str, tuple[float, float, float]] = ANTENNAS,
-) -> list[RsuMeasurement]:
-    """Ranges of every antenna to every corner."""
-    x, y, yaw = path(t_s)
-    c, s = math.cos(yaw), math.sin(yaw)
-    result = []
-    for name, corner in CORNERS.items():
-        for antenna, (lx, ly, lz) in antennas.items():
-            place = np.array([x + c * lx - s * ly, y + s * lx + c * ly, HEIGHT_M + lz])
-            noise = 0.0 if rng is None else rng.normal(0.0, sd)
-            result.append(
-                RsuMeasurement(
-                    stamp_ns=T0_NS + round(t_s * 1e9),
-                    rsu_id=f"{name}_{antenna}",
-                    vue_id="vue_1",
-                    expected=len(CORNERS) * len(antennas),
-                    fields=Field.RANGE,
-                    range_m=float(np.linalg.norm(place - corner)) + noise,
-                    range_var=sd**2,
-                    lever_arm=(lx, ly, lz),
-                )
-            )
-    return result
-
-
-def tracker(**config: Any) -> Tracker:
-    values = {
-        "motion_model": "rigid_body",
-        "device_height_m": HEIGHT_M,
-        "hold_s": 0.0,
-        "accel_density_mps2_sqrthz": 0.5,
-        "turn_rate_density": 0.5,
-        "initial_speed_sd_mps": 1.5,
-        "coverage_radius_m": 20.0,
-    }
-    made = Tracker(TrackerConfig(**(values | config)))
-    for name, corner in CORNERS.items():
-        for antenna in ANTENNAS:
-            made.add_rsu(RsuInfo(rsu_id=f"{name}_{antenna}", position=corner))
-    return made
-
-
-def followed(
-    path: Path, seconds: float, seed: int, feed: Any, target: Tracker | None = None, **options: Any
-) -> list[tuple[float, TrackOutput]]:
-    """Time and report of every epoch, ten per second."""
-    target, rng = target or tracker(), np.random.default_rng(seed)
-    result = []
-    for k in range(round(seconds * 10)):
-        (report,) = feed(target, measure(path, 0.1 * k, rng, **options))
-        result.append((0.1 * k, report))
-    return result
-
-
-def yaw_of(odometry: Odometry) -> float:
-    return 2.0 * math.atan2(odometry.quaternion[2], odometry.quaternion[3])
-
-
-def heading_error(path: Path, t_s: float, odometry: Odometry) -> float:
-    return math.remainder(yaw_of(odometry) - path(t_s)[2], math.tau)
-
-
-def errors(path: Path, reports: list[tuple[float, TrackOutput]]) -> tuple[Array, Array]:
-    """Position errors (n, 2) m and heading errors (n,) rad."""
-    found = [(t, r.odometry) for t, r in reports if r.odometry is not None]
-    place = np.array([o.position[:2] - path(t)[:2] for t, o in found])
-    return place, np.array([heading_error(path, t, o) for t, o in found])
 
 
 def pose_fit(measured: list[RsuMeasurement], start: tuple[float, float, float]) -> Array:
@@ -308,83 +223,6 @@ def test_lever_arms_matter(feed: Any) -> None:
     place, _ = errors(circle, without)
     rmse = [np.sqrt(np.mean((e[20:] ** 2).sum(axis=1))) for e in (with_arms, place)]
     assert rmse[0] < 0.2 * rmse[1]
-
-
-def test_first_heading_is_waited_for(feed: Any) -> None:
-    """One antenna off the middle leaves a circle of poses; a second one decides."""
-    path, target = standing(2.2), tracker()
-    one = {"left": ANTENNAS["left"]}
-    for k in range(20):
-        for report in feed(target, measure(path, 0.1 * k, antennas=one)):
-            assert report.odometry is None
-    found = [feed(target, measure(path, 2.0 + 0.1 * k)) for k in range(3)]
-    odometry = found[-1][-1].odometry
-    assert odometry is not None
-    assert abs(heading_error(path, 2.2, odometry)) < math.radians(4.0)
-
-
-def test_a_noisy_first_heading_is_never_the_opposite_one(feed: Any) -> None:
-    """Ranges as noisy as the antennas are apart (0.5 m): what is reported lies within 4.5 sd."""
-    for seed in range(25):
-        path = standing(0.25 * seed)
-        t, report = followed(path, 1.0, seed, feed, sd=0.5)[-1]
-        if report.odometry is not None:
-            error = heading_error(path, t, report.odometry)
-            assert abs(error) < 4.5 * math.sqrt(report.odometry.pose_cov[5, 5])
-
-
-def test_heading_is_found_anew_after_a_silence(feed: Any) -> None:
-    target = tracker(max_gap_s=2.0)
-    followed(standing(0.5), 1.0, 5, feed, target)
-    path, rng = standing(-2.6), np.random.default_rng(6)
-    for k in range(5):
-        (report,) = feed(target, measure(path, 10.0 + 0.1 * k, rng))
-    assert report.odometry is not None
-    assert abs(heading_error(path, 10.4, report.odometry)) < math.radians(6.0)
-
-
-def test_initial_pose_leaves_the_heading_to_the_lever_arms(feed: Any) -> None:
-    for yaw in np.linspace(-3.1, 3.1, 9):
-        path, target, rng = standing(float(yaw)), tracker(), np.random.default_rng(7)
-        pose = InitialPose(
-            stamp_ns=T0_NS,
-            vue_id="vue_1",
-            position=np.array([1.0, 2.0, 0.0]),
-            cov=0.25 * np.eye(3),
-        )
-        for k in range(10):
-            items = measure(path, 0.1 * k, rng)
-            (report,) = feed(target, [pose, *items] if k == 0 else items)
-        assert report.odometry is not None
-        assert abs(heading_error(path, 0.9, report.odometry)) < math.radians(6.0)
-
-
-# What does not hold yet; strict, so that a mark goes with its defect.
-
-
-@pytest.mark.parametrize("filter_name", ["ekf", "ukf"])
-def test_initial_pose_without_iteration(feed: Any, filter_name: str) -> None:
-    place, cov = np.array([1.0, 2.0, 0.0]), 0.25 * np.eye(3)
-    for yaw in (0.3, -2.6):
-        path, target = standing(yaw), tracker(filter=filter_name)
-        target.add(InitialPose(stamp_ns=T0_NS, vue_id="vue_1", position=place, cov=cov))
-        t, report = followed(path, 3.0, 1, feed, target)[-1]
-        assert report.odometry is not None
-        assert abs(heading_error(path, t, report.odometry)) < math.radians(6.0)
-
-
-def test_first_fix_with_antennas_far_ahead(feed: Any) -> None:
-    path, target = standing(1.0), tracker()
-    (report,) = feed(target, measure(path, 0.0, np.random.default_rng(8), antennas=AHEAD))
-    assert report.odometry is not None
-    d = report.odometry.position[:2] - path(0.0)[:2]
-    assert d @ np.linalg.solve(report.odometry.pose_cov[:2, :2], d) < chi2.ppf(0.9999, 2)
-
-
-def test_first_fix_close_to_an_rsu(feed: Any) -> None:
-    """0.9 m from a corner, with ranges to all four."""
-    reports = followed(lambda _: (9.4, 9.3, 0.4), 4.0, 9, feed, sd=0.02)
-    assert reports[-1][1].odometry is not None
 
 
 def test_smoothed_heading_is_that_of_the_state(feed: Any) -> None:

@@ -103,20 +103,10 @@ class Setup:
             declare biases while the motion model is inertial
         """
         simulation = self.simulation.with_seed(seed)
-        pose = simulation.initial_pose(VUE)
-        if pose is None:
-            raise ValueError(
-                f"scenario {simulation.scenario.name} gives no initial pose; set initial_pose_sd_m"
-            )
-        heard, row_start, rows, bias = observation_rows(
-            simulation.observations(VUE), self._templates, N_CORE + self._extra_sd.size
-        )
-        if not heard.size or heard[0] > 0:
-            raise ValueError(f"no RSU hears the first beacon of {simulation.scenario.name}")
-        epochs = Epochs(simulation.beacons(VUE).stamp_ns[heard], row_start, rows, bias)
-        mean, cov = pose_state(self.config, pose.position[:2], pose.cov[:2, :2])
+        mean, cov = self._start(simulation)
+        heard, epochs = self._epochs(simulation)
         if self.config.use_imu:
-            if bias.size:
+            if epochs.bias.size:
                 raise ValueError(
                     "an inertial motion model takes no RSU biases here; undeclare them"
                 )
@@ -126,20 +116,11 @@ class Setup:
             motions = self._motions
         prior = self._grown(mean, cov, epochs)[1]
         truth = _truth(simulation.beacons(VUE), heard, len(prior))
-        height_m = self.config.device_height_m
-        bound = bound_covariances(*epochs[:3], truth, prior, height_m, motions, bias)
+        height_m, risk = self.config.device_height_m, self.config.integrity_risk
+        bound = bound_covariances(*epochs[:3], truth, prior, height_m, motions, epochs.bias)
         means, covs, nis, dof, taken = (array[:done] for array in filled)
         level = protection_levels(
-            *epochs[:3],
-            means,
-            covs,
-            nis,
-            dof,
-            taken,
-            motions,
-            bias,
-            self._options,
-            self.config.integrity_risk,
+            *epochs[:3], means, covs, nis, dof, taken, motions, epochs.bias, self._options, risk
         )
         return Track(
             stamps_ns=epochs.stamps_ns[:done],
@@ -152,6 +133,25 @@ class Setup:
             level=level,
             lost=done < heard.size,
         )
+
+    def _start(self, simulation: Simulation) -> tuple[Array, Array]:
+        """Mean and covariance of the initial pose."""
+        pose = simulation.initial_pose(VUE)
+        if pose is None:
+            raise ValueError(
+                f"scenario {simulation.scenario.name} gives no initial pose; set initial_pose_sd_m"
+            )
+        return pose_state(self.config, pose.position[:2], pose.cov[:2, :2])
+
+    def _epochs(self, simulation: Simulation) -> tuple[Ints, Epochs]:
+        """The beacons heard, (N,), and their epochs."""
+        heard, row_start, rows, bias = observation_rows(
+            simulation.observations(VUE), self._templates, N_CORE + self._extra_sd.size
+        )
+        if not heard.size or heard[0] > 0:
+            raise ValueError(f"no RSU hears the first beacon of {simulation.scenario.name}")
+        stamps_ns = simulation.beacons(VUE).stamp_ns[heard]
+        return heard, Epochs(stamps_ns, row_start, rows, bias)
 
     def _compiled(
         self, epochs: Epochs, mean: Array, cov: Array

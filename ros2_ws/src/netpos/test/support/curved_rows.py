@@ -1,0 +1,43 @@
+"""Rows that bend over the width of their prior, for the tests of iterated updates."""
+
+from __future__ import annotations
+
+import numpy as np
+from filter_rows import row
+from netpos.filters.measurement import (
+    VARIANCE,
+    Kind,
+    curvature_variance,
+    linearise,
+)
+from netpos.messages.values import Array
+
+
+def log_posterior_cost(rows: Array, mean: Array, cov: Array, height: float, x: Array) -> float:
+    """Twice the negative log posterior, plainly."""
+    innovation, _ = linearise(rows, x, height)
+    return float(
+        (x - mean) @ np.linalg.inv(cov) @ (x - mean) + np.sum(innovation**2 / rows[:, VARIANCE])
+    )
+
+
+def range_problem(seed: int) -> tuple[Array, Array, Array]:
+    """A wide prior, two precise ranges and a bearing: strongly curved."""
+    rng = np.random.default_rng(seed)
+    mean = np.array([10.0, 8.0, 1.0, 0.0, 0.0, 0.0]) + rng.normal(size=6) * 0.5
+    cov = np.diag([30.0, 20.0, 1.0, 1.0, 1.0, 1.0])
+    cov[0, 2] = cov[2, 0] = 2.0
+    rows = np.array(
+        [
+            row(Kind.RANGE, 10.0, 0.01, 0, np.array([0.0, 0.0, 0.0])),
+            row(Kind.RANGE, 9.0, 0.01, 1, np.array([12.0, 0.0, 0.0])),
+            row(Kind.AZIMUTH, 0.9, 0.01, 2, np.array([0.0, 0.0, 0.0])),
+        ]
+    )
+    return mean, cov, rows
+
+
+def two_variances(mean: Array, cov: Array, rows: Array) -> Array:
+    """Variances of an update: the rows' and the curvature's."""
+    extra = [curvature_variance(r, mean, cov, 0.0) for r in rows]
+    return np.asarray(rows[:, VARIANCE] + extra)
