@@ -179,10 +179,8 @@ def test_a_rejected_row_that_bends_is_no_reason_to_iterate() -> None:
     np.testing.assert_array_equal(result[1], plain[1])
 
 
-@pytest.mark.parametrize("seed", [12, 27, 105])
-def test_where_rounding_makes_iterating_indefinite_the_tangent_serves(seed: int) -> None:
-    """Sds up to 1e6, correlations near 1 and a speed that bends: iterated row by row the
-    covariance ends indefinite; what is returned is the linear update, exactly."""
+def nearly_singular(seed: int) -> tuple[Array, Array, Array]:
+    """Sds up to 1e6, correlations near 1, three precise rows and a speed that bends."""
     rng = np.random.default_rng(seed)
     scale = 10.0 ** rng.uniform(-1, 6, 6)
     A = rng.normal(size=(6, 2))
@@ -190,14 +188,26 @@ def test_where_rounding_makes_iterating_indefinite_the_tangent_serves(seed: int)
     P = (P + P.T) / 2
     H, R, x = rng.normal(size=(3, 6)), 10.0 ** rng.uniform(-6, -2, 3), rng.normal(size=6)
     truth = x + np.linalg.cholesky(P) @ rng.normal(size=6)
-    linear = [linear_row(h, h @ truth, r, 0) for h, r in zip(H, R, strict=True)]
-    rows = np.array([*linear, row(Kind.SPEED, math.hypot(truth[2], truth[3]), 0.01)])
-    _, lost = iterated(x, P, rows, rows[:, VARIANCE].copy(), 8)
-    sd = np.sqrt(np.abs(np.diag(lost)))
-    assert np.linalg.eigvalsh(lost / np.outer(sd, sd))[0] < -1e-3
-    mean, cov, *_ = updated(x, P, rows, 0.0, NO_GATE, 8)
-    innovation, H = linearise(rows, x, 0.0)
-    expected_mean, expected_cov = exact_fuse(x, P, innovation, H, rows[:, VARIANCE])
-    sd = np.sqrt(np.diag(expected_cov))
-    np.testing.assert_allclose((mean - expected_mean) / sd, 0.0, atol=1e-5)
-    np.testing.assert_allclose((cov - expected_cov) / np.outer(sd, sd), 0.0, atol=1e-5)
+    rows = [linear_row(h, h @ truth, r, 0) for h, r in zip(H, R, strict=True)]
+    speed = row(Kind.SPEED, math.hypot(truth[2], truth[3]), 0.01)
+    return x, P, np.array([*rows, speed])
+
+
+def test_where_rounding_makes_iterating_indefinite_the_tangent_serves() -> None:
+    """Iterated row by row the covariance ends indefinite; what is returned is the linear update,
+    exactly. Which seeds do so depends on the processor's rounding."""
+    lost = 0
+    for seed in range(200):
+        x, P, rows = nearly_singular(seed)
+        _, cov = iterated(x, P, rows, rows[:, VARIANCE].copy(), 8)
+        sd = np.sqrt(np.abs(np.diag(cov)))
+        if np.linalg.eigvalsh(cov / np.outer(sd, sd))[0] > -1e-3:
+            continue
+        lost += 1
+        mean, cov, *_ = updated(x, P, rows, 0.0, NO_GATE, 8)
+        innovation, H = linearise(rows, x, 0.0)
+        expected_mean, expected_cov = exact_fuse(x, P, innovation, H, rows[:, VARIANCE])
+        sd = np.sqrt(np.diag(expected_cov))
+        np.testing.assert_allclose((mean - expected_mean) / sd, 0.0, atol=0.01)
+        np.testing.assert_allclose((cov - expected_cov) / np.outer(sd, sd), 0.0, atol=1e-6)
+    assert lost >= 3
