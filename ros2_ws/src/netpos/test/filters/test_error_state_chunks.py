@@ -12,6 +12,7 @@ from netpos.filters.error_state import (
     Constraints,
     Imu,
     Sensors,
+    SlowErrors,
     advance,
     predict_chunk,
 )
@@ -142,3 +143,21 @@ def test_nothing_is_held_in_a_hole() -> None:
         sds.append(np.sqrt(cov[4, 4]))
     assert sds[0] < 0.1
     assert sds[1] > 1.0
+
+
+def test_every_bias_fades_with_its_own_time() -> None:
+    """Three of them over a second, with what they share; the clock goes on by its drift."""
+    sds, taus = np.array([2.0, 0.5, 3.0]), np.array([30.0, 5.0, 0.8])
+    slow = SlowErrors(0.0, 0.0, np.array([sds, taus]))
+    known = np.array([1.5, -0.8, 0.3])
+    nav, cov = np.concatenate([resting(), [100.0, 7.0], known]), np.eye(ERR + 5)
+    cov[ERR + 2 :, ERR + 2 :] += 0.5
+    shared = cov[ERR + 2 :, ERR + 2 :].copy()
+    stamps = np.arange(10, 1001, 10, dtype=np.int64) * MS
+    imu = Imu(stamps, np.tile([0.0, 0, 0, 0, 0, 9.80665], (stamps.size, 1)))
+    sensors = Sensors(NOISE, still_earth(), UNCONSTRAINED, slow)
+    assert advance(nav, cov, np.zeros(MEMORY), 0, 1000 * MS, imu, sensors) == 0.0
+    fade = np.exp(-1.0 / taus)
+    np.testing.assert_allclose(nav[NAV:], [107.0, 7.0, *(fade * known)], rtol=1e-12)
+    expected = shared * np.outer(fade, fade) + np.diag(sds**2 * (1.0 - fade**2))
+    np.testing.assert_allclose(cov[ERR + 2 :, ERR + 2 :], expected, rtol=1e-9)
