@@ -192,15 +192,13 @@ class BagReader:
         wanted = {name: self.topics[name] for name in names}
         stream = self._by_chunk(names) or self._by_message(names)
         counts = dict.fromkeys(names, 0)
-        while True:
-            try:
-                log_time_ns, _, topic, cdr = next(stream)
-            except StopIteration:
-                break
-            except Exception as error:  # damaged bytes raise nearly anything
-                raise self._damaged(error) from error
-            counts[topic] += 1
-            yield BagEntry(topic, wanted[topic].type_name, log_time_ns, cdr, self._decode)
+        types, decode = {name: info.type_name for name, info in wanted.items()}, self._decode
+        try:
+            for log_time_ns, _, topic, cdr in stream:
+                counts[topic] += 1
+                yield BagEntry(topic, types[topic], log_time_ns, cdr, decode)
+        except Exception as error:  # damaged bytes raise nearly anything
+            raise self._damaged(error) from error
         for topic, info in wanted.items():
             if counts[topic] != info.count:
                 raise self._damaged(f"{topic}: {counts[topic]} of {info.count} messages found")

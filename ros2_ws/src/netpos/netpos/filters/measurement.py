@@ -252,8 +252,9 @@ def innovation_variance(
     ``cov`` (n, n) along the row's Jacobian ``h`` (n,) at ``mean`` (n,)."""
     total = variance + curvature_variance(row, mean, cov, height_m)
     for a in range(mean.size):
-        for b in range(mean.size):
-            total += h[a] * cov[a, b] * h[b]
+        if h[a] != 0.0:
+            for b in range(mean.size):
+                total += h[a] * cov[a, b] * h[b]
     return float(total)
 
 

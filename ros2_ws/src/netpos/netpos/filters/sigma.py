@@ -23,7 +23,7 @@ import math
 
 import numpy as np
 
-from netpos.filters.compile import kernel
+from netpos.filters.compile import kernel, leaf
 from netpos.filters.measurement import VALUE, is_angle, is_cyclic, predict_row, wrap
 from netpos.filters.motion import propagate
 from netpos.messages.values import Array
@@ -48,13 +48,21 @@ def move(mean: Array, L: Array, dt: float, motion: Array, bias: Array) -> Array:
     is D'D.
     """
     n = mean.size
-    D = np.empty((2 * n + 1, n))
+    D, shift = np.empty((2 * n + 1, n)), np.zeros(n)
+    _move(mean, L, dt, motion, bias, D, shift)
+    return D
+
+
+@leaf
+def _move(
+    mean: Array, L: Array, dt: float, motion: Array, bias: Array, D: Array, shift: Array
+) -> None:
+    n = mean.size
     for j in range(n):
         for a in range(n):
             D[j, a] = mean[a] + REACH * L[a, j]
             D[n + j, a] = mean[a] - REACH * L[a, j]
     propagate(mean, dt, motion, bias)
-    shift = np.zeros(n)
     for j in range(2 * n):
         propagate(D[j], dt, motion, bias)
         for a in range(n):
@@ -63,7 +71,6 @@ def move(mean: Array, L: Array, dt: float, motion: Array, bias: Array) -> Array:
     for a in range(n):
         mean[a] += shift[a]
         D[2 * n, a] = _SHIFT_WEIGHT * shift[a]
-    return D
 
 
 @kernel
@@ -79,7 +86,23 @@ def regress(mean: Array, L: Array, rows: Array, height_m: float) -> tuple[Array,
     """
     n, m = mean.size, rows.shape[0]
     innovation, G, E = np.empty(m), np.empty((m, n)), np.empty((m, n + 1))
-    high, low, h = np.empty(n), np.empty(n), np.empty(n)
+    _regress(mean, L, rows, height_m, innovation, G, E, np.empty((3, n)))
+    return innovation, G, E
+
+
+@leaf
+def _regress(
+    mean: Array,
+    L: Array,
+    rows: Array,
+    height_m: float,
+    innovation: Array,
+    G: Array,
+    E: Array,
+    work: Array,
+) -> None:
+    n, m = mean.size, rows.shape[0]
+    high, low, h = work[0], work[1], work[2]
     for i in range(m):
         innovation[i] = predict_row(rows[i], mean, height_m, h)
         E[i, n] = 0.0
@@ -100,7 +123,6 @@ def regress(mean: Array, L: Array, rows: Array, height_m: float) -> tuple[Array,
         if is_cyclic(rows[i]):
             innovation[i] = wrap(innovation[i])
         E[i, n] *= _SHIFT_WEIGHT
-    return innovation, G, E
 
 
 @kernel

@@ -18,7 +18,7 @@ import math
 
 import numpy as np
 
-from netpos.filters.compile import kernel
+from netpos.filters.compile import inlined, kernel, leaf
 from netpos.filters.factor import factor
 from netpos.filters.gate import gate_groups, select_rows
 from netpos.filters.measurement import GATE_VARIANCE, VARIANCE
@@ -42,9 +42,16 @@ def cholesky_update(L: Array, x: Array, sign: float) -> bool:
 
     False, and L as it was, where the down-dated matrix would not be positive definite.
     """
-    n = x.size
     if sign < 0.0:
         return bool(_down_date(L, x))
+    _up_date(L, x)
+    return True
+
+
+@leaf
+def _up_date(L: Array, x: Array) -> None:
+    """The rotations that turn [L x] into a factor."""
+    n = x.size
     for k in range(n):
         if x[k] == 0.0:
             continue
@@ -55,7 +62,6 @@ def cholesky_update(L: Array, x: Array, sign: float) -> bool:
             below = L[i, k]
             L[i, k] = c * below + s * x[i]
             x[i] = c * x[i] - s * below
-    return True
 
 
 @kernel
@@ -82,7 +88,7 @@ def _down_date(L: Array, x: Array) -> bool:
     return True
 
 
-@kernel
+@inlined
 def _rotate(first: Array, second: Array, start: int, c: float, s: float) -> None:
     """Rotate two columns from entry ``start`` on."""
     for i in range(start, first.size):
@@ -101,7 +107,7 @@ def predict(mean: Array, spread: Array, dt: float, motion: Array, bias: Array) -
     noise(mean, dt, motion, bias, Q)
     spread[:] = factor(Q)
     for j in range(D.shape[0]):
-        cholesky_update(spread, D[j], 1.0)
+        _up_date(spread, D[j])
 
 
 @kernel
@@ -115,7 +121,9 @@ def update(
     index, nis = select_rows(rows, innovation, S, gate_nis, accepted)
     if index.size == 0:
         return 0.0, 0
-    fuse(mean, spread, innovation[index], G[index], E[index], rows[index, VARIANCE])
+    if index.size < rows.shape[0]:
+        innovation, G, E = innovation[index], G[index], E[index]
+    fuse(mean, spread, innovation, G, E, rows[index, VARIANCE])
     return nis, index.size
 
 
@@ -129,19 +137,28 @@ def fuse(
     S = np.zeros((m, m))  # the factor: first of E E' + R, then of the whole
     for i in range(m):
         S[i, i] = math.sqrt(variance[i])
+    column, gain = np.empty(m), np.empty(n)
     for j in range(E.shape[1]):
-        cholesky_update(S, E[:, j].copy(), 1.0)
+        column[:] = E[:, j]
+        _up_date(S, column)
     for i in range(m):
-        gain = np.zeros(n)
-        for j in range(n - 1, -1, -1):
-            if G[i, j] == 0.0:
-                continue
-            length = math.hypot(S[i, i], G[i, j])
-            c, s = S[i, i] / length, G[i, j] / length
-            _rotate(S[:, i], G[:, j], i, c, s)
-            _rotate(gain, spread[:, j], j, c, s)
+        _eliminate(i, S, G, spread, gain)
         for k in range(i):
             innovation[i] -= S[i, k] * innovation[k]
         innovation[i] /= S[i, i]
         for a in range(n):
             mean[a] += gain[a] * innovation[i]
+
+
+@leaf
+def _eliminate(i: int, S: Array, G: Array, spread: Array, gain: Array) -> None:
+    """Rotate row ``i`` of G (m, n) into S (m, m), and what of the factor goes with it into
+    ``gain`` (n,)."""
+    gain[:] = 0.0
+    for j in range(gain.size - 1, -1, -1):
+        if G[i, j] == 0.0:
+            continue
+        length = math.hypot(S[i, i], G[i, j])
+        c, s = S[i, i] / length, G[i, j] / length
+        _rotate(S[:, i], G[:, j], i, c, s)
+        _rotate(gain, spread[:, j], j, c, s)

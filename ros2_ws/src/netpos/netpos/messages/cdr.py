@@ -78,14 +78,22 @@ class Layout:
         # Fields of fixed size up to a string or a sequence, by where they begin; then what follows
         self._runs: list[tuple[tuple[struct.Struct, ...], int, str]] = []
         codes: tuple[str, ...] = ()
+        first: struct.Struct | None = None
         for item in (*items, ""):
             if item in ("", STRING) or item.endswith("[]"):
+                first = first or _fixed(codes, 0)
                 counted = (*codes, "I") if item else codes
                 by_phase = tuple(_fixed(counted, phase) for phase in range(8))
                 self._runs.append((by_phase, len(codes), item))
                 codes = ()
             else:
                 codes += (item,)
+        assert first is not None
+        self._first = first  # what comes before the first string
+        # Few senders, many messages. Of those read: where what follows the last string begins,
+        # by size, and the fields from the first string to the last, by their bytes.
+        self._ends: dict[int, tuple[int, struct.Struct]] = {}
+        self._middles: dict[bytes, list[Any]] = {}
 
     def pack(self, *values: Any) -> bytes:
         """The message; ``struct.error`` where a value does not fit its field."""
@@ -112,11 +120,21 @@ class Layout:
         cut or damaged, a type with sequences."""
         if not cdr.startswith(_ENCAPSULATION):
             return None
+        known = self._ends.get(len(cdr))
+        if known is not None:
+            at, last = known
+            middle = self._middles.get(cdr[4 + self._first.size : at])
+            if middle is not None:
+                return [*self._first.unpack_from(cdr, 4), *middle, *last.unpack_from(cdr, at)]
+        return self._walk(cdr)
+
+    def _walk(self, cdr: bytes) -> list[Any] | None:
+        """``unpack`` run by run; notes where the strings are and what they say."""
         values: list[Any] = []
-        position = 4
+        position = begin = 4
         try:
             for by_phase, _, kind in self._runs:
-                fixed = by_phase[(position - 4) & 7]
+                fixed, begin = by_phase[(position - 4) & 7], position
                 values += fixed.unpack_from(cdr, position)
                 position += fixed.size
                 if kind:
@@ -127,7 +145,15 @@ class Layout:
                     position = end
         except (struct.error, ValueError):
             return None
-        return values if 0 <= len(cdr) - position < 4 else None
+        if not 0 <= len(cdr) - position < 4:
+            return None
+        if len(self._runs) > 1:
+            if len(self._middles) >= _NAMES:
+                self._ends, self._middles = {}, {}
+            self._ends[len(cdr)] = begin, fixed
+            middle = values[self._runs[0][1] : len(values) - self._runs[-1][1]]
+            self._middles[cdr[4 + self._first.size : begin]] = middle
+        return values
 
 
 def _bytes(matrix: Array) -> bytes:

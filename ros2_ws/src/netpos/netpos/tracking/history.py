@@ -7,7 +7,7 @@ from typing import Generic, Protocol, TypeVar
 
 from netpos.tracking.sequencer import Epoch, Item, channel_and_source
 
-_SNAPSHOTS = 4  # states kept per length of the history
+_SNAPSHOTS = 2  # states kept per length of the history
 
 
 class _Copied(Protocol):

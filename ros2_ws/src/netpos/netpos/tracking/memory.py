@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass, field, fields
+from operator import attrgetter
 
 import numpy as np
 
@@ -44,9 +45,7 @@ class TrackMemory:
 
     def copy(self) -> TrackMemory:
         """An independent copy, for a track to go back to."""
-        twin = TrackMemory.__new__(TrackMemory)
-        for name in _FIELDS:
-            setattr(twin, name, getattr(self, name))
+        twin = TrackMemory(*_values(self))
         twin.biases = self.biases.copy()
         twin.blockage = self.blockage.copy()
         if self.estimate is None:
@@ -61,4 +60,4 @@ class TrackMemory:
         return twin
 
 
-_FIELDS = tuple(entry.name for entry in fields(TrackMemory))
+_values = attrgetter(*(entry.name for entry in fields(TrackMemory)))

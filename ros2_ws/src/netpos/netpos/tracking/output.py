@@ -32,10 +32,11 @@ def eigenvalues(xx: float, xy: float, yy: float) -> tuple[float, float]:
     return min(inner, outer), max(inner, outer)
 
 
+@leaf
 def largest_sd(cov: Array) -> float:
     """Standard deviation [m] of the position along its worst horizontal direction."""
-    (xx, xy), (_, yy) = cov[:2, :2].tolist()
-    return math.sqrt(max(eigenvalues(xx, xy, yy)[1], 0.0))
+    xx, xy, yy = cov[0, 0], cov[0, 1], cov[1, 1]
+    return math.sqrt(max(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy), 0.0))
 
 
 def heading(mean: Array, cov: Array, last: float, index: int = -1) -> tuple[float, float]:
@@ -116,17 +117,25 @@ def with_yaw_rate(odometry: Odometry, mean: Array, cov: Array, heading: int) -> 
     return odometry
 
 
-def clock_state(stamp_ns: int, vue_id: str, mean: Array, cov: Array) -> ClockState:
-    """Clock state in seconds and seconds per second of offset and drift in metres: mean (2,), cov
-    (2, 2)."""
-    c = SPEED_OF_LIGHT_MPS
+def clock_state(stamp_ns: int, vue_id: str, mean: Array, cov: Array, at: int = 0) -> ClockState:
+    """Clock state in seconds and seconds per second of offset and drift in metres, the states
+    ``at`` and after of mean (n,), cov (n, n)."""
+    c, clock_cov = SPEED_OF_LIGHT_MPS, np.empty((2, 2))
+    _clock_cov(cov, at, clock_cov)
     return ClockState(
         stamp_ns=stamp_ns,
         vue_id=vue_id,
-        offset_s=mean.item(0) / c,
-        drift=mean.item(1) / c,
-        cov=cov / (c * c),
+        offset_s=mean.item(at) / c,
+        drift=mean.item(at + 1) / c,
+        cov=clock_cov,
     )
+
+
+@leaf
+def _clock_cov(cov: Array, at: int, out: Array) -> None:
+    for a in range(2):
+        for b in range(2):
+            out[a, b] = cov[at + a, at + b] / (SPEED_OF_LIGHT_MPS * SPEED_OF_LIGHT_MPS)
 
 
 def track_state(

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from netpos.filters.compile import kernel, leaf
-from netpos.filters.fusion import fuse, workspace
+from netpos.filters.fusion import W_GAIN, fuse
 from netpos.filters.manoeuvre import add_manoeuvre, unnoticed_s
 from netpos.filters.measurement import GROUP, VARIANCE, curvature_variance, innovation_row
 from netpos.messages.values import Array
@@ -25,6 +25,7 @@ _ANGLES = 16
 _COS2 = np.cos(np.linspace(0.0, np.pi / 2, _ANGLES + 1)) ** 2
 _WEIGHT = np.append(np.append(0.5, np.ones(_ANGLES - 1)), 0.5) / _ANGLES
 _ITERATIONS = 20
+_NEGLIGIBLE = 40.0  # exponent of a term too small for the sum's digits
 RISK_MIN, RISK_MAX = 1e-15, 0.5
 
 
@@ -38,13 +39,16 @@ def gaussian_radius(xx: float, xy: float, yy: float, risk: float) -> float:
         return 0.0
     ratio = max(centre - spread, 0.0) / large
     log_risk = math.log(risk)
-    u = -2.0 * log_risk  # of a circular error: an upper bound
+    circular = -2.0 * log_risk
+    # Laplace's approximation of the mean over the angles: nearly there
+    u = max(circular - math.log(1.0 + math.pi / 2.0 * circular * (1.0 - ratio)), 0.0)
     for _ in range(_ITERATIONS):
         total, slope = 0.0, 0.0
+        least = max(u / (u + 2.0 * _NEGLIGIBLE), 1e-9)
         for i in range(_COS2.size):
             axis = _COS2[i] + ratio * (1.0 - _COS2[i])
-            if axis < 1e-9:
-                continue
+            if axis < least:  # so are those that follow
+                break
             term = _WEIGHT[i] * math.exp(-0.5 * u * (1.0 / axis - 1.0))
             total += term
             slope -= 0.5 * term / axis
@@ -80,14 +84,23 @@ def protection_level(cov2: Array, risk: float, inflation: float = 1.0) -> float:
     Raises ``ValueError`` for a covariance that is none, a risk outside [1e-15, 0.5], an inflation
     below 1.
     """
-    xx, xy, yy = float(cov2[0, 0]), float(cov2[0, 1]), float(cov2[1, 1])
-    if not (math.isfinite(xx + yy) and min(xx, yy) >= 0.0 and xy * xy <= xx * yy * (1.0 + 1e-9)):
-        raise ValueError(f"cov2 must be a finite covariance, got {np.asarray(cov2).tolist()}")
     if not RISK_MIN <= risk <= RISK_MAX:
         raise ValueError(f"risk must be in [{RISK_MIN:g}, {RISK_MAX:g}], got {risk!r}")
     if not 1.0 <= inflation < math.inf:
         raise ValueError(f"inflation must be finite and >= 1, got {inflation!r}")
-    return inflation * float(gaussian_radius(xx, xy, yy, risk))
+    radius: float = _radius_of(cov2, risk)
+    if math.isnan(radius):
+        raise ValueError(f"cov2 must be a finite covariance, got {np.asarray(cov2).tolist()}")
+    return inflation * radius
+
+
+@leaf
+def _radius_of(cov2: Array, risk: float) -> float:
+    """``gaussian_radius`` of cov2 (2, 2); not a number where it is no covariance."""
+    xx, xy, yy = cov2[0, 0], cov2[0, 1], cov2[1, 1]
+    if math.isfinite(xx + yy) and min(xx, yy) >= 0.0 and xy * xy <= xx * yy * (1.0 + 1e-9):
+        return float(gaussian_radius(xx, xy, yy, risk))
+    return math.nan
 
 
 @lru_cache(1024)
@@ -113,16 +126,20 @@ class NisWindow:
         self._tail = 1.0 - confidence
         self._nis: deque[float] = deque(maxlen=epochs)
         self._dofs: deque[int] = deque(maxlen=epochs)
+        self._dof = 0
 
     def add(self, nis: float, dof: int) -> None:
         """Take the NIS of one epoch; one without measurements (``dof`` 0) says nothing."""
         if dof > 0:
+            if len(self._dofs) == self._dofs.maxlen:
+                self._dof -= self._dofs[0]
+            self._dof += dof
             self._nis.append(nis)
             self._dofs.append(dof)
 
     def inflation(self) -> float:
         """Factor on the sd, >= 1."""
-        dof, nis = sum(self._dofs), math.fsum(self._nis)
+        dof, nis = self._dof, math.fsum(self._nis)
         if dof == 0 or nis <= _bound(dof, self._tail):
             return 1.0
         return math.sqrt(nis / dof)
@@ -130,9 +147,19 @@ class NisWindow:
     def copy(self) -> NisWindow:
         """An independent copy: a track that goes back in time goes back to it."""
         twin = NisWindow.__new__(NisWindow)
-        twin._tail = self._tail
+        twin._tail, twin._dof = self._tail, self._dof
         twin._nis, twin._dofs = self._nis.copy(), self._dofs.copy()
         return twin
+
+
+Scratch = tuple[Array, Array, Array, Array]
+
+
+@kernel
+def level_scratch(n: int, m: int) -> Scratch:
+    """Scratch memory of ``level_in`` for ``n`` states and up to ``m`` rows."""
+    vectors, covs = np.empty((4, max(n, m))), np.empty((2, n, n))
+    return vectors, covs, np.empty((m, n)), np.empty((W_GAIN + 1, n))
 
 
 @kernel
@@ -155,37 +182,68 @@ def manoeuvre_level(
     as receiver autonomous integrity monitoring has it). inf where there is no
     gate, or a direction is open.
     """
-    speed, height_m = options[Option.MANOEUVRE_SPEED], options[Option.HEIGHT]
-    x, P = prior_mean.copy(), prior_cov.copy()
-    gate, h = options[GATE + 2], np.empty(x.size)
-    _, longest_s = unnoticed_s(x, P, rows, height_m, gate, speed, h)
+    scratch = level_scratch(mean.size, rows.shape[0])
+    return float(
+        level_in(prior_mean, prior_cov, rows, accepted, unheard_s, mean, options, risk, scratch)
+    )
+
+
+@leaf
+def level_in(
+    prior_mean: Array,
+    prior_cov: Array,
+    rows: Array,
+    accepted: Array,
+    unheard_s: float,
+    mean: Array,
+    options: Array,
+    risk: float,
+    scratch: Scratch,
+) -> float:
+    """``manoeuvre_level`` in the memory of ``level_scratch``."""
+    n, height_m, speed = mean.size, options[Option.HEIGHT], options[Option.MANOEUVRE_SPEED]
+    x, wide, P = scratch[0][0, :n], scratch[1][0], scratch[1][1]
+    _, longest_s = unnoticed_s(prior_mean, prior_cov, rows, height_m, options[GATE + 2], speed, x)
     if math.isinf(longest_s):
         return math.inf
-    add_manoeuvre(speed, max(unheard_s, longest_s), P)
-    _apply_about(mean, x, P, rows, accepted, height_m)
+    for a in range(n):
+        x[a] = mean[a]
+        for b in range(n):
+            wide[a, b] = prior_cov[a, b]
+    add_manoeuvre(speed, max(unheard_s, longest_s), wide)
+    _apply_about(x, P, prior_mean, wide, rows, accepted, height_m, scratch)
     apart = math.hypot(x[0] - mean[0], x[1] - mean[1])
     return float(apart + gaussian_radius(P[0, 0], P[0, 1], P[1, 1], risk))
 
 
-@kernel
+@leaf
 def _apply_about(
-    about: Array, mean: Array, cov: Array, rows: Array, accepted: Array, height_m: float
+    x: Array,
+    P: Array,
+    prior_mean: Array,
+    prior_cov: Array,
+    rows: Array,
+    accepted: Array,
+    height_m: float,
+    scratch: Scratch,
 ) -> None:
-    """Apply the accepted groups of ``rows`` (m, ROW_WIDTH) in place, linearised at ``about`` (n,),
-    an answer already known, and once more at what comes of it, with the curvature that is left."""
-    n, m = mean.size, rows.shape[0]
-    H, innovation, variance = np.empty((m, n)), np.empty(m), rows[:, VARIANCE].copy()
-    use, work = np.empty(m), workspace(n, m)
-    prior, prior_cov, last = mean.copy(), cov.copy(), about
+    """Apply the accepted groups of ``rows`` (m, ROW_WIDTH) to the prior (n,), (n, n), linearised
+    at ``x`` (n,), an answer already known, and once more at what comes of it, with the curvature
+    that is left. The posterior replaces ``x`` and fills ``P`` (n, n)."""
+    n, m = x.size, rows.shape[0]
+    vectors, _, H, work = scratch
+    innovation, variance, use = vectors[1, :m], vectors[2, :m], vectors[3, :m]
     for again in range(2):
         for i in range(m):
             use[i] = accepted[int(rows[i, GROUP])]
-            innovation[i] = innovation_row(rows[i], last, height_m, H[i])
+            innovation[i] = innovation_row(rows[i], x, height_m, H[i])
             for a in range(n):
-                innovation[i] += H[i, a] * (last[a] - prior[a])
+                innovation[i] += H[i, a] * (x[a] - prior_mean[a])
+            variance[i] = rows[i, VARIANCE]
             if again:
-                variance[i] += curvature_variance(rows[i], last, cov, height_m)
-        mean[:] = prior
-        cov[:] = prior_cov
-        fuse(mean, cov, innovation, H, variance, use, work)
-        last = mean.copy()
+                variance[i] += curvature_variance(rows[i], x, P, height_m)
+        for a in range(n):
+            x[a] = prior_mean[a]
+            for b in range(n):
+                P[a, b] = prior_cov[a, b]
+        fuse(x, P, innovation, H[:m], variance, use, work)

@@ -58,7 +58,7 @@ class Epoch:
         """Items in the order in which they are applied."""
         if len(self.items) == 1:
             return iter(self.items.values())
-        return (self.items[key] for key in sorted(self.items))
+        return iter([self.items[key] for key in sorted(self.items)])
 
     def rsu_complete(self) -> bool:
         """Every RSU measurement announced by ``expected`` is here; False where the number is not
@@ -143,8 +143,9 @@ class Sequencer:
         """Note that a channel has reached a stamp."""
         if channel == IMU and self._tick_ns > 0 and RSU in self._watermark:
             self._tick(self._watermark.get(channel, stamp_ns), stamp_ns)
-        self._watermark[channel] = max(stamp_ns, self._watermark.get(channel, stamp_ns))
-        self.newest_ns = max(stamp_ns, self.newest_ns)
+        if stamp_ns > self._watermark.get(channel, -1):
+            self._watermark[channel] = stamp_ns
+            self.newest_ns = max(stamp_ns, self.newest_ns)
 
     def _tick(self, from_ns: int, to_ns: int) -> None:
         """Have epochs at the multiples of the tick after ``from_ns``, none older than a second."""
@@ -190,7 +191,7 @@ class Sequencer:
         """Epochs that may be applied now, in stamp order."""
         released = []
         while self._pending:
-            stamp = min(self._pending)
+            stamp = min(self._pending) if len(self._pending) > 1 else next(iter(self._pending))
             if not self._ready(self._pending[stamp]):
                 break
             released.append(self._take(stamp))

@@ -78,14 +78,14 @@ class Tracker:
         """Take a measurement; returns the reason when it is refused (also counted in the track's
         status)."""
         if isinstance(item, RsuMeasurement):
-            if not self.concerns(item):
+            if self._config.network and not self.concerns(item):
                 return None
         elif isinstance(item, ImuSample):
             return self._add_imu(item)
         reason = self._fault(item)
         self._touched.add(item.vue_id)
         if reason is None:
-            sequencer = self._sequencer(item.vue_id)
+            sequencer = self._sequencers.get(item.vue_id) or self._sequencer(item.vue_id)
             reason = sequencer.add(item)
             if sequencer.set_back:
                 self.reset(item.vue_id)

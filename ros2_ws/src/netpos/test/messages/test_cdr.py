@@ -235,6 +235,41 @@ def test_what_does_not_fit_its_field_is_an_error(change: dict[str, int]) -> None
         cdr_codec().track_status(replace(status, **change))
 
 
+names = st.sampled_from(["", "a", "b", "ab", "ba", "rsu_1", "rsu_2", "rsu_12"])
+strings = st.builds(
+    RsuMeasurement, stamp_ns=stamps, rsu_id=names, vue_id=names, sequence=counts, toa_s=doubles
+)
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.lists(strings, min_size=2, max_size=6), st.integers(0, 3), st.data())
+def test_what_was_read_before_changes_nothing(
+    values: list[RsuMeasurement], cut: int, data: st.DataObject
+) -> None:
+    """One layout for messages in turn, of like sizes and like strings in other places; then a byte
+    of one of them is another, and it is cut or padded."""
+    layout = Layout(flat_items(MEASUREMENT))
+    cdrs = [serialise(codec().measurement_to_msg(value)) for value in values]
+    for cdr in [*cdrs, *reversed(cdrs)]:
+        assert repr(layout.unpack(cdr)) == repr(Layout(flat_items(MEASUREMENT)).unpack(cdr))
+    damaged = bytearray(data.draw(st.sampled_from(cdrs)))
+    damaged[data.draw(st.integers(0, 60))] ^= data.draw(st.integers(1, 255))
+    for other in (bytes(damaged), cdrs[0][: len(cdrs[0]) - cut], cdrs[0] + b"\0" * cut):
+        assert repr(layout.unpack(other)) == repr(Layout(flat_items(MEASUREMENT)).unpack(other))
+
+
+def test_names_are_not_kept_without_end() -> None:
+    layout = Layout(["I", "string", "d"])
+    for number in range(3 * 4096):
+        assert layout.unpack(_named(number))[:2] == [7, f"n{number}"]
+    assert len(layout._middles) <= 4096
+    assert layout.unpack(_named(5)) == [7, "n5", 0.0]
+
+
+def _named(number: int) -> bytes:
+    return Layout(["I", "string", "d"]).pack(7, f"n{number}", 0.0)
+
+
 def test_types_are_flattened_to_their_fields() -> None:
     header = ["i", "I", "string"]
     assert list(flat_items("netpos_msgs/msg/ClockState")) == [*header, "d", "d", "4d"]

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from netpos.filters.manoeuvre import unnoticed_s
-from netpos.filters.measurement import linearise
+from netpos.filters.measurement import VALUE, linearise
 from netpos.filters.rows import linear_rows, rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking import TrackerConfig
@@ -166,6 +166,20 @@ def test_window_forgets_and_ignores_epochs_without_measurements() -> None:
     assert NisWindow().inflation() == 1.0
 
 
+def test_window_forgets_the_degrees_of_freedom_with_their_nis() -> None:
+    """Epochs of different size: the sums of the last five alone."""
+    window, dofs = NisWindow(epochs=5), [2, 9, 4, 1, 7, 3, 8, 2, 6, 5]
+    for dof in dofs:
+        window.add(100.0, dof)
+    expected = math.sqrt(500.0 / sum(dofs[-5:]))
+    assert window.inflation() == pytest.approx(expected)
+    assert window.copy().inflation() == window.inflation()
+    twin = window.copy()
+    twin.add(100.0, 11)
+    assert twin.inflation() == pytest.approx(math.sqrt(500.0 / (sum(dofs[-4:]) + 11)))
+    assert window.inflation() == pytest.approx(expected)
+
+
 def test_window_finds_the_scale_and_is_quiet_where_the_filter_is_right() -> None:
     rng = np.random.default_rng(12)
     for scale in (1.0, 3.0):
@@ -250,6 +264,24 @@ def test_level_of_a_manoeuvre_is_a_second_answer_and_how_far_it_is(unheard_s: fl
     expected = np.linalg.norm(x[:2] - mean[:2]) + protection_level(P[:2, :2], 1e-4)
     level = manoeuvre_level(prior, cov, rows, accepted, unheard_s, mean, options(), 1e-4)
     assert level == pytest.approx(expected, rel=1e-6)
+
+
+def test_level_of_a_manoeuvre_with_biases_that_tell_nothing() -> None:
+    """States beyond the six, known exactly: the level of six states."""
+    prior, cov = np.array([10.0, 20.0, 3.0, -1.0, 0.0, 0.0]), np.diag([4.0, 9.0, 0.2, 0.3, 1, 1])
+    rows = np.vstack([azimuth_row(-50.0, 0.0, 0.05, prior), azimuth_row(9.0, -80.0, 0.02, prior)])
+    rows[:, VALUE] += 0.03, -0.01
+    levels = []
+    for n in (6, 8):
+        mean, P = np.zeros(n), np.zeros((n, n))
+        mean[:6], P[:6, :6] = prior, cov
+        state = mean.copy()
+        state[:2] += 0.7, -0.4
+        args = (mean, P, rows, np.ones(2), 0.3, state, options(), 1e-4)
+        levels.append(manoeuvre_level(*args))
+        assert np.array_equal(mean[:6], prior)
+        assert np.array_equal(P[:6, :6], cov)
+    assert levels[0] == pytest.approx(levels[1], rel=1e-9)
 
 
 def test_a_manoeuvre_nobody_could_notice() -> None:

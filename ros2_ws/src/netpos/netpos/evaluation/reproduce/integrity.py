@@ -13,7 +13,7 @@ from netpos.filters.measurement import GROUP
 from netpos.filters.motion import Parameter
 from netpos.messages.values import Array
 from netpos.tracking.engine import GATE, GATE_SIZE, Option
-from netpos.tracking.protection import gaussian_radius, manoeuvre_level, radius_limit
+from netpos.tracking.protection import gaussian_radius, level_in, level_scratch, radius_limit
 
 _WINDOW, _TAIL = 50, 1e-3  # of ``NisWindow``
 _BOUND = np.append(0.0, chdtri(np.arange(1.0, 64.0 * _WINDOW), _TAIL))
@@ -42,36 +42,46 @@ def protection_levels(
     """
     count = means.shape[0]
     level = np.empty(count)
-    full_nis, full_dof = np.empty(count), np.empty(count)
-    sum_nis = sum_dof = 0.0
-    heard_ns = stamps_ns[0]
-    accepted = np.ones(GATE_SIZE)
+    optimism = _optimism(row_start, rows, nis, taken, options)
+    x, P, motion = means[0].copy(), covs[0].copy(), motions[0].copy()
+    scratch = level_scratch(x.size, np.diff(row_start).max())
+    heard_ns, accepted = stamps_ns[0], np.ones(GATE_SIZE)
     for k in range(count):
-        own = rows[row_start[k] : row_start[k + 1]]
-        m = own.shape[0]
-        groups = int(own[m - 1, GROUP]) + 1
-        size = m // groups
-        full_nis[k] = nis[k] + (groups - taken[k]) * options[GATE + min(size, GATE_SIZE - 1)]
-        full_dof[k] = m
-        sum_nis, sum_dof = sum_nis + full_nis[k], sum_dof + full_dof[k]
-        if k >= _WINDOW:
-            sum_nis, sum_dof = sum_nis - full_nis[k - _WINDOW], sum_dof - full_dof[k - _WINDOW]
-        cov = covs[k]
-        optimism = math.sqrt(sum_nis / sum_dof) if sum_nis > _BOUND[int(sum_dof)] else 1.0
         level[k] = 0.0
         if options[Option.MANOEUVRE_SPEED] > 0.0 and k > 0:
             unheard_s = (stamps_ns[k] - heard_ns) * 1e-9
-            x, P = means[k - 1].copy(), covs[k - 1].copy()
-            motion = motions[min(k, motions.shape[0] - 1)].copy()
+            x[:], P[:], motion[:] = means[k - 1], covs[k - 1], motions[min(k, len(motions) - 1)]
             motion[Parameter.JUMP_SPEED] = 0.0
             ekf.predict(x, P, (stamps_ns[k] - stamps_ns[k - 1]) * 1e-9, motion, bias)
             accepted[:] = 1.0 if taken[k] > 0 else 0.0
-            level[k] = manoeuvre_level(x, P, own, accepted, unheard_s, means[k], options, risk)
+            own = rows[row_start[k] : row_start[k + 1]]
+            level[k] = level_in(x, P, own, accepted, unheard_s, means[k], options, risk, scratch)
             if taken[k] == 0:
                 level[k] += options[Option.MANOEUVRE_SPEED] * unheard_s
-        if level[k] < optimism * radius_limit(cov[0, 0], cov[0, 1], cov[1, 1], risk):
-            radius = gaussian_radius(cov[0, 0], cov[0, 1], cov[1, 1], risk)
-            level[k] = max(level[k], optimism * radius)
+        xx, xy, yy = covs[k, 0, 0], covs[k, 0, 1], covs[k, 1, 1]
+        if level[k] < optimism[k] * radius_limit(xx, xy, yy, risk):
+            level[k] = max(level[k], optimism[k] * gaussian_radius(xx, xy, yy, risk))
         if taken[k] > 0:
             heard_ns = stamps_ns[k]
     return level
+
+
+@kernel
+def _optimism(row_start: Array, rows: Array, nis: Array, taken: Array, options: Array) -> Array:
+    """Factor on the sd (N,) of a ``NisWindow`` after each epoch."""
+    count = nis.size
+    factor, full_nis = np.ones(count), np.empty(count)
+    sum_nis = sum_dof = 0.0
+    for k in range(count):
+        m = row_start[k + 1] - row_start[k]
+        groups = int(rows[row_start[k + 1] - 1, GROUP]) + 1
+        refused = options[GATE + min(m // groups, GATE_SIZE - 1)]
+        full_nis[k] = nis[k] + (groups - taken[k]) * refused
+        sum_nis, sum_dof = sum_nis + full_nis[k], sum_dof + m
+        if k >= _WINDOW:
+            old = k - _WINDOW
+            sum_nis -= full_nis[old]
+            sum_dof -= row_start[old + 1] - row_start[old]
+        if sum_nis > _BOUND[int(sum_dof)]:
+            factor[k] = math.sqrt(sum_nis / sum_dof)
+    return factor
