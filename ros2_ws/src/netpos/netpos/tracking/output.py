@@ -117,25 +117,17 @@ def with_yaw_rate(odometry: Odometry, mean: Array, cov: Array, heading: int) -> 
     return odometry
 
 
-def clock_state(stamp_ns: int, vue_id: str, mean: Array, cov: Array, at: int = 0) -> ClockState:
-    """Clock state in seconds and seconds per second of offset and drift in metres, the states
-    ``at`` and after of mean (n,), cov (n, n)."""
-    c, clock_cov = SPEED_OF_LIGHT_MPS, np.empty((2, 2))
-    _clock_cov(cov, at, clock_cov)
+def clock_state(stamp_ns: int, vue_id: str, mean: Array, cov: Array) -> ClockState:
+    """Clock state in seconds and seconds per second of offset and drift in metres: mean (2,), cov
+    (2, 2)."""
+    c = SPEED_OF_LIGHT_MPS
     return ClockState(
         stamp_ns=stamp_ns,
         vue_id=vue_id,
-        offset_s=mean.item(at) / c,
-        drift=mean.item(at + 1) / c,
-        cov=clock_cov,
+        offset_s=mean.item(0) / c,
+        drift=mean.item(1) / c,
+        cov=cov / (c * c),
     )
-
-
-@leaf
-def _clock_cov(cov: Array, at: int, out: Array) -> None:
-    for a in range(2):
-        for b in range(2):
-            out[a, b] = cov[at + a, at + b] / (SPEED_OF_LIGHT_MPS * SPEED_OF_LIGHT_MPS)
 
 
 def track_state(

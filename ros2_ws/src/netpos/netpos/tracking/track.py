@@ -369,7 +369,7 @@ class Track:
         )
         clock = None
         if state.has_clock:
-            clock = output.clock_state(epoch.stamp_ns, self._vue_id, mean, cov, at=4)
+            clock = output.clock_state(epoch.stamp_ns, self._vue_id, mean[4:6], cov[4:6, 4:6])
         track = None
         if self._secondary is not None:
             track = self._secondary.track(state.own, state.segment, estimate, state.bias)
