@@ -8,6 +8,10 @@ N(r) N(c | r) and the posterior
 
 is normal in c given r; what is left is a quadrature over r. The rest of the state follows the
 position linearly.
+
+The moments of one bearing are exact, but the next one cuts the normal prior made of them at the
+RSU again, and the next: the same news each time. Counted again and again it puts a device on top
+of the RSU, sure to a millimetre, whatever the bearings say.
 """
 
 from __future__ import annotations
@@ -82,9 +86,16 @@ def _moments(
 
 
 @kernel
-def fuse_bearing(mean: Array, cov: Array, row: Array, variance: float) -> bool:
+def fuse_bearing(
+    mean: Array, cov: Array, row: Array, variance: float, again: bool = False
+) -> bool:
     """Fuse a plain bearing with ``variance`` [rad^2] into mean (n,) and cov (n, n) in place;
-    False, and nothing done, where the prior is degenerate."""
+    False, and nothing done, where the prior is degenerate.
+
+    again : one of many. As far as the prior is a strip along the bearing already, the range then
+        keeps its second moment about the prior's mean, as if what lies behind the RSU were folded
+        to its front: the bearing tells the side once more, and no distance.
+    """
     angle = row[VALUE] + math.atan2(row[AXES + 1], row[AXES])
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     rsu = row[ORIGIN : ORIGIN + 2]
@@ -105,6 +116,8 @@ def fuse_bearing(mean: Array, cov: Array, row: Array, variance: float) -> bool:
             break
         width = max(_REACH_SD * sd, (high - low) / _NODES)
         low, high = max(r - width, 0.0), r + width
+    if again:
+        c_rr += max(1.0 - P[1, 1] / rr, 0.0) * (r - a[0]) ** 2
     C = np.array([[c_rr, c_rc], [c_rc, c_cc]])
     prior_2d = cov[:2, :2].copy()
     gain = np.linalg.solve(prior_2d, cov[:2].copy()).T.copy()
@@ -115,12 +128,12 @@ def fuse_bearing(mean: Array, cov: Array, row: Array, variance: float) -> bool:
 
 @leaf
 def on_top(mean: Array, cov: Array, rows: Array, work: Array) -> bool:
-    """Whether ``mean`` lies nearer to the RSU of a bearing used than half its own sd."""
+    """Whether ``mean`` lies nearer to the RSU of a bearing used than two of its own sd."""
     for i in range(rows.shape[0]):
         if work[W_USE, i] == 0.0 or not is_plain_bearing(rows[i]):
             continue
         dx, dy = mean[0] - rows[i, ORIGIN], mean[1] - rows[i, ORIGIN + 1]
-        if 4.0 * (dx * dx + dy * dy) < cov[0, 0] + cov[1, 1]:
+        if dx * dx + dy * dy < 4.0 * (cov[0, 0] + cov[1, 1]):
             return True
     return False
 
@@ -135,7 +148,7 @@ def fuse_around(mean: Array, cov: Array, rows: Array, height_m: float, work: Arr
     use = work[W_USE, :m].copy()
     for i in range(m):
         wanted = use[i] == 1.0 and is_plain_bearing(rows[i])
-        if wanted and fuse_bearing(mean, cov, rows[i], rows[i, VARIANCE]):
+        if wanted and fuse_bearing(mean, cov, rows[i], rows[i, VARIANCE], True):
             use[i] = 0.0
     innovation, H = linearise(rows, mean, height_m)
     variance = rows[:, VARIANCE].copy()

@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 from netpos.filters import ekf
-from netpos.filters.bearing import fuse_bearing, is_plain_bearing
+from netpos.filters.bearing import fuse_bearing, is_plain_bearing, on_top
+from netpos.filters.fusion import W_USE
 from netpos.filters.measurement import BIAS, HEADING
 from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
@@ -121,3 +122,46 @@ def test_a_device_behind_the_rsu_is_not_put_on_top_of_it() -> None:
     assert np.hypot(*(expected[:2] - RSU)) > 1.0
     assert (np.abs(x - expected) < 0.02 * sd).all()
     np.testing.assert_allclose(P / np.outer(sd, sd), expected_cov / np.outer(sd, sd), atol=0.02)
+
+
+def test_the_same_bearing_again_tells_the_side_and_no_distance() -> None:
+    """A strip along the bearing, cut in its middle: the range keeps its second moment, which of a
+    half-normal is that of the normal."""
+    mean, cov = np.array([*RSU, 0.0, 0.0, 0.0, 0.0]), np.eye(6)
+    cov[0, 0], cov[1, 1] = 36.0, 1e-4
+    once, again = (mean.copy(), cov.copy()), (mean.copy(), cov.copy())
+    assert fuse_bearing(*once, _row(0.0), SD**2)
+    assert fuse_bearing(*again, _row(0.0), SD**2, True)
+    np.testing.assert_array_equal(once[0], again[0])
+    moved = once[0][0] - RSU[0]
+    strip = 1.0 - 1e-4 / 36.0
+    assert again[1][0, 0] == pytest.approx(once[1][0, 0] + strip * moved**2, rel=1e-9)
+    assert again[1][0, 0] == pytest.approx(36.0, rel=0.03)
+    np.testing.assert_allclose(again[1][1:, 1:], once[1][1:, 1:], rtol=1e-9)
+    round_cov = 4.0 * np.eye(6)
+    first, other = (mean.copy(), round_cov.copy()), (mean.copy(), round_cov.copy())
+    fuse_bearing(*first, _row(0.4), SD**2)
+    fuse_bearing(*other, _row(0.4), SD**2, True)
+    np.testing.assert_allclose(other[1], first[1], rtol=1e-9, atol=1e-12)
+
+
+def test_bearings_cut_at_the_rsu_do_not_make_sure() -> None:
+    """The prior passes the RSU while the device, 20 m before it, goes on being seen there."""
+    mean, cov = np.array([RSU[0] - 3.0, RSU[1], 0.0, 0.0, 0.0, 0.0]), np.eye(6)
+    cov[0, 0], cov[1, 1] = 64.0, 0.04
+    rows, gate, work = _row(0.0)[None], np.array([0.0, np.inf]), ekf.workspace(6, 1)
+    for _ in range(60):
+        ekf.update(mean, cov, rows, 0.0, gate, 8, np.zeros(1), work)
+    error = RSU[0] + 20.0 - mean[0]
+    assert error**2 < 12.0 * cov[0, 0]
+
+
+@pytest.mark.parametrize(("distance", "near"), [(1.99, True), (2.01, False)])
+def test_an_rsu_is_near_within_two_sd(distance: float, near: bool) -> None:
+    rows, work = _row(0.0)[None], ekf.workspace(6, 1)
+    cov, mean = np.diag([0.5, 0.5, 1.0, 1.0, 1.0, 1.0]), np.zeros(6)
+    mean[:2] = RSU + distance * np.array([0.6, -0.8])
+    work[W_USE, 0] = 1.0
+    assert on_top(mean, cov, rows, work) is near
+    work[W_USE, 0] = 0.0
+    assert not on_top(mean, cov, rows, work)
