@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Install netpos into .venv and build the ROS workspace. Does nothing when both are up to date.
+# Install netpos into .venv, build the ROS workspace, compile the kernels. Does nothing when all are up to date.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 root=$PWD
@@ -121,7 +121,7 @@ built="$(wanted_venv)
 workspace=$(workspace_state | sha256sum | cut -d' ' -f1)"
 if [ "$(cat ros2_ws/install/.netpos-setup 2>/dev/null || true)" != "$built" ]; then
   check_platform
-  say "building the workspace and compiling the kernels (about a minute)"
+  say "building the workspace (about a minute)"
   unfinished=ros2_ws/build/.netpos-unfinished # left by a build that was stopped: start that one afresh
   [ ! -e "$unfinished" ] || rm -rf ros2_ws/build ros2_ws/install
   rm -f ros2_ws/install/.netpos-setup
@@ -137,7 +137,16 @@ if [ "$(cat ros2_ws/install/.netpos-setup 2>/dev/null || true)" != "$built" ]; t
     fail "building the workspace failed; the whole log is ros2_ws/log/setup.log"
   }
   rm "$unfinished"
+  printf '%s\n' "$built" >ros2_ws/install/.netpos-setup
+fi
+
+# ---- kernels -------------------------------------------------------------------------------------------------------
+# An edit of one compiles them all anew: here, not in the first node that is started.
+kernels="$built
+kernels=$(grep -rlE --include='*.py' '@kernel|@leaf|njit' ros2_ws/src/netpos/netpos | sort | xargs cat | sha256sum | cut -d' ' -f1)"
+if [ "$(cat ros2_ws/install/.netpos-kernels 2>/dev/null || true)" != "$kernels" ]; then
+  say "compiling the kernels (two minutes)"
   load_environment
   python -m netpos.warm_up || say "the kernels could not be compiled ahead; they will be at their first use"
-  printf '%s\n' "$built" >ros2_ws/install/.netpos-setup
+  printf '%s\n' "$kernels" >ros2_ws/install/.netpos-kernels
 fi

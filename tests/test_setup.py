@@ -111,7 +111,9 @@ def test_other_ros_is_refused(copy: Path, repository: Path) -> None:
 
 def test_second_setup_does_nothing(repository: Path) -> None:
     """Neither in a plain shell nor after env.sh, which makes a shell look like a sourced ROS."""
-    stamps = [repository / ".venv/.netpos-setup", repository / "ros2_ws/install/.netpos-setup"]
+    installed = repository / "ros2_ws" / "install"
+    stamps = [repository / ".venv" / ".netpos-setup"]
+    stamps += [installed / ".netpos-setup", installed / ".netpos-kernels"]
     before = [stamp.stat().st_mtime_ns for stamp in stamps]
     for script in ("scripts/setup.sh", ". ./env.sh && scripts/setup.sh"):
         result = shell(repository, script, plain_environment(repository))

@@ -11,7 +11,7 @@ from netpos.tracking import Tracker, TrackOutput
 from netpos.tracking.warm_up import warm_up, warm_up_anchors
 from netpos_msgs.msg import NetworkTrack, RsuInfo, RsuMeasurement
 from netpos_node import CDR, CODEC, LATCHED, STREAM, run, take_waiting
-from netpos_node.estimating import EstimatingNode, spin
+from netpos_node.estimating import EstimatingNode
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu
 
@@ -124,4 +124,4 @@ class EkfTrackerNode(EstimatingNode):
 
 def main() -> None:
     """Entry point of ``ros2 run ekf_tracker ekf_tracker``."""
-    run(EkfTrackerNode, spin)
+    run(EkfTrackerNode)

@@ -63,7 +63,13 @@ CODEC = Codec(message_class)
 CDR = cdr_codec()  # the same for the bytes of messages
 
 
-def run(factory: Callable[[], Node], spin: Callable[[Node], None] = rclpy.spin) -> None:
+def spin_and_finish(node: Any) -> None:
+    """Spin a node until it is stopped, then let it ``finish``: give out what still follows from
+    all that has arrived, and see it delivered."""
+    spin_until_stopped(node, node.finish)
+
+
+def run(factory: Callable[[], Any], spin: Callable[[Any], None] = spin_and_finish) -> None:
     """Start a node, spin it, shut down; a bad parameter ends the process with one sentence and
     code 2."""
     choose_profiles(os.environ)

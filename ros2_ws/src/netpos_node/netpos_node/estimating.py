@@ -26,7 +26,6 @@ from netpos_node import (
     CDR,
     STREAM,
     see_delivered,
-    spin_until_stopped,
     take_waiting,
     wait_until_heard,
 )
@@ -180,9 +179,3 @@ class EstimatingNode(Node):
         response.success = True
         response.message = "enabled" if request.data else "disabled: measurements are refused"
         return response
-
-
-def spin(node: Node) -> None:
-    """Spin an ``EstimatingNode`` until it is stopped, then let it finish."""
-    assert isinstance(node, EstimatingNode)
-    spin_until_stopped(node, node.finish)

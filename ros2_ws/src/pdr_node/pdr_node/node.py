@@ -17,7 +17,6 @@ from netpos_node import (
     STREAM,
     run,
     see_delivered,
-    spin_until_stopped,
     take_waiting,
     wait_until_heard,
 )
@@ -87,11 +86,6 @@ class PdrNode(Node):
         see_delivered(self)
 
 
-def _spin(node: Node) -> None:
-    assert isinstance(node, PdrNode)
-    spin_until_stopped(node, node.finish)
-
-
 def main() -> None:
     """Entry point of ``ros2 run pdr_node pdr_node``."""
-    run(PdrNode, _spin)
+    run(PdrNode)

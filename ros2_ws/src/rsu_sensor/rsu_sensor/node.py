@@ -6,7 +6,7 @@ from typing import Any
 
 from netpos.messages.topics import BEACON, RSU_INFO, RSU_MEASUREMENTS, of_vue
 from netpos_msgs.msg import Beacon, RsuInfo, RsuMeasurement
-from netpos_node import LATCHED, STREAM, run, wait_until_heard
+from netpos_node import LATCHED, STREAM, run, see_delivered, take_waiting, wait_until_heard
 from rclpy.duration import Duration
 from rclpy.node import Node
 
@@ -31,9 +31,10 @@ class RsuSensorNode(Node):
             if rsu.rsu_id in self._settings.rsu_ids:
                 self._info_pub.publish(rsu_info_to_msg(rsu))
         self._wait_for_subscribers()
-        for vue_id in self._settings.scenario.vue_ids:
-            topic = of_vue(vue_id, BEACON)
-            self.create_subscription(Beacon, topic, self._on_beacon, STREAM)
+        self._beacon_subs = [
+            self.create_subscription(Beacon, of_vue(vue_id, BEACON), self._on_beacon, STREAM)
+            for vue_id in self._settings.scenario.vue_ids
+        ]
         self.get_logger().info(
             f"{self._settings.scenario.name}: {len(self._settings.rsu_ids)} RSUs listen to "
             f"{', '.join(self._settings.scenario.vue_ids)}"
@@ -62,6 +63,12 @@ class RsuSensorNode(Node):
         for measurement in measurements:
             if measurement.rsu_id in self._settings.rsu_ids:
                 self._measurement_pub.publish(measurement_to_msg(measurement))
+
+    def finish(self) -> None:
+        """Measure what beacons are waiting, and see it delivered."""
+        for subscription in self._beacon_subs:
+            take_waiting(subscription, self._on_beacon)
+        see_delivered(self)
 
 
 def main() -> None:

@@ -10,7 +10,8 @@ import pytest
 import rclpy
 from netpos.messages.values import Beacon
 from netpos.scenario import Simulation, load_scenario
-from netpos_node import CODEC
+from netpos_node import CODEC, STREAM, wait_until_heard
+from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from rsu_sensor.node import RsuSensorNode
 from rsu_sensor.parameters import hosted
@@ -75,6 +76,19 @@ def test_bad_beacons_are_counted_and_the_next_good_one_is_measured(ros: None) ->
     assert (node.refused, sink.messages) == (2, [])
     node._on_beacon(good)
     assert (node.refused, len(sink.messages)) == (2, 2)
+
+
+def test_beacons_that_wait_when_the_node_is_stopped_are_measured(ros: None) -> None:
+    node, sink = _node(scenario="fast_pass")
+    beacons = _beacon_messages("fast_pass")[:5]
+    publisher = node.create_publisher(type(beacons[0]), "/vue_1/beacon", STREAM)
+    heard = {"beacon": publisher}
+    assert not wait_until_heard(heard, {"beacon": 1}, 20.0, settle_s=0.0)
+    for message in beacons:
+        publisher.publish(message)
+    assert publisher.wait_for_all_acked(Duration(seconds=20))
+    node.finish()
+    assert [m.sequence for m in sink.messages[::2]] == [b.sequence for b in beacons]
 
 
 def test_unknown_rsus_are_refused_by_name(ros: None) -> None:

@@ -9,7 +9,7 @@ from netpos.messages import topics
 from netpos.tracking.networks.tertiary import TrackFusion
 from netpos_msgs.msg import NetworkTrack
 from netpos_node import run
-from netpos_node.estimating import EstimatingNode, spin
+from netpos_node.estimating import EstimatingNode
 
 from track_fusion.conversions import diagnostics_to_msg, network_track_from_msg
 from track_fusion.parameters import declare_parameters
@@ -48,4 +48,4 @@ class TrackFusionNode(EstimatingNode):
 
 def main() -> None:
     """Entry point of ``ros2 run track_fusion track_fusion``."""
-    run(TrackFusionNode, spin)
+    run(TrackFusionNode)
