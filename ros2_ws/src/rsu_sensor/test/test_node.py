@@ -11,18 +11,11 @@ import rclpy
 from netpos.messages.values import Beacon
 from netpos.scenario import Simulation, load_scenario
 from netpos_node import CODEC, STREAM, wait_until_heard
+from nodes import Kept
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from rsu_sensor.node import RsuSensorNode
 from rsu_sensor.parameters import hosted
-
-
-class _Sink:
-    def __init__(self) -> None:
-        self.messages: list[Any] = []
-
-    def publish(self, message: Any) -> None:
-        self.messages.append(message)
 
 
 @pytest.fixture
@@ -33,11 +26,11 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     rclpy.try_shutdown()
 
 
-def _node(**parameters: Any) -> tuple[RsuSensorNode, _Sink]:
+def _node(**parameters: Any) -> tuple[RsuSensorNode, Kept]:
     node = RsuSensorNode(
         parameter_overrides=[Parameter(n, value=v) for n, v in parameters.items()]
     )
-    sink = _Sink()
+    sink = Kept()
     node._measurement_pub = sink  # type: ignore[assignment]
     return node, sink
 
