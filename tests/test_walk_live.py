@@ -31,7 +31,11 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> str:
         "pauses_s": [2.0, 0.7, 0.7, 0.7, 1.5],
     }
     path = tmp_path_factory.mktemp("walk") / "lap.yaml"
-    return str(changed_scenario(path, "pedestrian_walk", {"route": route}, tracker=PATIENT))
+    return str(
+        changed_scenario(
+            path, "pedestrian_walk", {"route": route}, tracker=PATIENT | {"history_s": 10.0}
+        )
+    )
 
 
 @pytest.fixture(scope="module")
@@ -146,9 +150,8 @@ def test_the_run_script_dead_reckons_who_walks(
     scenario: str, graph: Graph, tmp_path: Path
 ) -> None:
     """run_graph.sh starts a pdr_node; the tracker fuses its velocities and says what it learned of
-    the person. A velocity that comes more than ``history_s`` late is not used: on a busy machine
-    some are missing live, and what is learned agrees within half its sd; with all of them it is
-    the same to the last bit. So is a replay of what was computed without delays."""
+    the person: the same to the last bit as offline, and in a replay of that. A velocity heard
+    before the tracker waits for velocities is late at most, and goes through the history."""
     bag_path = tmp_path / "run"
     started = script(graph, "run_graph", scenario, bag_path, str(RATE))
     finish(started)
@@ -156,28 +159,16 @@ def test_the_run_script_dead_reckons_who_walks(
     with BagReader(bag_path) as bag:
         steps = [e.message for e in bag.messages(["/vue_1/step"])]
     assert len(steps) == 32
-    fused = with_steps(bag_path)
+    fused = [s for s in messages(bag_path, TRACK_STATUS) if "step_velocity" in s.sources]
     assert len(fused) > 200
     learned = steps_learned(bag_path)
     assert 0.8 < learned[0] < 1.2
     assert 0.0 < learned[1] < 0.09  # 0.1 at the start
     assert 0.0 < learned[3] < 0.05
     offline = steps_learned(tmp_path / "offline")
-    if len(fused) == len(with_steps(tmp_path / "offline")):
-        assert learned == offline
-    assert abs(offline[0] - learned[0]) < 0.5 * learned[1]
-    assert abs(offline[2] - learned[2]) < 0.5 * learned[3]
+    assert learned == offline
     netpos("replay", tmp_path / "offline", "--out", tmp_path / "again")
     assert steps_learned(tmp_path / "again") == offline
-
-
-def with_steps(bag: Path) -> set[int]:
-    """Stamps of the epochs that fused a step velocity."""
-    return {
-        stamp_ns(s.header.stamp)
-        for s in messages(bag, TRACK_STATUS)
-        if "step_velocity" in s.sources
-    }
 
 
 def steps_learned(bag: Path) -> tuple[float, ...]:
