@@ -31,7 +31,8 @@ Found = tuple[int, int, str, bytes]  # log time, place in the file, topic, paylo
 def messages_in_order(storage: Any, topics: Mapping[int, str]) -> Iterator[Found]:
     """Messages of an indexed file in log-time order, ties in the order of the file.
 
-    ``storage`` is rosbags' reader of the file, opened; ``topics`` those wanted, by channel.
+    ``storage`` is the file, opened by rosbags or ``SingleFile``; ``topics`` those wanted, by
+    channel.
 
     Raises
     ------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -17,6 +17,7 @@ from netpos.bags import layout
 from netpos.bags.chunks import Found, messages_in_order
 from netpos.bags.errors import BagError
 from netpos.bags.scan import summary_is_sound
+from netpos.bags.single_file import open_single_file
 from netpos.bags.types import require_type, store_of_definition
 
 
@@ -28,6 +29,14 @@ class TopicInfo:
     count: int
     qos: list[Qos]
     definition: str
+
+
+def _info(type_name: str, count: int, qos: list[Qos], definition: str) -> TopicInfo:
+    return TopicInfo(type_name=type_name, count=count, qos=qos, definition=definition)
+
+
+def _texts(custom: Mapping[Any, Any]) -> dict[str, str]:
+    return {str(key): str(value) for key, value in custom.items()}
 
 
 class BagEntry:
@@ -69,6 +78,13 @@ class BagReader:
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
+        self._check_path()
+        self._file = open_single_file(self.path) if self.path.is_dir() else None
+        if self._file is not None:
+            self.topics = {name: _info(*told) for name, told in self._file.topics.items()}
+            self.start_ns, self.end_ns = self._file.start_ns, self._file.end_ns
+            self.metadata = _texts(self._file.custom)
+            return
         self._reader = self._open()
         try:
             self.topics = self._describe_topics()
@@ -78,7 +94,7 @@ class BagReader:
         empty = self._reader.message_count == 0
         self.start_ns = 0 if empty else int(self._reader.start_time)
         self.end_ns = 0 if empty else int(self._reader.end_time) - 1
-        self.metadata: dict[str, str] = self._run_metadata()
+        self.metadata = self._run_metadata()
 
     def __enter__(self) -> Self:
         return self
@@ -93,7 +109,9 @@ class BagReader:
 
     def close(self) -> None:
         """Close the files; may be called twice."""
-        if self._reader.is_open:
+        if self._file is not None:
+            self._file.close()
+        elif self._reader.is_open:
             self._reader.close()
 
     def _damaged(self, reason: object) -> BagError:
@@ -102,7 +120,7 @@ class BagReader:
             f"{self.path} is incomplete or damaged ({text}); try: netpos recover {self.path}"
         )
 
-    def _open(self) -> Reader:
+    def _check_path(self) -> None:
         if not self.path.exists():
             raise BagError(f"{self.path} does not exist; check the path of the bag")
         if self.path.is_dir() and not (self.path / layout.METADATA_FILE).exists():
@@ -112,6 +130,8 @@ class BagReader:
                 f"{self.path} is not a bag: it holds no {layout.METADATA_FILE} and no .mcap file"
             )
         self._check_summaries()
+
+    def _open(self) -> Reader:
         try:
             reader = Reader(self.path)
         except ReaderError as error:
@@ -140,11 +160,11 @@ class BagReader:
                     f"{self.path}: {connection.topic} holds both {known.type_name} and "
                     f"{connection.msgtype}; split it first"
                 )
-            topics[connection.topic] = TopicInfo(
-                type_name=connection.msgtype,
-                count=connection.msgcount + (known.count if known else 0),
-                qos=list(getattr(connection.ext, "offered_qos_profiles", [])),
-                definition=connection.msgdef.data,
+            topics[connection.topic] = _info(
+                connection.msgtype,
+                connection.msgcount + (known.count if known else 0),
+                list(getattr(connection.ext, "offered_qos_profiles", [])),
+                connection.msgdef.data,
             )
         total = sum(topic.count for topic in topics.values())
         if total != self._reader.message_count:
@@ -155,8 +175,7 @@ class BagReader:
 
     def _run_metadata(self) -> dict[str, str]:
         if self.path.is_dir():
-            custom = getattr(self._reader.storage.metadata, "custom", None) or {}
-            return {str(key): str(value) for key, value in custom.items()}
+            return _texts(getattr(self._reader.storage.metadata, "custom", None) or {})
         with self.path.open("rb") as stream:
             for record in make_reader(stream).iter_metadata():
                 if record.name == layout.RUN_RECORD:
@@ -211,6 +230,9 @@ class BagReader:
 
     def _by_chunk(self, wanted: Collection[str]) -> Iterator[Found] | None:
         """The short way, for a single MCAP file with an index."""
+        if self._file is not None:
+            wanted_by_channel = {c: t for c, t in self._file.channels.items() if t in wanted}
+            return messages_in_order(self._file, wanted_by_channel)
         storages = getattr(self._reader.storage, "storages", [self._reader.storage])
         whole = self._reader.storage.metadata.compression_mode != "message"
         if len(storages) != 1 or not whole or not getattr(storages[0], "chunks", None):

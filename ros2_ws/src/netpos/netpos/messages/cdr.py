@@ -118,6 +118,11 @@ class Layout:
     def unpack(self, cdr: bytes) -> list[Any] | None:
         """The fields, or None for what needs a closer look: another encoding, a message that is
         cut or damaged, a type with sequences."""
+        parts = self.parts(cdr)
+        return None if parts is None else [value for part in parts for value in part]
+
+    def parts(self, cdr: bytes) -> tuple[Sequence[Any], Sequence[Any], Sequence[Any]] | None:
+        """``unpack``: the fields before the first string, from it to the last one, after it."""
         if not cdr.startswith(_ENCAPSULATION):
             return None
         known = self._ends.get(len(cdr))
@@ -125,11 +130,17 @@ class Layout:
             at, last = known
             middle = self._middles.get(cdr[4 + self._first.size : at])
             if middle is not None:
-                return [*self._first.unpack_from(cdr, 4), *middle, *last.unpack_from(cdr, at)]
-        return self._walk(cdr)
+                return self._first.unpack_from(cdr, 4), middle, last.unpack_from(cdr, at)
+        values = self._walk(cdr)
+        if values is None:
+            return None
+        if len(self._runs) == 1:
+            return values, (), ()
+        begin, end = self._runs[0][1], len(values) - self._runs[-1][1]
+        return values[:begin], values[begin:end], values[end:]
 
     def _walk(self, cdr: bytes) -> list[Any] | None:
-        """``unpack`` run by run; notes where the strings are and what they say."""
+        """The fields, run by run; notes where the strings are and what they say."""
         values: list[Any] = []
         position = begin = 4
         try:
@@ -192,36 +203,37 @@ class CdrCodec:
 
     def measurement(self, cdr: bytes) -> RsuMeasurement | None:
         """Value of a netpos_msgs/RsuMeasurement; values are not judged here."""
-        values = self._measurement.unpack(cdr)
-        if values is None:
+        parts = self._measurement.parts(cdr)
+        if parts is None:
             return None
-        sec, nanosec, _, rsu_id, vue_id, sequence, expected, fields, los, rssi = values[:10]
-        position, position_cov = _NO_POSITION, _NO_COV
-        if not cdr.endswith(_ZERO_POSITION):
-            position, position_cov = np.array(values[23:26]), _matrix(values[26], 3)
-        return RsuMeasurement(
-            stamp_ns=sec * NS + nanosec,
-            rsu_id=rsu_id,
-            vue_id=vue_id,
-            sequence=sequence,
-            expected=expected,
-            fields=_field(fields),
-            line_of_sight=los,
-            rssi_dbm=rssi,
-            azimuth_rad=values[10],
-            azimuth_var=values[11],
-            elevation_rad=values[12],
-            elevation_var=values[13],
-            toa_s=values[14],
-            toa_var=values[15],
-            range_m=values[16],
-            range_var=values[17],
-            phase_difference_rad=values[18],
-            phase_difference_var=values[19],
-            lever_arm=(values[20], values[21], values[22]),
-            position=position,
-            position_cov=position_cov,
-        )
+        (sec, nanosec), (_, rsu_id, vue_id), scalars = parts
+        value = RsuMeasurement.__new__(RsuMeasurement)  # the defaults would cost most
+        value.stamp_ns, value.rsu_id, value.vue_id = sec * NS + nanosec, rsu_id, vue_id
+        (
+            value.sequence,
+            value.expected,
+            fields,
+            value.line_of_sight,
+            value.rssi_dbm,
+            value.azimuth_rad,
+            value.azimuth_var,
+            value.elevation_rad,
+            value.elevation_var,
+            value.toa_s,
+            value.toa_var,
+            value.range_m,
+            value.range_var,
+            value.phase_difference_rad,
+            value.phase_difference_var,
+            *lever_and_position,
+        ) = scalars
+        x, y, z, *position, position_cov = lever_and_position
+        value.fields, value.lever_arm = _field(fields), (x, y, z)
+        if cdr.endswith(_ZERO_POSITION):
+            value.position, value.position_cov = _NO_POSITION, _NO_COV
+        else:
+            value.position, value.position_cov = np.array(position), _matrix(position_cov, 3)
+        return value
 
     def imu(self, cdr: bytes, vue_id: str | None = None) -> ImuSample | None:
         """Value of a sensor_msgs/Imu of a device (default: the one its frame names)."""

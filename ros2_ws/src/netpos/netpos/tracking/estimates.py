@@ -79,19 +79,15 @@ class Single:
         self._factored = config.filter == "srukf"
         self._motion: Array = motions_of(config)[0].copy()
         mean, cov = grown(mean, cov, initial_extra_sd(config))
-        self._mean, self._spread = mean.copy(), engine.to_spread(cov, self._options)
+        self.mean, self._spread = mean.copy(), engine.to_spread(cov, self._options)
         self._rows = 0
         self._make_room(4)
 
     def _make_room(self, rows: int) -> None:
-        n = self._mean.size
+        n = self.mean.size
         self._rows = max(rows, self._rows)
         self._work, self._spare = engine.scratch(n, self._rows)
         self._accepted = np.zeros((2, self._rows))
-
-    @property
-    def mean(self) -> Array:
-        return self._mean
 
     @property
     def cov(self) -> Array:
@@ -103,14 +99,14 @@ class Single:
 
     @property
     def prior(self) -> tuple[Array, Array]:
-        spread = self._spare[1 : self._mean.size + 1]
+        spread = self._spare[1 : self.mean.size + 1]
         cov = engine.to_cov(spread, self._options) if self._factored else spread
         return self._spare[0], cov
 
     def grow(self, sd: Array) -> None:
-        if self._mean.size < 6 + sd.size:
-            mean, cov = grown(self._mean, self.cov, sd)
-            self._mean, self._spread = mean, engine.to_spread(cov, self._options)
+        if self.mean.size < 6 + sd.size:
+            mean, cov = grown(self.mean, self.cov, sd)
+            self.mean, self._spread = mean, engine.to_spread(cov, self._options)
             self._make_room(self._rows)
 
     def drive(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
@@ -123,7 +119,7 @@ class Single:
 
     def predict(self, stamp_ns: int, bias: Array) -> None:
         dt = (stamp_ns - self.stamp_ns) * 1e-9
-        engine.predict(self._mean, self._spread, dt, self._motion, bias, self._options)
+        engine.predict(self.mean, self._spread, dt, self._motion, bias, self._options)
         self.stamp_ns = stamp_ns
 
     def step(
@@ -132,7 +128,7 @@ class Single:
         if len(rows) > self._rows:
             self._make_room(len(rows))
         nis, dof, _ = engine.step(
-            self._mean,
+            self.mean,
             self._spread,
             (stamp_ns - self.stamp_ns) * 1e-9,
             unheard_s,
@@ -151,7 +147,7 @@ class Single:
     def copy(self) -> Single:
         twin = Single.__new__(Single)
         twin.__dict__.update(self.__dict__)
-        twin._mean, twin._spread = self._mean.copy(), self._spread.copy()
+        twin.mean, twin._spread = self.mean.copy(), self._spread.copy()
         twin._motion = self._motion.copy()
         return twin
 

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from netpos.filters.compile import kernel
+from netpos.filters.compile import kernel, leaf
 from netpos.filters.measurement import (
     GATE_VARIANCE,
     GROUP,
@@ -19,13 +19,23 @@ from netpos.filters.measurement import (
 )
 from netpos.messages.values import Array, RsuMeasurement
 from netpos.tracking.batch import Batch, Source
+from netpos.tracking.engine import Option, is_sound
 from netpos.tracking.health import RsuHealth
-from netpos.tracking.health_words import Observation
+from netpos.tracking.observations import FittedEpoch
+from netpos.tracking.protection import manoeuvre_level
 from netpos.tracking.rsus import Rsu
 
 AnySource = TypeVar("AnySource", bound=Source)
-# What is told of: a position fix has rows along no axis anyone can name.
-_KIND_NAMES = {int(kind): kind.name for kind in Kind if kind is not Kind.LINEAR}
+
+
+@leaf
+def _row_fits(
+    mean: Array, cov: Array, rows: Array, height_m: float, h: Array, fits: Array
+) -> None:
+    for i in range(rows.shape[0]):
+        fits[i, 0] = innovation_row(rows[i], mean, height_m, h)
+        noise = rows[i, GATE_VARIANCE]
+        fits[i, 1] = math.sqrt(innovation_variance(rows[i], mean, cov, height_m, noise, h))
 
 
 @kernel
@@ -33,12 +43,34 @@ def row_fits(mean: Array, cov: Array, rows: Array, height_m: float) -> Array:
     """Innovation of each row (m, ROW_WIDTH) at ``mean`` (n,) and its standard deviation under
     ``cov`` (n, n): (m, 2)."""
     fits = np.empty((rows.shape[0], 2))
-    h = np.empty(mean.size)
-    for i in range(rows.shape[0]):
-        fits[i, 0] = innovation_row(rows[i], mean, height_m, h)
-        noise = rows[i, GATE_VARIANCE]
-        fits[i, 1] = math.sqrt(innovation_variance(rows[i], mean, cov, height_m, noise, h))
+    _row_fits(mean, cov, rows, height_m, np.empty(mean.size), fits)
     return fits
+
+
+@kernel
+def fits_and_level(
+    prior_mean: Array,
+    prior_cov: Array,
+    rows: Array,
+    accepted: Array,
+    unheard_s: float,
+    mean: Array,
+    cov: Array,
+    options: Array,
+    risk: float,
+    fits: Array,
+) -> float:
+    """``row_fits`` at the prediction, put into ``fits`` (m, 2); ``manoeuvre_level`` where there
+    may be a manoeuvre, else 0. Not a number where ``mean``, ``cov`` are not sound."""
+    if not is_sound(mean, cov):
+        return math.nan
+    h = np.empty(mean.size)
+    _row_fits(prior_mean, prior_cov, rows, options[Option.HEIGHT], h, fits)
+    if options[Option.MANOEUVRE_SPEED] <= 0.0:
+        return 0.0
+    return float(
+        manoeuvre_level(prior_mean, prior_cov, rows, accepted, unheard_s, mean, options, risk)
+    )
 
 
 def widen(fits: Array, rows: Array, rsu: Rsu) -> None:
@@ -52,6 +84,8 @@ def without_isolated(
     health: RsuHealth, stamp_ns: int, items: Sequence[AnySource]
 ) -> tuple[list[AnySource], list[RsuMeasurement]]:
     """What may be fused, and what comes from an isolated RSU and is only looked at."""
+    if health.trusts_all(stamp_ns):
+        return list(items), []
     used: list[AnySource] = []
     watched: list[RsuMeasurement] = []
     for item in items:
@@ -75,27 +109,6 @@ def with_refused(
     return nis, dof
 
 
-def observe(
-    health: RsuHealth,
-    vue_id: str,
-    stamp_ns: int,
-    batch: Batch,
-    fits: Array,
-    accepted: Sequence[float],
-) -> None:
-    """Tell ``health`` how the measurements of an epoch fitted: ``fits`` (m, 2) per row, whether
-    ``accepted`` (groups,) per item."""
-    found: list[list[tuple[str, tuple[float, float]]]] = [[] for _ in batch.items]
-    kinds, groups = batch.rows[:, KIND].tolist(), batch.rows[:, GROUP].tolist()
-    for kind, group, (innovation, sd) in zip(kinds, groups, fits.tolist(), strict=True):
-        if kind in _KIND_NAMES:
-            found[int(group)].append((_KIND_NAMES[kind], (innovation, sd)))
-    for item, taken, innovations in zip(batch.items, accepted, found, strict=True):
-        if isinstance(item, RsuMeasurement):
-            seen = Observation(stamp_ns, vue_id, bool(taken), tuple(innovations))
-            health.take(item.rsu_id, seen)
-
-
 def observe_isolated(
     health: RsuHealth, vue_id: str, stamp_ns: int, batch: Batch, fits: Array, rsu: Rsu, gate: Array
 ) -> None:
@@ -103,4 +116,4 @@ def observe_isolated(
     fused; its rows have no bias states."""
     widen(fits, batch.rows, rsu)
     fitting = bool(((fits[:, 0] / fits[:, 1]) ** 2 <= gate[1]).all())
-    observe(health, vue_id, stamp_ns, batch, fits, [fitting])
+    health.hear(FittedEpoch(stamp_ns, vue_id, batch.items, batch.rows, fits, [fitting]))

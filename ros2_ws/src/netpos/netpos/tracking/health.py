@@ -23,7 +23,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
 
-from netpos.tracking.health_words import Observation, medians, misfit, off, rate_hz, words
+from netpos.tracking.health_memory import RsuMemory, Run, Vote
+from netpos.tracking.health_words import medians, misfit, off, rate_hz, words
+from netpos.tracking.observations import FittedEpoch, Observation
 
 _AGREES, _REFUSED = 0.7, 0.3  # accept ratios
 _WITNESS = 2.5  # mean squared normalised innovation; that of a track led astray is larger
@@ -31,6 +33,7 @@ _STALE_SLOTS = 10  # a run of verdicts does not survive a longer pause
 _FORGET_NS = 60_000_000_000
 _SPEAKS = 3  # refused measurements in a run before they are mentioned
 _FEW = 20
+_AT_ONCE = 64  # epochs kept before they are taken: one after the other costs twice as much
 _BIASED = 1.5  # median normalised innovation of an RSU that passes the gate
 
 
@@ -88,42 +91,6 @@ class RsuReport:
     mean_normalised: Mapping[str, float] = field(default_factory=dict)
 
 
-@dataclass(slots=True)
-class _Run:
-    """Verdicts of one sign in a row: first and last stamp and number of their measurements."""
-
-    first_ns: int
-    last_ns: int
-    count: int
-
-    def reaches(self, duration_s: float, count: int) -> bool:
-        return self.last_ns - self.first_ns >= duration_s * 1e9 and self.count >= count
-
-
-@dataclass(slots=True)
-class _Rsu:
-    window: deque[Observation]
-    last_ns: int = -1
-    last_vue: str = ""
-    measurements: int = 0
-    late: int = 0
-    isolated: bool = False
-    cause: str = ""
-    against: _Run | None = None
-    agrees: _Run | None = None
-    changes: deque[tuple[int, bool]] = field(default_factory=lambda: deque(maxlen=16))
-
-
-@dataclass(slots=True)
-class _Vote:
-    """What one device says of one RSU in one slot."""
-
-    entries: list[Observation]
-    ratio: float
-    misfit: float
-    witnesses: frozenset[str] = frozenset()
-
-
 class RsuHealth:
     """Collects observations of all tracks, reports and isolates RSUs."""
 
@@ -137,11 +104,13 @@ class RsuHealth:
         """Forget everything: the clock jumped back."""
         # By slot, then by device and RSU, then by stamp.
         self._open: dict[int, dict[tuple[str, str], dict[int, Observation]]] = {}
-        self._rsus: dict[str, _Rsu] = {}
+        self._rsus: dict[str, RsuMemory] = {}
+        self._heard_of: list[FittedEpoch] = []  # not yet taken
         self._heard: dict[str, int] = {}  # newest stamp by device
         self._judged = -(1 << 62)  # slots below are judged
         self._due_ns = -(1 << 62)  # when the next one is
         self._trusted_ns = 0
+        self._accused = False  # an RSU is, or was, isolated
 
     def observe(
         self,
@@ -157,41 +126,57 @@ class RsuHealth:
         innovations : (measured minus predicted in m or rad, its sd) by ``Kind`` name, any case
         Raises ``ValueError`` for an innovation that is not finite or an sd that is not > 0.
         """
-        self.take(rsu_id, Observation(stamp_ns, vue_id, accepted, tuple(innovations.items())))
-
-    def take(self, rsu_id: str, seen: Observation) -> None:
-        """``observe`` for an observation that exists."""
-        for _, (value, sd) in seen.innovations:
+        for value, sd in innovations.values():
             if not (-math.inf < value < math.inf and 0.0 < sd < math.inf):
                 raise ValueError(
                     f"innovation and sd of {rsu_id} must be finite, the sd > 0, got "
-                    f"{dict(seen.innovations)}"
+                    f"{dict(innovations)}"
                 )
-        stamp_ns, vue_id, _, _ = seen
+        values = [value for pair in innovations.values() for value in pair]
+        seen = Observation(stamp_ns, vue_id, accepted, tuple(innovations), values)
+        self._catch_up()
         if stamp_ns >= self._due_ns:
             self._advance(stamp_ns)
-        rsu = self._rsus.get(rsu_id)
-        if rsu is None:
-            rsu = self._rsus[rsu_id] = _Rsu(deque(maxlen=self._config.window))
+        self._take(vue_id, stamp_ns, [(rsu_id, seen)])
+
+    def hear(self, epoch: FittedEpoch) -> None:
+        """``observe`` for all measurements of an epoch, whose innovations are sound."""
+        if epoch.stamp_ns >= self._due_ns:
+            self._advance(epoch.stamp_ns)
+        self._heard_of.append(epoch)
+        if len(self._heard_of) >= _AT_ONCE:
+            self._catch_up()
+
+    def _catch_up(self) -> None:
+        """Take the epochs heard."""
+        heard, self._heard_of = self._heard_of, []
+        for epoch in heard:
+            self._take(epoch.vue_id, epoch.stamp_ns, epoch.observations())
+
+    def _take(self, vue_id: str, stamp_ns: int, found: Iterable[tuple[str, Observation]]) -> None:
         slot = stamp_ns // self._slot_ns
-        if slot < self._judged:
-            rsu.late += 1
-            return
-        if stamp_ns >= rsu.last_ns:
-            rsu.last_ns, rsu.last_vue = stamp_ns, vue_id
-        if stamp_ns > self._heard.get(vue_id, -1):
+        late = slot < self._judged
+        if not late and stamp_ns > self._heard.get(vue_id, -1):
             self._heard[vue_id] = stamp_ns
-        streams = self._open.get(slot)
-        if streams is None:
-            streams = self._open[slot] = {}
-        stream = streams.get((vue_id, rsu_id))
-        if stream is None:
-            stream = streams[vue_id, rsu_id] = {}
-        stream[stamp_ns] = seen
+        streams = {} if late else self._open.setdefault(slot, {})
+        for rsu_id, seen in found:
+            rsu = self._rsus.get(rsu_id)
+            if rsu is None:
+                rsu = self._rsus[rsu_id] = RsuMemory(deque(maxlen=self._config.window))
+            if late:
+                rsu.late += 1
+                continue
+            if stamp_ns >= rsu.last_ns:
+                rsu.last_ns, rsu.last_vue = stamp_ns, vue_id
+            stream = streams.get((vue_id, rsu_id))
+            if stream is None:
+                stream = streams[vue_id, rsu_id] = {}
+            stream[stamp_ns] = seen
 
     def rewind(self, vue_id: str, stamp_ns: int) -> None:
         """Drop what was observed of a device from ``stamp_ns`` on, as far as it is not judged: its
         track goes back and will observe anew."""
+        self._catch_up()
         for slot, streams in self._open.items():
             if (slot + 1) * self._slot_ns > stamp_ns:
                 for key in [k for k in streams if k[0] == vue_id]:
@@ -200,6 +185,12 @@ class RsuHealth:
                         streams[key] = kept
                     else:
                         del streams[key]
+
+    def trusts_all(self, stamp_ns: int) -> bool:
+        """Whether no measurement with this stamp is to be refused."""
+        if stamp_ns >= self._due_ns:
+            self._advance(stamp_ns)
+        return not self._accused
 
     def isolated(self, rsu_id: str, stamp_ns: int) -> bool:
         """Whether a measurement of this RSU with this stamp is to be refused."""
@@ -220,6 +211,7 @@ class RsuHealth:
         closed = (now_ns - self._settle_ns) // self._slot_ns
         if closed <= self._judged:
             return
+        self._catch_up()
         self._judged = closed
         self._due_ns = (closed + 1) * self._slot_ns + self._settle_ns
         for slot in sorted(s for s in self._open if s < closed):
@@ -229,12 +221,12 @@ class RsuHealth:
     def _judge(
         self, streams: Mapping[tuple[str, str], Mapping[int, Observation]], end_ns: int
     ) -> None:
-        devices: dict[str, dict[str, _Vote]] = {}
+        devices: dict[str, dict[str, Vote]] = {}
         heard: dict[str, list[Observation]] = {}
         for (vue_id, rsu_id), stream in streams.items():
             entries = list(stream.values())
-            ratio = sum(e.accepted for e in entries) / len(entries)
-            devices.setdefault(vue_id, {})[rsu_id] = _Vote(entries, ratio, misfit(entries))
+            ratio = sum([e.accepted for e in entries]) / len(entries)
+            devices.setdefault(vue_id, {})[rsu_id] = Vote(entries, ratio, misfit(entries))
             heard.setdefault(rsu_id, []).extend(entries)
         for rsu_id, entries in heard.items():
             rsu = self._rsus[rsu_id]
@@ -242,8 +234,8 @@ class RsuHealth:
             rsu.measurements += len(entries)
             if not rsu.isolated:
                 self._trusted_ns = max(self._trusted_ns, rsu.window[-1].stamp_ns)
-        against: dict[str, list[_Vote]] = {}
-        agree: dict[str, list[_Vote]] = {}
+        against: dict[str, list[Vote]] = {}
+        agree: dict[str, list[Vote]] = {}
         for votes in devices.values():
             self._compare(votes, against, agree)
         for rsu_id in sorted(against.keys() | agree.keys()):
@@ -252,9 +244,9 @@ class RsuHealth:
 
     def _compare(
         self,
-        votes: Mapping[str, _Vote],
-        against: dict[str, list[_Vote]],
-        agree: dict[str, list[_Vote]],
+        votes: Mapping[str, Vote],
+        against: dict[str, list[Vote]],
+        agree: dict[str, list[Vote]],
     ) -> None:
         """Sort what one device says of the RSUs into votes against and for them."""
         trusted = [name for name in votes if not self._rsus[name].isolated]
@@ -271,7 +263,7 @@ class RsuHealth:
             elif vote.ratio <= _REFUSED and len(taken) >= max(2, len(refused) + 1):
                 against.setdefault(name, []).append(vote)
 
-    def _extend(self, rsu_id: str, against: list[_Vote], agree: list[_Vote]) -> None:
+    def _extend(self, rsu_id: str, against: list[Vote], agree: list[Vote]) -> None:
         """Lengthen the run of verdicts the majority of devices is for, end the other."""
         rsu = self._rsus[rsu_id]
         if len(against) >= len(agree):
@@ -283,14 +275,14 @@ class RsuHealth:
             rsu.against = None
             rsu.agrees = self._longer(rsu.agrees, agree, True)
 
-    def _longer(self, run: _Run | None, votes: Iterable[_Vote], accepted: bool) -> _Run:
+    def _longer(self, run: Run | None, votes: Iterable[Vote], accepted: bool) -> Run:
         stamps = [e.stamp_ns for vote in votes for e in vote.entries if e.accepted is accepted]
         first, last = min(stamps), max(stamps)
         if run is None or first - run.last_ns > _STALE_SLOTS * self._slot_ns:
-            return _Run(first, last, len(stamps))
-        return _Run(run.first_ns, last, run.count + len(stamps))
+            return Run(first, last, len(stamps))
+        return Run(run.first_ns, last, run.count + len(stamps))
 
-    def _decide(self, against: Mapping[str, list[_Vote]], end_ns: int) -> None:
+    def _decide(self, against: Mapping[str, list[Vote]], end_ns: int) -> None:
         cfg = self._config
         for rsu in self._rsus.values():
             if not rsu.isolated:
@@ -312,8 +304,9 @@ class RsuHealth:
             ):
                 self._set(self._rsus[name], True, end_ns)
 
-    def _set(self, rsu: _Rsu, isolated: bool, end_ns: int) -> None:
+    def _set(self, rsu: RsuMemory, isolated: bool, end_ns: int) -> None:
         rsu.isolated = isolated
+        self._accused = True
         rsu.agrees = None
         if not isolated:
             rsu.against = None
@@ -323,11 +316,13 @@ class RsuHealth:
 
     def reports(self, now_ns: int) -> list[RsuReport]:
         """Reports of all RSUs heard so far, by name."""
+        self._catch_up()
         return [self.report(rsu_id, now_ns) for rsu_id in sorted(self._rsus)]
 
     def report(self, rsu_id: str, now_ns: int) -> RsuReport:
         """State of one RSU at ``now_ns`` by any clock, and in words what is wrong with it; changes
         nothing."""
+        self._catch_up()
         rsu = self._rsus.get(rsu_id)
         if rsu is None or rsu.last_ns < 0:
             return RsuReport(rsu_id=rsu_id, state=RsuState.OK, text="not heard yet")
@@ -350,12 +345,12 @@ class RsuHealth:
             mean_normalised=medians(entries, normalised=True),
         )
 
-    def _since_refused(self, rsu: _Rsu) -> list[Observation]:
+    def _since_refused(self, rsu: RsuMemory) -> list[Observation]:
         first_ns = rsu.against.first_ns if rsu.against is not None else -1
         return [e for e in rsu.window if e.stamp_ns >= first_ns]
 
     def _verdict(
-        self, rsu: _Rsu, now_ns: int, age_s: float, entries: list[Observation]
+        self, rsu: RsuMemory, now_ns: int, age_s: float, entries: list[Observation]
     ) -> tuple[RsuState, str]:
         faults = []
         silent = age_s >= self._config.silent_after_s

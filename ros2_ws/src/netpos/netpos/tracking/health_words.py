@@ -5,24 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from statistics import median
-from typing import NamedTuple
 
 from netpos.filters.measurement import wrap
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.tracking.observations import Observation
 
 _OFF = _SCATTERS = 3.0  # median and sd of the normalised innovations of what is refused
 _NORMAL_QUARTILE = 0.6744897501960817
 _RATE_NS = 10_000_000_000
 _CYCLIC = {"azimuth", "elevation", "phase"}
-
-
-class Observation(NamedTuple):
-    """What a track found of one measurement; per kind (innovation in m or rad, its sd)."""
-
-    stamp_ns: int
-    vue_id: str
-    accepted: bool
-    innovations: tuple[tuple[str, tuple[float, float]], ...]
 
 
 def words(entries: Sequence[Observation]) -> str:
@@ -72,7 +63,8 @@ def _by_kind(entries: Iterable[Observation]) -> dict[str, list[tuple[float, floa
     """Innovations by kind name in lower case."""
     kinds: dict[str, list[tuple[float, float]]] = {}
     for entry in entries:
-        for kind, pair in entry.innovations:
+        pairs = zip(entry.values[::2], entry.values[1::2], strict=True)
+        for kind, pair in zip(entry.kinds, pairs, strict=True):
             kinds.setdefault(kind.lower(), []).append(pair)
     return kinds
 
@@ -93,7 +85,11 @@ def medians(entries: Iterable[Observation], normalised: bool = False) -> dict[st
 
 def misfit(entries: Iterable[Observation]) -> float:
     """Mean squared normalised innovation; 1 for a consistent track."""
-    squares = [(v / sd) ** 2 for entry in entries for _, (v, sd) in entry.innovations]
+    squares = [
+        (values[i] / values[i + 1]) ** 2
+        for values in [entry.values for entry in entries]
+        for i in range(0, len(values), 2)
+    ]
     return math.fsum(squares) / len(squares) if squares else 0.0  # fsum: in any order the same
 
 

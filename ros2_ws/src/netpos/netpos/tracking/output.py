@@ -10,6 +10,7 @@ from netpos.filters.compile import leaf
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages.values import Array, ClockState, Odometry, TrackState
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.protection import radius_of
 
 # What a planar tracker does not estimate (height, roll, pitch and their rates) is reported with
 # this variance.
@@ -83,6 +84,64 @@ def _fill(
     twist[0, 1] = twist[1, 0] = cos * sin * (yy - xx) + (cos * cos - sin * sin) * xy
 
 
+@leaf
+def _describe(
+    mean: Array,
+    cov: Array,
+    yaw: float,
+    yaw_var: float,
+    risk: float,
+    vectors: Array,
+    covs: Array,
+    clock_cov: Array,
+) -> tuple[float, float, float]:
+    """``_fill``, with the direction of motion where ``yaw_var`` < 0 (``yaw``: the last one), and
+    the covariance of a clock in seconds; yaw, ``largest_sd`` and ``gaussian_radius``."""
+    if yaw_var < 0.0:
+        yaw, yaw_var = _course(mean, cov, yaw)
+    _fill(mean, cov, yaw, yaw_var, vectors, covs)
+    for a in range(2):
+        for b in range(2):
+            clock_cov[a, b] = cov[4 + a, 4 + b] / (SPEED_OF_LIGHT_MPS * SPEED_OF_LIGHT_MPS)
+    return yaw, largest_sd(cov), radius_of(cov, risk)
+
+
+def describe(
+    stamp_ns: int,
+    vue_id: str,
+    mean: Array,
+    cov: Array,
+    height_m: float,
+    last_yaw: float,
+    heading_index: int,
+    risk: float,
+) -> tuple[Odometry, ClockState, float, float, float]:
+    """Odometry and clock of a planar track (n,), (n, n), its yaw [rad] (``heading``), the sd of
+    its position along the worst direction [m] and the radius [m] that its Gaussian error leaves
+    with the probability ``risk``.
+
+    Raises ``ValueError`` for a covariance that is none.
+    """
+    vectors, covs, clock_cov = np.zeros(_VECTORS), _COVS.copy(), np.empty((2, 2))
+    yaw, yaw_var = last_yaw, -1.0
+    if heading_index >= 0:
+        yaw, yaw_var = heading(mean, cov, last_yaw, heading_index)
+    yaw, sd_m, radius_m = _describe(mean, cov, yaw, yaw_var, risk, vectors, covs, clock_cov)
+    if math.isnan(radius_m):
+        raise ValueError(f"the position's covariance is none: {cov[:2, :2].tolist()}")
+    clock = ClockState(
+        stamp_ns=stamp_ns,
+        vue_id=vue_id,
+        offset_s=mean.item(4) / SPEED_OF_LIGHT_MPS,
+        drift=mean.item(5) / SPEED_OF_LIGHT_MPS,
+        cov=clock_cov,
+    )
+    told = _odometry(stamp_ns, vue_id, vectors, covs, height_m)
+    if heading_index >= 0:
+        with_yaw_rate(told, mean, cov, heading_index)
+    return told, clock, yaw, sd_m, radius_m
+
+
 def odometry(
     stamp_ns: int,
     vue_id: str,
@@ -95,6 +154,12 @@ def odometry(
     """Odometry of a planar track: pose in map, twist in base_link (x along ``yaw``)."""
     vectors, covs = np.zeros(_VECTORS), _COVS.copy()
     _fill(mean, cov, yaw, yaw_var, vectors, covs)
+    return _odometry(stamp_ns, vue_id, vectors, covs, height_m)
+
+
+def _odometry(
+    stamp_ns: int, vue_id: str, vectors: Array, covs: Array, height_m: float
+) -> Odometry:
     vectors[_POSITION + 2] = height_m
     return Odometry(
         stamp_ns=stamp_ns,

@@ -88,14 +88,14 @@ def protection_level(cov2: Array, risk: float, inflation: float = 1.0) -> float:
         raise ValueError(f"risk must be in [{RISK_MIN:g}, {RISK_MAX:g}], got {risk!r}")
     if not 1.0 <= inflation < math.inf:
         raise ValueError(f"inflation must be finite and >= 1, got {inflation!r}")
-    radius: float = _radius_of(cov2, risk)
+    radius: float = radius_of(cov2, risk)
     if math.isnan(radius):
         raise ValueError(f"cov2 must be a finite covariance, got {np.asarray(cov2).tolist()}")
     return inflation * radius
 
 
 @leaf
-def _radius_of(cov2: Array, risk: float) -> float:
+def radius_of(cov2: Array, risk: float) -> float:
     """``gaussian_radius`` of cov2 (2, 2); not a number where it is no covariance."""
     xx, xy, yy = cov2[0, 0], cov2[0, 1], cov2[1, 1]
     if math.isfinite(xx + yy) and min(xx, yy) >= 0.0 and xy * xy <= xx * yy * (1.0 + 1e-9):
@@ -139,7 +139,7 @@ class NisWindow:
 
     def inflation(self) -> float:
         """Factor on the sd, >= 1."""
-        dof, nis = self._dof, math.fsum(self._nis)
+        dof, nis = self._dof, sum(self._nis)
         if dof == 0 or nis <= _bound(dof, self._tail):
             return 1.0
         return math.sqrt(nis / dof)

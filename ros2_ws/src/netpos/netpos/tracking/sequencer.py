@@ -58,7 +58,7 @@ class Epoch:
         """Items in the order in which they are applied."""
         if len(self.items) == 1:
             return iter(self.items.values())
-        return iter([self.items[key] for key in sorted(self.items)])
+        return map(self.items.__getitem__, sorted(self.items))
 
     def rsu_complete(self) -> bool:
         """Every RSU measurement announced by ``expected`` is here; False where the number is not
@@ -114,13 +114,18 @@ class Sequencer:
         self._late_in_row = 0
         self.set_back = False
         """The device's time was set back: start anew."""
+        self.idle = False
+        """Nothing can be released before the next item: the one epoch there is waits for
+        measurements of its stamp."""
 
     def add(self, item: Item) -> str | None:
         """Take an item; returns the reason when it is refused (``late``, ``future_stamp`` or
         ``duplicate``)."""
-        stamp = item.stamp_ns
+        stamp, self.idle = item.stamp_ns, False
         if isinstance(item, InitialPose) and stamp <= self._released_ns:
             stamp = max(self._released_ns, 1)
+        elif self._released_ns - self._history_ns <= stamp <= self.newest_ns + self._future_ns:
+            self._suspect_ns, self._late_in_row, self.set_back = None, 0, False
         else:
             reason = self._time_fault(stamp)
             if reason is not None:
@@ -137,10 +142,13 @@ class Sequencer:
             epoch = self._pending[stamp] = Epoch(stamp)
         epoch.put(key, item)
         self.mark(key[0], stamp)
+        alone = len(self._pending) == 1 and stamp == self.newest_ns and self._hold_ns > 0
+        self.idle = alone and not epoch.rsu_complete()
         return None
 
     def mark(self, channel: str, stamp_ns: int) -> None:
         """Note that a channel has reached a stamp."""
+        self.idle = False
         if channel == IMU and self._tick_ns > 0 and RSU in self._watermark:
             self._tick(self._watermark.get(channel, stamp_ns), stamp_ns)
         if stamp_ns > self._watermark.get(channel, -1):

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from netpos.bags import BagReader
+from netpos.bags.single_file import load_yaml
 from netpos.messages import topics
 
 # Name of the metadata entry of a bag that holds parameters for its measurements, as YAML.
@@ -55,7 +54,7 @@ def bag_settings(metadata: Mapping[str, str]) -> TrackerSettings:
 
 
 def _mapping(metadata: Mapping[str, str], name: str) -> dict[str, Any]:
-    loaded = yaml.safe_load(metadata.get(name, "")) or {}
+    loaded = load_yaml(metadata.get(name, "")) or {}
     if not isinstance(loaded, dict):
         raise ValueError(f"the bag's {name!r} metadata is not a mapping of parameters")
     return loaded

@@ -13,6 +13,7 @@ from netpos.filters import smooth
 from netpos.messages.values import Array, Odometry
 from netpos.tracking import output
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.estimates import Estimate
 from netpos.tracking.models import grown, heading_index, initial_extra_sd
 
 
@@ -30,6 +31,12 @@ class Posterior:
     cov: Array
     motion: Array
     bias: Array
+
+    @classmethod
+    def of(cls, estimate: Estimate, segment: int, bias: Array) -> Posterior:
+        """That of an estimate, which goes on."""
+        mean, cov, motion = estimate.mean.copy(), estimate.cov.copy(), estimate.motion.copy()
+        return cls(estimate.stamp_ns, segment, mean, cov, motion, bias)
 
 
 def check_smoothable(config: TrackerConfig) -> None:

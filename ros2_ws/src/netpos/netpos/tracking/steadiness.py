@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from copy import copy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -35,8 +34,8 @@ class Steadiness:
 
     def copy(self) -> Steadiness:
         """An independent copy."""
-        twin = copy(self)
-        twin._last = self._last.copy()
+        twin = Steadiness.__new__(Steadiness)
+        twin.config, twin._explained, twin._last = self.config, self._explained, self._last.copy()
         return twin
 
     def density(self, stamp_ns: int, velocities: Iterable[Velocity] = ()) -> float | None:

@@ -25,10 +25,11 @@ from netpos.tracking import output
 from netpos.tracking.batch import Batch, mostly_accepted
 from netpos.tracking.blockage import Blockage
 from netpos.tracking.config import ROBUST, TrackerConfig
-from netpos.tracking.fit import observe, observe_isolated, with_refused, without_isolated
+from netpos.tracking.fit import observe_isolated, with_refused, without_isolated
 from netpos.tracking.health import RsuHealth
 from netpos.tracking.history import History, merge
 from netpos.tracking.models import gate_thresholds
+from netpos.tracking.observations import FittedEpoch
 from netpos.tracking.protection import NisWindow, protection_level
 from netpos.tracking.report import Applied, TrackOutput, total, track_status
 from netpos.tracking.rsus import BiasStates, Rsu
@@ -235,7 +236,8 @@ class StrapdownTrack:
             state.rejected["gate"] += refused
         state.nis_window.add(*with_refused(batch, taken, self._gate, nis, dof))
         if self._config.isolate_rsus:
-            observe(self._health, self._vue_id, stamp_ns, batch, fits, taken)
+            epoch = FittedEpoch(stamp_ns, self._vue_id, batch.items, batch.rows, fits, taken)
+            self._health.hear(epoch)
         sources: tuple[str, ...] = ()
         if dof > 0:
             sources = self._note_accepted(stamp_ns, batch, accepted)

@@ -6,26 +6,19 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from netpos.filters.measurement import VARIANCE
-from netpos.messages.values import (
-    Array,
-    InitialPose,
-    Odometry,
-    RsuMeasurement,
-    Velocity,
-)
+from netpos.messages.values import Array, InitialPose, Odometry, RsuMeasurement, Velocity
 from netpos.tracking import estimates, output
 from netpos.tracking.batch import Batch, Source, batch_of, mostly_accepted, velocity_inflation
 from netpos.tracking.blockage import Blockage
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.engine import GATE, is_sound
+from netpos.tracking.engine import GATE
 from netpos.tracking.estimates import Estimate
 from netpos.tracking.fit import (
-    observe,
+    fits_and_level,
     observe_isolated,
     row_fits,
     with_refused,
@@ -38,8 +31,8 @@ from netpos.tracking.initialise import Initialiser, with_heading
 from netpos.tracking.memory import TrackMemory
 from netpos.tracking.models import heading_index, initial_extra_sd, options_of, pose_state
 from netpos.tracking.networks.secondary import Secondary
+from netpos.tracking.observations import FittedEpoch
 from netpos.tracking.phase_start import PhaseStart, corrections, with_sectors
-from netpos.tracking.protection import manoeuvre_level, protection_level
 from netpos.tracking.report import Applied, TrackOutput, total, track_status
 from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sectors import Sectors
@@ -70,6 +63,7 @@ class Track:
         self._gate = self._options[GATE:]
         self._extra_sd = initial_extra_sd(config)
         self._heading = heading_index(config)
+        self._use_imu, self._calibrates_steps = config.use_imu, config.calibrates_steps
         self._secondary = Secondary(vue_id, config) if config.network else None
         self._history: History[TrackMemory] = History(int(config.history_s * 1e9))
         self._fixed_lag = FixedLag(vue_id, config) if config.fixed_lag_s > 0.0 else None
@@ -136,14 +130,7 @@ class Track:
         unkept = self._fixed_lag is None and self.posteriors is None
         if estimate is None or unkept or not estimate.decided:
             return result
-        posterior = Posterior(
-            stamp_ns=estimate.stamp_ns,
-            segment=state.segment,
-            mean=estimate.mean.copy(),
-            cov=estimate.cov.copy(),
-            motion=estimate.motion.copy(),
-            bias=state.bias,
-        )
+        posterior = Posterior.of(estimate, state.segment, state.bias)
         if self.posteriors is not None:
             self.posteriors.append(posterior)
         if self._fixed_lag is None:
@@ -239,23 +226,25 @@ class Track:
         state.estimate = with_sectors(self._config, state.estimate, batch.rows)
         estimate = self._prepare(stamp_ns, batch.items)
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
-        state.blockage.expect(batch)
+        blocked = self._config.nlos_probability > 0.0
+        if blocked:
+            state.blockage.expect(batch)
         nis, dof, flags = estimate.step(
             stamp_ns, unheard_s, state.rejected_in_row, batch.rows, state.bias
         )
         accepted = flags.tolist()
-        state.blockage.learn(batch)
+        if blocked:
+            state.blockage.learn(batch)
         if self._secondary is not None:
             state.own = self._secondary.after(
                 state.own, stamp_ns, estimate, batch.rows, state.bias
             )
         state.segment += corrections(estimate, state.rejected)
         state.has_clock = state.has_clock or (dof > 0 and batch.has_time)
-        if not is_sound(estimate.mean, estimate.cov):
+        if not self._note_fit(stamp_ns, batch, flags, accepted, nis, dof):
             state.rejected["diverged"] += 1
             self._forget()
             return Applied(stamp_ns)
-        self._note_fit(stamp_ns, batch, accepted, nis, dof)
         refused = accepted.count(0.0)
         if refused:
             state.rejected["gate"] += refused
@@ -278,40 +267,51 @@ class Track:
         assert estimate is not None
         if estimate.mean.size < self._state.biases.first + len(self._state.biases.sd):
             estimate.grow(np.append(self._extra_sd, self._state.bias[0]))
-        if self._config.use_imu:
+        if self._use_imu:
             yaw, speed, uncovered_s = self.imu.increments(estimate.stamp_ns, stamp_ns)
             blind = uncovered_s > _IMU_HOLE_S
             estimate.drive(yaw, speed, _BLIND_GYRO if blind else self._config.gyro_noise_density)
-        velocities = (item for item in items if isinstance(item, Velocity))
-        density = self._state.steadiness.density(stamp_ns, velocities)
-        if density is not None:
-            estimate.shake(density)
+        if self._config.steady_accel_density_mps2_sqrthz > 0.0:
+            velocities = (item for item in items if isinstance(item, Velocity))
+            density = self._state.steadiness.density(stamp_ns, velocities)
+            if density is not None:
+                estimate.shake(density)
         return estimate
 
     def _note_fit(
-        self, stamp_ns: int, batch: Batch, accepted: Sequence[float], nis: float, dof: int
-    ) -> None:
-        """Tell the protection level and the health of the RSUs how the epoch fitted."""
-        state = self._state
+        self,
+        stamp_ns: int,
+        batch: Batch,
+        flags: Array,
+        accepted: Sequence[float],
+        nis: float,
+        dof: int,
+    ) -> bool:
+        """Tell the protection level and the health of the RSUs how the epoch fitted, unless the
+        estimate is not sound; ``flags`` (groups,) and ``accepted`` are the same."""
+        state, fits = self._state, np.empty((len(batch.rows), 2))
+        assert state.estimate is not None
+        unnoticed_m = fits_and_level(
+            *state.estimate.prior,
+            batch.rows,
+            flags,
+            (stamp_ns - state.last_accepted_ns) * 1e-9,
+            state.estimate.mean,
+            state.estimate.cov,
+            self._options,
+            self._config.integrity_risk,
+            fits,
+        )
+        if math.isnan(unnoticed_m):
+            return False
+        state.unnoticed_m = unnoticed_m
         nis, dof = with_refused(batch, accepted, self._gate, nis, dof)
         if math.isfinite(nis):
             state.nis_window.add(nis, dof)
-        assert state.estimate is not None
-        prior, height_m = state.estimate.prior, self._config.device_height_m
-        if self._config.manoeuvre_speed_sd_mps > 0.0:
-            state.unnoticed_m = manoeuvre_level(
-                *prior,
-                batch.rows,
-                np.array(accepted),
-                (stamp_ns - state.last_accepted_ns) * 1e-9,
-                state.estimate.mean,
-                self._options,
-                self._config.integrity_risk,
-            )
-        if not self._config.isolate_rsus:
-            return
-        fits = row_fits(*prior, batch.rows, height_m)
-        observe(self._health, self._vue_id, stamp_ns, batch, fits, accepted)
+        if self._config.isolate_rsus:
+            epoch = FittedEpoch(stamp_ns, self._vue_id, batch.items, batch.rows, fits, accepted)
+            self._health.hear(epoch)
+        return True
 
     def _watch(self, stamp_ns: int, watched: list[RsuMeasurement]) -> None:
         """Compare what isolated RSUs say with the estimate, without fusing it."""
@@ -352,44 +352,49 @@ class Track:
     def _report(self, epoch: Applied) -> TrackOutput:
         self._predict(epoch.stamp_ns)
         state, config = self._state, self._config
-        estimate, rejected = state.estimate, total(self.refused, state.rejected)
-        status_of = partial(
-            track_status, config, self._vue_id, epoch, accepted=state.accepted, rejected=rejected
-        )
+        estimate, counts = state.estimate, (state.accepted, total(self.refused, state.rejected))
         if estimate is None:
-            status = status_of(heard_ns=None)
+            status = track_status(config, self._vue_id, epoch, *counts)
             return TrackOutput(None, None, status, network=config.network)
         mean, cov = estimate.mean, estimate.cov
-        status = status_of(
-            heard_ns=state.last_accepted_ns,
-            position_sd_m=output.largest_sd(cov),
-            level_m=self._level(epoch.stamp_ns, estimate),
-            decided=estimate.decided,
-            steps=state.biases.step_calibration(mean, cov) if config.calibrates_steps else None,
+        odometry, clock, state.yaw, sd_m, radius_m = output.describe(
+            epoch.stamp_ns,
+            self._vue_id,
+            mean,
+            cov,
+            config.device_height_m,
+            state.yaw,
+            self._heading,
+            config.integrity_risk,
         )
-        clock = None
-        if state.has_clock:
-            clock = output.clock_state(epoch.stamp_ns, self._vue_id, mean[4:6], cov[4:6, 4:6])
+        status = track_status(
+            config,
+            self._vue_id,
+            epoch,
+            *counts,
+            heard_ns=state.last_accepted_ns,
+            position_sd_m=sd_m,
+            level_m=self._level(epoch.stamp_ns, estimate, radius_m),
+            decided=estimate.decided,
+            steps=state.biases.step_calibration(mean, cov) if self._calibrates_steps else None,
+        )
         track = None
         if self._secondary is not None:
             track = self._secondary.track(state.own, state.segment, estimate, state.bias)
-        odometry = self._odometry(epoch.stamp_ns, mean, cov)
-        return TrackOutput(odometry, clock, status, network=config.network, track=track)
+        return TrackOutput(
+            odometry,
+            clock if state.has_clock else None,
+            status,
+            network=config.network,
+            track=track,
+        )
 
-    def _level(self, stamp_ns: int, estimate: Estimate) -> float:
-        """Protection level [m]."""
+    def _level(self, stamp_ns: int, estimate: Estimate, radius_m: float) -> float:
+        """Protection level [m]; ``radius_m``: that of the estimate's Gaussian."""
         state, config = self._state, self._config
-        risk, inflation = config.integrity_risk, state.nis_window.inflation()
-        level = protection_level(estimate.cov[:2, :2], risk, inflation)
+        level = state.nis_window.inflation() * radius_m
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
         moved = state.unnoticed_m + config.manoeuvre_speed_sd_mps * unheard_s
         level = max(level, min(moved, _LEVEL_MAX_M))
+        risk = config.integrity_risk
         return estimate.radius(level, risk) if isinstance(estimate, Sectors) else level
-
-    def _odometry(self, stamp_ns: int, mean: Array, cov: Array) -> Odometry:
-        state, height_m = self._state, self._config.device_height_m
-        state.yaw, yaw_var = output.heading(mean, cov, state.yaw, self._heading)
-        odometry = output.odometry(stamp_ns, self._vue_id, mean, cov, height_m, state.yaw, yaw_var)
-        if self._heading >= 0:
-            output.with_yaw_rate(odometry, mean, cov, self._heading)
-        return odometry

@@ -83,12 +83,14 @@ class Tracker:
         elif isinstance(item, ImuSample):
             return self._add_imu(item)
         reason = self._fault(item)
-        self._touched.add(item.vue_id)
         if reason is None:
             sequencer = self._sequencers.get(item.vue_id) or self._sequencer(item.vue_id)
             reason = sequencer.add(item)
             if sequencer.set_back:
                 self.reset(item.vue_id)
+            elif sequencer.idle:
+                return None
+        self._touched.add(item.vue_id)
         if reason is not None:
             self.track(item.vue_id).refused[reason] += 1
         return reason
@@ -121,11 +123,11 @@ class Tracker:
         if not self._touched:
             return []
         touched, self._touched = self._touched, set()
-        return self._apply(Sequencer.release, touched)
+        return self._apply(Sequencer.release, sorted(touched))
 
     def flush(self) -> list[TrackOutput]:
         """Apply all that is pending: the recording has ended, or nothing has come for a while."""
-        return self._apply(Sequencer.flush, self._sequencers.keys())
+        return self._apply(Sequencer.flush, sorted(self._sequencers))
 
     def reset(self, vue_id: str | None = None) -> None:
         """Forget all tracks, or one, and what is pending; RSUs stay known. For a clock that jumped
@@ -154,13 +156,13 @@ class Tracker:
         self, take: Callable[[Sequencer], list[Epoch]], vue_ids: Iterable[str]
     ) -> list[TrackOutput]:
         outputs: list[TrackOutput] = []
-        for vue in sorted(vue_ids):
+        for vue in vue_ids:
             sequencer = self._sequencers.get(vue)
             if sequencer is None:
                 continue
             late = sequencer.take_late()
             epochs = take(sequencer)
-            if not late and not epochs:
+            if not (late or epochs):
                 continue
             track = self._tracks[vue]
             if late:
@@ -169,9 +171,11 @@ class Tracker:
                     sequencer.applied(epoch)
                 if not epochs:
                     outputs.append(revised)
-            found = [(epoch, track.step(epoch)) for epoch in epochs]
-            # Before a first fix there is nothing to tell of between epochs.
-            outputs += [said for epoch, said in found if epoch.items or said.odometry]
+            for epoch in epochs:
+                said = track.step(epoch)
+                # Before a first fix there is nothing to tell of between epochs.
+                if epoch.items or said.odometry:
+                    outputs.append(said)
         return outputs
 
     def _fault(self, item: Item) -> str | None:
@@ -180,11 +184,12 @@ class Tracker:
         match item:
             case RsuMeasurement():
                 fault = validation.measurement_fault(item)
-                if fault is None and item.rsu_id not in self._rsus:
+                if fault is not None:
+                    return fault
+                rsu = self._rsus.get(item.rsu_id)
+                if rsu is None:
                     return "unknown_rsu"
-                if fault is None and int(item.fields) & _PHASE:
-                    return self._rsus[item.rsu_id].phase_fault()
-                return fault
+                return rsu.phase_fault() if int(item.fields) & _PHASE else None
             case Velocity():
                 return validation.velocity_fault(item)
             case GroundSpeed():

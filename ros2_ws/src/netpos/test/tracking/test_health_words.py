@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from netpos.filters.measurement import Kind
 from netpos.tracking.health import HealthConfig, RsuHealth
-from netpos.tracking.health_words import Observation, medians, misfit, off, rate_hz, words
+from netpos.tracking.health_words import medians, misfit, off, rate_hz, words
+from netpos.tracking.observations import Observation
 
 
 def observed(
@@ -17,7 +18,7 @@ def observed(
 ) -> list[Observation]:
     """One observation per error, 0.1 s apart."""
     return [
-        Observation(k * 100_000_000, vues[k % len(vues)], accepted, ((kind, (float(e), sd)),))
+        Observation(k * 100_000_000, vues[k % len(vues)], accepted, (kind,), (float(e), sd))
         for k, e in enumerate(errors)
     ]
 
@@ -45,8 +46,8 @@ def test_what_a_kind_is_called(kind: str, error: float, vues: tuple[str, ...], t
 
 def test_worst_first() -> None:
     """An array turned and late at once; the kind that is fine is not named."""
-    values = (("toa", (5.0, 1.0)), ("azimuth", (0.5, 0.01)), ("elevation", (0.001, 0.01)))
-    entries = [Observation(k, "v", False, values) for k in range(9)]
+    kinds, values = ("toa", "azimuth", "elevation"), (5.0, 1.0, 0.5, 0.01, 0.001, 0.01)
+    entries = [Observation(k, "v", False, kinds, values) for k in range(9)]
     assert words(entries) == "azimuth off by 28.6 deg, clock step of 17 ns or blocked path"
 
 
@@ -94,7 +95,7 @@ def test_the_rate_is_that_of_the_last_ten_seconds() -> None:
     """A pause before them does not count, several devices at one stamp do."""
     old = observed("range", [0.0] * 50)
     new = [
-        Observation(60_000_000_000 + k * 200_000_000, vue, True, ())
+        Observation(60_000_000_000 + k * 200_000_000, vue, True, (), ())
         for k in range(50)
         for vue in ("v", "w")
     ]

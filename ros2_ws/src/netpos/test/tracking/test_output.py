@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from netpos.messages.values import Array, TrackState
 from netpos.tracking import TrackerConfig, output
+from netpos.tracking.protection import protection_level
 from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 
@@ -148,3 +149,32 @@ def test_what_a_track_is_worth(
 ) -> None:
     config = TrackerConfig(coast_after_s=2.0, initial_position_sd_max_m=1.0)
     assert output.track_state(config, 2_000_000_000, heard_ns, position_sd) is expected
+
+
+@pytest.mark.parametrize("velocity", [(5.0, -2.0), (1e-3, 0.0)])
+@pytest.mark.parametrize("heading", [-1, 6])
+def test_all_of_a_track_in_one_go(velocity: tuple[float, float], heading: int) -> None:
+    """What ``describe`` says is what its parts say."""
+    mean, cov = state(*velocity), spd(6, 0.01)
+    said, clock, yaw, sd_m, radius_m = output.describe(7, "v", mean, cov, 1.5, 0.4, heading, 1e-3)
+    expected_yaw, yaw_var = output.heading(mean, cov, 0.4, heading)
+    expected = output.odometry(7, "v", mean, cov, 1.5, expected_yaw, yaw_var)
+    if heading >= 0:
+        output.with_yaw_rate(expected, mean, cov, heading)
+    assert yaw == pytest.approx(expected_yaw, abs=1e-15)
+    for name in ("position", "quaternion", "linear_velocity", "angular_velocity"):
+        np.testing.assert_allclose(getattr(said, name), getattr(expected, name), atol=1e-14)
+    np.testing.assert_allclose(said.pose_cov, expected.pose_cov, rtol=1e-12)
+    np.testing.assert_allclose(said.twist_cov, expected.twist_cov, rtol=1e-12)
+    told = output.clock_state(7, "v", mean[4:6], cov[4:6, 4:6])
+    assert (clock.offset_s, clock.drift) == (told.offset_s, told.drift)
+    np.testing.assert_allclose(clock.cov, told.cov, rtol=1e-14)
+    assert sd_m == output.largest_sd(cov)
+    assert radius_m == protection_level(cov[:2, :2], 1e-3)
+
+
+def test_a_covariance_that_is_none_is_not_described() -> None:
+    cov = np.eye(6)
+    cov[0, 1] = cov[1, 0] = 1.5
+    with pytest.raises(ValueError, match="covariance"):
+        output.describe(7, "v", np.ones(6), cov, 1.5, 0.0, -1, 1e-4)

@@ -10,10 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from netpos.filters.manoeuvre import unnoticed_s
-from netpos.filters.measurement import VALUE, linearise
+from netpos.filters.measurement import GROUP, VALUE, linearise
 from netpos.filters.rows import linear_rows, rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking import TrackerConfig
+from netpos.tracking.engine import Option
+from netpos.tracking.fit import fits_and_level, row_fits
 from netpos.tracking.models import options_of
 from netpos.tracking.protection import (
     RISK_MIN,
@@ -296,3 +298,29 @@ def test_a_manoeuvre_nobody_could_notice() -> None:
             mean, np.eye(6), fix, accepted, 0.1, mean, options(probability), 1e-4
         )
         assert math.isfinite(level) is finite
+
+
+@pytest.mark.parametrize("speed", [0.0, 4.0])
+def test_fits_and_level_in_one_go(speed: float) -> None:
+    prior, cov = np.array([10.0, 20.0, 3.0, -1.0, 0.0, 0.0]), np.diag([4.0, 9.0, 0.2, 0.3, 1, 1])
+    rows = np.vstack([azimuth_row(-50.0, 0.0, 0.05, prior), azimuth_row(9.0, -80.0, 0.02, prior)])
+    rows[:, GROUP] = 0, 1
+    mean, taken, fits = prior + 0.2, np.array([1.0, 0.0]), np.full((2, 2), np.nan)
+    said = options(speed=speed)
+    level = fits_and_level(prior, cov, rows, taken, 0.3, mean, cov, said, 1e-4, fits)
+    assert np.array_equal(fits, row_fits(prior, cov, rows, said[Option.HEIGHT]))
+    alone = manoeuvre_level(prior, cov, rows, taken, 0.3, mean, said, 1e-4)
+    assert level == (alone if speed else 0.0)
+
+
+@pytest.mark.parametrize("where", ["mean", "cov"])
+def test_nothing_is_told_of_what_is_not_sound(where: str) -> None:
+    mean, cov, fits = np.zeros(6), np.eye(6), np.full((1, 2), 7.0)
+    if where == "mean":
+        mean[0] = np.nan
+    else:
+        cov[1, 1] = -1.0
+    row = azimuth_row(-50.0, 0.0, 0.05, np.zeros(6))
+    args = (np.zeros(6), np.eye(6), row, np.ones(1), 0.1, mean, cov, options(), 1e-4, fits)
+    assert math.isnan(fits_and_level(*args))
+    assert np.array_equal(fits, [[7.0, 7.0]])
