@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from error_states import LEVER_ARM, NOISE, OPEN, driven, linearised, moving
+from filter_rows import row
 from netpos.filters.error_state import (
     MEMORY,
     UNCONSTRAINED,
@@ -15,31 +17,14 @@ from netpos.filters.error_state import (
     correct,
     doubt_standstill,
 )
-from netpos.filters.measurement import ROW_WIDTH, VALUE, VARIANCE
-from netpos.filters.space import (
-    SpaceKind,
-    bend_variance,
-    direction_rows,
-    innovation_at,
-    place_rows,
-)
-from netpos.inertial.strapdown import (
-    ERR,
-    GYRO_BIAS,
-    NAV,
-    InertialNoise,
-    inject,
-    rotation_of,
-    still_earth,
-)
+from netpos.filters.measurement import VARIANCE, Kind
+from netpos.filters.space import SpaceKind, bend_variance, direction_rows, place_rows
+from netpos.inertial.strapdown import ERR, GYRO_BIAS, NAV, InertialNoise, inject, still_earth
 from netpos.messages.values import Array
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 G = 9.80665
-NOISE = InertialNoise(2e-3, 8.7e-4, 9.8e-3, 1.7e-4, 100.0)
-OPEN = np.array([0.0, np.inf, np.inf, np.inf, np.inf])
-LEVER_ARM = (0.5, 0.1, 1.0)
 
 
 def start(yaw: float = 0.4) -> Array:
@@ -59,10 +44,7 @@ def test_correct_is_the_information_form() -> None:
     rng = np.random.default_rng(1)
     nav, cov = start(), spd(rng)
     rows = place_rows(np.array([5.3, -2.8, 2.1]), np.diag([0.4, 0.3, 0.2]), LEVER_ARM)
-    H, z, C = np.empty((3, ERR)), np.empty(3), np.empty((3, 3))
-    rotation_of(nav[6:10], C)
-    for i in range(3):
-        z[i] = innovation_at(rows[i], nav, C, H[i])
+    z, H = linearised(rows, nav)
     R = np.diag(rows[:, VARIANCE])
     posterior = np.linalg.inv(np.linalg.inv(cov) + H.T @ np.linalg.inv(R) @ H)
     error = posterior @ H.T @ np.linalg.inv(R) @ z
@@ -111,17 +93,15 @@ def test_a_bearing_is_iterated_to_the_most_probable_place() -> None:
     nav, cov = moving(0.0), 1e-9 * np.eye(ERR)
     nav[0] = 20.0
     cov[:3, :3] = np.diag([4.0, 25.0, 0.01])
-    row = np.zeros((1, ROW_WIDTH))
-    row[0, VALUE], row[0, VARIANCE], row[0, 3], row[0, 19] = 0.5, 0.01, 0.01, -1
-    row[0, 10:19] = np.eye(3).ravel()
-    variance = 0.01 + bend_variance(row[0], nav, cov)
+    bearing = row(Kind.AZIMUTH, 0.5, 0.01)
+    variance = 0.01 + bend_variance(bearing, nav, cov)
 
     def cost(p: Array) -> float:
         prior = (p[0] - 20.0) ** 2 / 4.0 + p[1] ** 2 / 25.0
         return float(prior + (0.5 - np.arctan2(p[1], p[0])) ** 2 / variance)
 
     best = minimize(cost, [19.0, 8.0], method="Nelder-Mead", options={"xatol": 1e-7}).x
-    correct(nav, cov, row, OPEN, np.zeros(1))
+    correct(nav, cov, bearing[None], OPEN, np.zeros(1))
     np.testing.assert_allclose(nav[:2], best, atol=0.1)
     assert best[0] < 19.7
 
@@ -132,27 +112,14 @@ def level(n: int, rate: float = 0.0) -> tuple[Array, Array]:
     return stamps, np.tile([0.0, 0.0, rate, 0.0, 0.0, G], (n, 1))
 
 
-def moving(speed: float) -> Array:
-    nav = np.zeros(NAV)
-    nav[3], nav[9] = speed, 1.0
-    return nav
-
-
 def test_advance_is_the_same_however_it_is_cut() -> None:
     stamps, rates = level(300, 0.2)
     rates[:, 3] = 0.5
-    ends = []
+    sensors, ends = Sensors(NOISE, still_earth(), UNCONSTRAINED), []
     for cuts in ([3_000_000_000], [777_000_000, 1_500_000_000, 3_000_000_000]):
         nav, cov, memory, now = moving(5.0), 1e-4 * np.eye(ERR), np.zeros(MEMORY), 0
         for end in cuts:
-            args = (
-                memory,
-                now,
-                end,
-                Imu(stamps, rates),
-                Sensors(NOISE, still_earth(), UNCONSTRAINED),
-            )
-            assert advance(nav, cov, *args) == 0.0
+            assert advance(nav, cov, memory, now, end, Imu(stamps, rates), sensors) == 0.0
             now = end
         ends.append((nav, cov))
     np.testing.assert_allclose(ends[0][0], ends[1][0], atol=1e-9)
@@ -171,10 +138,7 @@ def test_a_hole_of_the_imu_is_counted_and_opens_the_covariance(missing: str) -> 
     sds = []
     for mask in (np.ones(300, dtype=bool), keep):
         nav, cov = moving(5.0), 1e-8 * np.eye(ERR)
-        blind = advance(
-            nav, cov, np.zeros(MEMORY), 0, 3 * 10**9, Imu(stamps[mask], rates[mask]),
-            Sensors(NOISE, still_earth(), UNCONSTRAINED),
-        )  # fmt: skip
+        blind = driven(nav, cov, Imu(stamps[mask], rates[mask]), 3.0)
         np.testing.assert_allclose(nav[:6], [15.0, 0, 0, 5.0, 0, 0], atol=1e-6)
         sds.append((blind, np.sqrt(cov[3, 3])))
     (whole, sure), (blind, unsure) = sds
@@ -189,15 +153,7 @@ def test_a_vehicle_does_not_slip() -> None:
     nav, cov = moving(10.0), np.diag([0.01] * 6 + [1e-4, 1e-4, 0.01] + [1e-6] * 6)
     nav[6:10] = Rotation.from_euler("z", 0.1).as_quat()
     held = Constraints(0.1, 0.1, 0.0, 0.0, 0.0)
-    advance(
-        nav,
-        cov,
-        np.zeros(MEMORY),
-        0,
-        10**10,
-        Imu(stamps, rates),
-        Sensors(NOISE, still_earth(), held),
-    )
+    driven(nav, cov, Imu(stamps, rates), 10.0, held)
     C = Rotation.from_quat(nav[6:10])
     assert abs(C.inv().apply(nav[3:6])[1]) < 0.02
     assert abs(C.as_euler("ZYX")[0]) < 0.02
@@ -214,15 +170,7 @@ def test_standstill_shows_the_gyro_bias(quiet: bool, standing: bool) -> None:
     noise = NOISE._replace(gyro_bias_sd_radps=0.01)
     rest = Constraints(0.0, 0.0, 0.02, 0.5, 0.1)
     nav = moving(0.0)
-    advance(
-        nav,
-        cov,
-        np.zeros(MEMORY),
-        0,
-        10**10,
-        Imu(stamps, rates),
-        Sensors(noise, still_earth(), rest),
-    )
+    driven(nav, cov, Imu(stamps, rates), 10.0, rest, noise)
     known = np.abs(nav[GYRO_BIAS:] - [0.002, -0.001, 0.003]).max() < 5e-4
     assert known is np.bool_(standing)
     assert (np.sqrt(cov[3, 3]) < 0.01) is np.bool_(standing)
@@ -234,15 +182,7 @@ def test_a_quiet_cruise_is_no_standstill(sd: float) -> None:
     stamps, rates = level(500)
     nav, cov = moving(15.0), np.diag([0.01] * 3 + [sd**2] * 3 + [1e-8] * 9)
     rest = Constraints(0.0, 0.0, 0.02, 0.5, 0.1)
-    advance(
-        nav,
-        cov,
-        np.zeros(MEMORY),
-        0,
-        5 * 10**9,
-        Imu(stamps, rates),
-        Sensors(NOISE, still_earth(), rest),
-    )
+    driven(nav, cov, Imu(stamps, rates), 5.0, rest)
     assert nav[3] == pytest.approx(15.0, abs=1e-6)
 
 
@@ -252,15 +192,7 @@ def test_setting_off_gently_ends_a_standstill() -> None:
     rates[500:, 3] = 0.3
     nav, cov = moving(0.0), np.diag([0.01] * 3 + [1.0] * 3 + [1e-8] * 9)
     rest = Constraints(0.0, 0.0, 0.02, 0.2, 0.05)
-    advance(
-        nav,
-        cov,
-        np.zeros(MEMORY),
-        0,
-        7 * 10**9,
-        Imu(stamps, rates),
-        Sensors(NOISE, still_earth(), rest),
-    )
+    driven(nav, cov, Imu(stamps, rates), 7.0, rest)
     assert nav[3] == pytest.approx(0.6, abs=0.05)
 
 
@@ -271,9 +203,7 @@ def test_a_doubted_standstill_is_not_held() -> None:
         nav, cov, memory = moving(0.0), np.diag([1.0] * 6 + [1e-8] * 9), np.zeros(MEMORY)
         if doubted:
             doubt_standstill(memory)
-        advance(
-            nav, cov, memory, 0, 8 * 10**9, Imu(stamps, rates), Sensors(NOISE, still_earth(), rest)
-        )
+        driven(nav, cov, Imu(stamps, rates), 8.0, rest, memory=memory)
         sds.append(np.sqrt(cov[3, 3]))
     assert sds[0] < 0.02
     assert sds[1] > 0.9
@@ -284,15 +214,7 @@ def test_the_attitude_is_that_of_the_middle_of_a_chunk() -> None:
     stamps, rates = level(10, 2.0)
     nav, cov = moving(0.0), np.diag([0.0] * 9 + [1.0, 0.0, 0.0] + [0.0] * 3)
     quiet = InertialNoise(0.0, 0.0, 0.0, 0.0, 1e9)
-    advance(
-        nav,
-        cov,
-        np.zeros(MEMORY),
-        0,
-        10**8,
-        Imu(stamps, rates),
-        Sensors(quiet, still_earth(), UNCONSTRAINED),
-    )
+    driven(nav, cov, Imu(stamps, rates), 0.1, UNCONSTRAINED, quiet)
     assert np.arctan2(-cov[4, 9], -cov[3, 9]) == pytest.approx(0.1, abs=2e-3)
 
 
@@ -301,10 +223,7 @@ def test_estimated_biases_fade_with_their_time() -> None:
     nav = moving(0.0)
     nav[10:] = 0.1, 0.2, 0.3, 0.01, 0.02, 0.03
     known = nav[10:].copy()
-    advance(
-        nav, np.eye(ERR), np.zeros(MEMORY), 0, 10**10, Imu(stamps, rates),
-        Sensors(NOISE, still_earth(), UNCONSTRAINED),
-    )  # fmt: skip
+    driven(nav, np.eye(ERR), Imu(stamps, rates), 10.0)
     np.testing.assert_allclose(nav[10:], np.exp(-0.1) * known, rtol=1e-9)
 
 

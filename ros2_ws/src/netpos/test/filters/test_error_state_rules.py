@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from error_states import LEVER_ARM, NOISE, OPEN, linearised, vehicle
+from filter_rows import row
 from netpos.filters.error_state import (
     MEMORY,
     QUIET,
@@ -14,67 +16,17 @@ from netpos.filters.error_state import (
     doubt_standstill,
     hold,
 )
-from netpos.filters.measurement import (
-    AXES,
-    BIAS,
-    COMMON,
-    GATE_VARIANCE,
-    GROUP,
-    HEADING,
-    KIND,
-    LEVER,
-    ORIGIN,
-    ROW_WIDTH,
-    VALUE,
-    VARIANCE,
-    Kind,
-)
-from netpos.filters.space import (
-    SpaceKind,
-    bend_variance,
-    direction_rows,
-    innovation_at,
-    place_rows,
-)
-from netpos.inertial.strapdown import (
-    ERR,
-    GYRO_BIAS,
-    NAV,
-    InertialNoise,
-    inject,
-    rotation_of,
-    still_earth,
-)
+from netpos.filters.measurement import GATE_VARIANCE, GROUP, VALUE, VARIANCE, Kind
+from netpos.filters.space import SpaceKind, bend_variance, direction_rows, place_rows
+from netpos.inertial.strapdown import ERR, GYRO_BIAS, NAV, inject, still_earth
 from netpos.messages.values import Array
-from scipy.spatial.transform import Rotation
-
-OPEN = np.array([0.0, np.inf])
-NOISE = InertialNoise(2e-3, 8.7e-4, 9.8e-3, 1.7e-4, 100.0)
-SCALES = np.repeat([3.0, 1.0, 0.1, 0.01, 1e-3], 3)
-
-
-def vehicle(rng: np.random.Generator) -> tuple[Array, Array]:
-    """A navigation state near the middle with correlated errors of some metres and degrees."""
-    nav = np.zeros(NAV)
-    nav[:3], nav[3:6] = rng.normal(0.0, [5.0, 5.0, 1.0]), rng.normal(0.0, [5.0, 5.0, 0.5])
-    nav[6:10] = Rotation.from_euler("ZYX", rng.normal(0.0, [1.5, 0.05, 0.05])).as_quat()
-    A = rng.normal(size=(ERR, ERR)) / 4.0
-    return nav, (A @ A.T + 0.3 * np.eye(ERR)) * np.outer(SCALES, SCALES)
 
 
 def rsu_row(kind: Kind, origin: Array, group: int) -> Array:
-    out = np.zeros(ROW_WIDTH)
-    out[KIND], out[GROUP], out[ORIGIN:AXES] = kind, group, origin
-    out[VARIANCE], out[GATE_VARIANCE] = (1e-3, 4e-4) if kind is Kind.AZIMUTH else (0.09, 0.05)
-    out[BIAS] = out[COMMON] = out[HEADING] = -1
-    out[AXES:HEADING], out[LEVER : LEVER + 3] = np.eye(3).ravel(), (0.5, 0.1, 1.0)
-    return out
-
-
-def linearised(rows: Array, nav: Array) -> tuple[Array, Array]:
-    C, H = np.empty((3, 3)), np.empty((len(rows), ERR))
-    rotation_of(nav[6:10], C)
-    return np.array([innovation_at(r, nav, C, h) for r, h in zip(rows, H, strict=True)]), H
+    variance, gate_variance = (1e-3, 4e-4) if kind is Kind.AZIMUTH else (0.09, 0.05)
+    return row(
+        kind, 0.0, variance, group, origin, gate_variance=gate_variance, lever_arm=LEVER_ARM
+    )
 
 
 def correct_by_the_rule(nav: Array, cov: Array, rows: Array) -> tuple[Array, Array, float, int]:
@@ -105,7 +57,7 @@ def problem(seed: int) -> tuple[Array, Array, Array]:
     kinds = rng.choice([Kind.RANGE, Kind.AZIMUTH, Kind.ELEVATION], 3)
     rows = [rsu_row(Kind(int(k)), rng.normal(0, [15, 15, 4]), g) for g, k in enumerate(kinds)]
     if seed % 2:
-        rows += list(place_rows(np.zeros(3), np.eye(3), (0.5, 0.1, 1.0), 3))
+        rows += list(place_rows(np.zeros(3), np.eye(3), LEVER_ARM, 3))
     velocity = direction_rows(
         SpaceKind.BODY_VELOCITY, np.eye(3)[1:], np.zeros(2), np.full(2, 0.01), 4 if seed % 2 else 3
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import filter_rows
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -21,6 +22,7 @@ from netpos.filters.measurement import (
     ROW_WIDTH,
     VALUE,
     Kind,
+    direction,
     is_angle,
     linearise,
     predict_row,
@@ -65,6 +67,17 @@ def test_jacobian_matches_central_differences(kind: Kind, seed: int, heading: in
     np.testing.assert_allclose(h, numeric, rtol=1e-6, atol=2e-8)
 
 
+@pytest.mark.parametrize("kind", DIRECTION_KINDS)
+@pytest.mark.parametrize("seed", range(5))
+def test_a_direction_changes_with_height_too(kind: Kind, seed: int) -> None:
+    rng = np.random.default_rng(200 + seed)
+    row, x, height, eps = random_row(rng, kind), random_state(rng), rng.uniform(-3, 3), 1e-5
+    d = np.append(x[:2], height + row[LEVER + 2]) - row[ORIGIN:AXES]
+    change = closed_form(row, x, height + eps) - closed_form(row, x, height - eps)
+    slope = math.remainder(change, 2 * math.pi) / (2 * eps)
+    assert direction(row, *d)[3] == pytest.approx(slope, rel=1e-6, abs=2e-8)
+
+
 def test_jacobian_of_the_paper() -> None:
     """fokin2020:eq.44: DOA rows (-dy/d2, dx/d2, 0 ...), TOA rows (dx/d, dy/d, 0, 0, 1, 0)."""
     info = RsuInfo(rsu_id="r", position=np.array([1.0, 2.0, 0.0]))
@@ -85,9 +98,8 @@ def test_jacobian_of_the_paper() -> None:
 def test_antenna_ahead_of_a_device_heading_north() -> None:
     """Device at (3, 2), antenna 2 m ahead of it at (3, 4): turning left moves it west, that is
     nearer by 3/5 of 2 m per rad; all kinds see the same move."""
-    row, x, h = np.zeros(ROW_WIDTH), np.array([3.0, 2.0, 0, 0, 7.0, 0, math.pi / 2]), np.empty(7)
-    row[[BIAS, COMMON, HEADING]], row[AXES:HEADING] = (-1, -1, 6), np.eye(3).reshape(-1)
-    row[LEVER:BLOCKED] = 2.0, 0.0, 0.0
+    row = filter_rows.row(Kind.RANGE, 0.0, 1.0, lever_arm=(2.0, 0.0, 0.0))
+    x, h, row[HEADING] = np.array([3.0, 2.0, 0, 0, 7.0, 0, math.pi / 2]), np.empty(7), 6
     for kind, value, gradient in (
         (Kind.RANGE, 5.0, [0.6, 0.8, 0, 0, 0, 0, -1.2]),
         (Kind.TOA, 12.0, [0.6, 0.8, 0, 0, 1, 0, -1.2]),
@@ -112,11 +124,7 @@ def test_unbiased_row_leaves_bias_states_alone() -> None:
 
 @pytest.mark.parametrize("kind", DIRECTION_KINDS)
 def test_directly_above_the_rsu_stays_finite(kind: Kind) -> None:
-    info = RsuInfo(rsu_id="r", position=np.array([1.0, 2.0, 5.0]))
-    row = np.zeros(ROW_WIDTH)
-    row[KIND], row[BIAS], row[COMMON], row[HEADING] = kind, -1, -1, -1
-    row[ORIGIN:AXES], row[AXES:HEADING] = info.position, rsu_axes(info)
-    h = np.zeros(6)
+    row, h = filter_rows.row(kind, 0.0, 1.0, origin=(1.0, 2.0, 5.0)), np.zeros(6)
     value = predict_row(row, np.array([1.0, 2.0, 0, 0, 0, 0]), 1.0, h)
     expected = {
         Kind.AZIMUTH: 0.0,
@@ -130,11 +138,7 @@ def test_directly_above_the_rsu_stays_finite(kind: Kind) -> None:
 
 def test_floors_at_the_rsu_and_at_rest() -> None:
     """At the RSU itself and at standstill the gradient is 0 or finite, never NaN."""
-    h = np.zeros(6)
-    row = np.zeros(ROW_WIDTH)
-    row[BIAS] = row[COMMON] = row[HEADING] = -1
-    row[AXES:HEADING] = np.eye(3).reshape(-1)
-    row[KIND] = Kind.RANGE
+    row, h = filter_rows.row(Kind.RANGE, 0.0, 1.0), np.zeros(6)
     assert predict_row(row, np.zeros(6), 0.0, h) == pytest.approx(1e-6)
     np.testing.assert_array_equal(h, 0.0)
     row[KIND] = Kind.AZIMUTH
@@ -206,13 +210,9 @@ def test_wrap_is_the_ieee_remainder(angle: float) -> None:
 @pytest.mark.parametrize("side", [1, -1])
 def test_angle_innovation_crosses_pi(kind: Kind, side: int) -> None:
     """Measured just one side of +-pi, predicted just the other: a small innovation."""
-    row = np.zeros((1, ROW_WIDTH))
-    row[0, [KIND, BIAS, COMMON, HEADING]] = kind, -1, -1, -1
-    row[0, AXES:HEADING] = np.eye(3).reshape(-1)
-    x = np.array([-10.0, -side * 0.1, 0, 0, 0, 0])
-    predicted = predict_row(row[0], x, 0.0, np.empty(6))
-    row[0, VALUE] = predicted + 0.02 + side * 2 * math.pi
-    innovation, _ = linearise(row, x, 0.0)
+    row, x = filter_rows.row(kind, 0.0, 1.0), np.array([-10.0, -side * 0.1, 0, 0, 0, 0])
+    row[VALUE] = predict_row(row, x, 0.0, np.empty(6)) + 0.02 + side * 2 * math.pi
+    innovation, _ = linearise(row[None], x, 0.0)
     assert innovation[0] == pytest.approx(0.02, abs=1e-12)
 
 

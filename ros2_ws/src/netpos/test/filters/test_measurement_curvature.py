@@ -14,8 +14,11 @@ from netpos.filters.measurement import (
     ORIGIN,
     Kind,
     curvature_variance,
+    innovation_row,
+    innovation_variance,
 )
 from netpos.messages.values import Array
+from scipy.spatial.transform import Rotation
 
 
 def hessian(row: Array, x: Array, height_m: float) -> Array:
@@ -57,6 +60,38 @@ def test_an_antenna_above_the_device_is_a_higher_device() -> None:
     plain = curvature_variance(row, x, np.eye(9), 1.5)
     row[LEVER + 2] = 1.5
     assert curvature_variance(row, x, np.eye(9), 0.0) == pytest.approx(plain, rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", [Kind.RANGE, Kind.AZIMUTH])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_lever_arm_bends_as_a_device_where_its_antenna_is(kind: Kind, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    row, x, A = level_row(kind, np.zeros(3)), random_state(rng), rng.normal(size=(9, 9))
+    at_antenna, lever_arm = x.copy(), rng.uniform(-9, 9, 3)
+    at_antenna[:2] += Rotation.from_euler("z", x[7]).apply(lever_arm)[:2]
+    plain = curvature_variance(row, at_antenna, A @ A.T, 2.0 + lever_arm[2])
+    row[HEADING], row[LEVER:BLOCKED] = 7, lever_arm
+    assert curvature_variance(row, x, A @ A.T, 2.0) == pytest.approx(plain, rel=1e-9)
+
+
+@pytest.mark.parametrize("kind", [Kind.PHASE, Kind.UNWRAPPED_PHASE])
+def test_a_phase_bends_with_the_radians_of_its_array(kind: Kind) -> None:
+    """A direction cosine times what the tilted row of the axes is long."""
+    row, x = level_row(Kind.COSINE_Y, np.zeros(3)), random_state(np.random.default_rng(3))
+    cosine = curvature_variance(row, x, np.eye(9), 2.0)
+    row[KIND], row[AXES : AXES + 3] = kind, (2.0, -3.0, 6.0)
+    assert curvature_variance(row, x, np.eye(9), 2.0) == pytest.approx(7.0**2 * cosine, rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", [Kind.RANGE, Kind.SPEED])
+def test_an_innovation_scatters_by_noise_curvature_and_prior(kind: Kind) -> None:
+    rng = np.random.default_rng(4)
+    row, x, A = random_row(rng, kind), random_state(rng), rng.normal(size=(9, 9))
+    h = np.empty(9)
+    innovation_row(row, x, 2.0, h)
+    expected = 0.7 + curvature_variance(row, x, A @ A.T, 2.0) + h @ A @ A.T @ h
+    found = innovation_variance(row, x, A @ A.T, 2.0, 0.7, h)
+    assert found == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("kind", [Kind.RANGE, Kind.TOA])

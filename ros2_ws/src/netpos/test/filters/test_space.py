@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 
+import filter_rows
 import numpy as np
 import pytest
+from error_states import moving
 from netpos.filters.measurement import (
     BIAS,
     COMMON,
     KIND,
     LEVER,
     ORIGIN,
-    ROW_WIDTH,
     VALUE,
     Kind,
 )
@@ -82,6 +83,19 @@ def innovation(row: Array, nav: Array) -> tuple[float, Array]:
     return innovation_at(row, nav, C, h), h
 
 
+def slopes(row: Array, nav: Array, n: int) -> list[float]:
+    """Derivatives of what a row measures by ``n`` errors, as central differences."""
+    found = []
+    for step in 1e-5 * np.eye(n):
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = nav.copy()
+            inject(moved, sign * step)
+            ends.append(innovation(row, moved)[0])
+        found.append(-math.remainder(ends[0] - ends[1], math.tau) / 2e-5)
+    return found
+
+
 def test_jacobians_are_central_differences() -> None:
     rng = np.random.default_rng(2)
     kinds = set()
@@ -89,14 +103,9 @@ def test_jacobians_are_central_differences() -> None:
         nav = state(rng)
         for row in all_rows(rng):
             _, h = innovation(row, nav)
-            for j in range(ERR):
-                values = []
-                for sign in (1.0, -1.0):
-                    moved = nav.copy()
-                    inject(moved, sign * 1e-5 * np.eye(ERR)[j])
-                    values.append(innovation(row, moved)[0])
-                slope = -math.remainder(values[0] - values[1], math.tau) / 2e-5
-                assert h[j] == pytest.approx(slope, abs=2e-6), (row[KIND], j)
+            np.testing.assert_allclose(
+                h, slopes(row, nav, ERR), rtol=0, atol=2e-6, err_msg=str(row[KIND])
+            )
             kinds.add(int(row[KIND]))
     assert kinds == {0, 1, 2, 3, 6, 7, *map(int, SpaceKind)}
     assert not set(SpaceKind) & set(Kind)
@@ -118,14 +127,9 @@ def test_clock_and_biases_are_states_of_their_own() -> None:
         clock = slow[0] if row[KIND] == Kind.TOA else 0.0
         expected = clock + (slow[2] + slow[3] if from_rsu else 0.0)
         assert math.remainder(plain - value - expected, math.tau) == pytest.approx(0.0, abs=1e-9)
-        for j in range(n):
-            ends = []
-            for sign in (1.0, -1.0):
-                moved = nav.copy()
-                inject(moved, sign * 1e-5 * np.eye(n)[j])
-                ends.append(innovation(row, moved)[0])
-            slope = -math.remainder(ends[0] - ends[1], math.tau) / 2e-5
-            assert h[j] == pytest.approx(slope, abs=2e-6), (row[KIND], j)
+        np.testing.assert_allclose(
+            h, slopes(row, nav, n), rtol=0, atol=2e-6, err_msg=str(row[KIND])
+        )
 
 
 def test_values_are_those_of_the_geometry() -> None:
@@ -190,11 +194,8 @@ def test_a_flat_covariance_is_refused() -> None:
 def test_bend_variance_covers_what_linearising_leaves_out(kind: Kind) -> None:
     """Monte Carlo: no smaller than the variance of the remainder, and no ten times larger."""
     rng = np.random.default_rng(9)
-    row = np.zeros(ROW_WIDTH)
-    row[KIND], row[19] = kind, -1
-    row[10:19] = np.eye(3).ravel()
-    nav = np.zeros(NAV)
-    nav[:3], nav[9] = (12.0, 9.0, -6.0), 1.0
+    row, nav = filter_rows.row(kind, 0.0, 1.0), moving(0.0)
+    nav[:3] = 12.0, 9.0, -6.0
     A = rng.normal(size=(3, 3))
     cov = np.zeros((ERR, ERR))
     cov[:3, :3] = 0.3 * (A @ A.T)

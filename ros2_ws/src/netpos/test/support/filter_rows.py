@@ -13,6 +13,7 @@ from netpos.filters.measurement import (
     GROUP,
     HEADING,
     KIND,
+    LEVER,
     ORIGIN,
     ROW_WIDTH,
     VALUE,
@@ -43,9 +44,10 @@ def row(
     group: int = 0,
     origin: Sequence[float] | Array = (0.0, 0.0, 0.0),
     *,
-    axes: Sequence[float] = (1, 0, 0, 0, 1, 0, 0, 0, 1),
+    axes: Sequence[float] | Array = (1, 0, 0, 0, 1, 0, 0, 0, 1),
     gate_variance: float | None = None,
     bias: int = -1,
+    lever_arm: Sequence[float] | Array = (0.0, 0.0, 0.0),
     h: Sequence[float] | Array | None = None,
 ) -> Array:
     """One row; ``h`` (6,) for LINEAR, which has no origin and axes."""
@@ -57,6 +59,7 @@ def row(
         out[ORIGIN : ORIGIN + 6] = h
     else:
         out[ORIGIN:AXES], out[AXES:HEADING] = origin, axes
+    out[LEVER : LEVER + 3] = lever_arm
     return out
 
 

@@ -3,21 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from netpos.filters.measurement import (
-    AXES,
-    BIAS,
-    BLOCKED,
-    COMMON,
-    GATE_VARIANCE,
-    HEADING,
-    KIND,
-    LEVER,
-    ORIGIN,
-    ROW_WIDTH,
-    VALUE,
-    VARIANCE,
-    Kind,
-)
+from filter_rows import row
+from netpos.filters.measurement import AXES, COMMON, HEADING, KIND, LEVER, ORIGIN, Kind
 from netpos.filters.rows import rsu_axes
 from netpos.messages.values import AngleConvention, Array, RsuInfo
 from scipy.spatial.transform import Rotation
@@ -40,14 +27,11 @@ def random_state(rng: np.random.Generator, n: int = 9) -> Array:
 def random_row(rng: np.random.Generator, kind: Kind, heading: int = -1) -> Array:
     """A row of an RSU with tilted axes (LINEAR: random H), own bias 6, common bias 8, and the
     device's antenna off its centre, which counts sideways only with a heading."""
-    row = np.zeros(ROW_WIDTH)
-    row[KIND], row[VALUE], row[VARIANCE], row[GATE_VARIANCE] = kind, 0.3, 1.0, 1.0
-    row[BIAS], row[COMMON] = 6, 8
     info = random_info(rng, AngleConvention.SPHERICAL)
-    row[ORIGIN:AXES] = info.position
-    row[AXES:HEADING] = rsu_axes(info)
-    row[HEADING], row[LEVER:BLOCKED] = heading, rng.uniform(-2, 2, 3)
-    return row
+    lever_arm = rng.uniform(-2, 2, 3)
+    out = row(kind, 0.3, 1.0, 0, info.position, axes=rsu_axes(info), bias=6, lever_arm=lever_arm)
+    out[COMMON], out[HEADING] = 8, heading
+    return out
 
 
 def closed_form(row: Array, x: Array, height_m: float) -> float:

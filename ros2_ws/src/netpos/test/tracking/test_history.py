@@ -23,6 +23,7 @@ from netpos.messages.values import (
     Velocity,
 )
 from netpos.tracking import Tracker, TrackerConfig, TrackOutput
+from street_run import epochs, fed, ran, truth
 
 T0 = 1_000_000_000
 MS = 1_000_000
@@ -35,11 +36,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "inertial": {"motion_model": "inertial"},
     "filterpy": {"backend": "filterpy", "filter": "ekf"},
 }
-
-
-def truth(t_s: float) -> Array:
-    """East along the street at 8 m/s, clock 3 km ahead and gaining 5 km/s."""
-    return np.array([8.0 * t_s, 0.0, 8.0, 0.0, 3000.0 + 5000.0 * t_s, 5000.0])
 
 
 def noisy(world: Any, seed: int) -> Any:
@@ -237,23 +233,6 @@ def test_order_does_not_decide_who_is_isolated(world: Any) -> None:
 
 
 # one late item
-
-
-def fed(tracker: Tracker, items: Iterable[Any]) -> list[TrackOutput]:
-    for item in items:
-        assert tracker.add(item) is None
-    return tracker.process()
-
-
-def epochs(world: Any, count: int, step_s: float = 0.1) -> list[list[RsuMeasurement]]:
-    return [world.measure(step_s * k, truth(step_s * k)) for k in range(count)]
-
-
-def ran(world: Any, batches: Iterable[list[Any]], **config: Any) -> Tracker:
-    tracker = world.tracker(**config)
-    for batch in batches:
-        fed(tracker, batch)
-    return tracker
 
 
 def test_a_late_item_joins_the_epoch_it_belongs_to(world: Any) -> None:

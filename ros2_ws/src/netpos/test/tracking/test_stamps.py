@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from netpos.messages.values import Array, RsuMeasurement
-from netpos.tracking import Tracker, TrackOutput
+from netpos.tracking import Tracker
+from street_run import epochs, fed, ran, truth
 
 T0 = 1_000_000_000
 MS = 1_000_000
@@ -22,28 +21,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "interacting": {"motion_model": "interacting"},
     "inertial": {"motion_model": "inertial"},
 }
-
-
-def truth(t_s: float) -> Array:
-    """East along the street at 8 m/s, clock 3 km ahead and gaining 5 km/s."""
-    return np.array([8.0 * t_s, 0.0, 8.0, 0.0, 3000.0 + 5000.0 * t_s, 5000.0])
-
-
-def fed(tracker: Tracker, items: Iterable[Any]) -> list[TrackOutput]:
-    for item in items:
-        assert tracker.add(item) is None
-    return tracker.process()
-
-
-def epochs(world: Any, count: int, step_s: float = 0.1) -> list[list[RsuMeasurement]]:
-    return [world.measure(step_s * k, truth(step_s * k)) for k in range(count)]
-
-
-def ran(world: Any, batches: Iterable[list[Any]], **config: Any) -> Tracker:
-    tracker: Tracker = world.tracker(**config)
-    for batch in batches:
-        fed(tracker, batch)
-    return tracker
 
 
 def state(tracker: Tracker) -> list[Any]:
