@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 from netpos.bags import BagReader, codec
-from netpos.bags.importers.uwb_anchors import TRACKER, RangeErrors, import_uwb_anchors
+from netpos.bags.importers.common import RangeErrors
+from netpos.bags.importers.uwb_anchors import ERRORS, TRACKER, import_uwb_anchors
 from netpos.evaluation.consistency import nees
 from netpos.messages import topics
 from netpos.messages.values import Array, RsuInfo, RsuMeasurement
@@ -66,7 +67,7 @@ def _score(recording: Recording, **parameters: Any) -> tuple[float, float]:
 
 
 def _settings() -> list[tuple[str, RangeErrors, dict[str, Any]]]:
-    used, accel = RangeErrors(), float(TRACKER["accel_density_mps2_sqrthz"])
+    used, accel = ERRORS, float(TRACKER["accel_density_mps2_sqrthz"])
     settings: list[tuple[str, RangeErrors, dict[str, Any]]] = [("as used", used, {})]
     settings += [(f"filter {name}", used, {"filter": name}) for name in ("ekf", "ukf")]
     settings += [
@@ -99,7 +100,7 @@ def _drawn(recording: Recording, seed: int) -> Recording:
     """The recording with ranges along its true way and errors as declared."""
     infos, heard, truth = recording
     heard = [m for m in heard if truth[0, 0] <= m.stamp_ns <= truth[-1, 0]]
-    rng, used = np.random.default_rng(seed), RangeErrors()
+    rng, used = np.random.default_rng(seed), ERRORS
     stamps = np.array([m.stamp_ns for m in heard], dtype=float)
     time_s = (stamps - stamps[0]) * 1e-9
     order = np.argsort(time_s, kind="stable")

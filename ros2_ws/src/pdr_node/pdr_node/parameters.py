@@ -39,12 +39,10 @@ def declare_parameters(node: Node) -> PdrParameters:
     defaults = _of_device(declare(node, "scenario", "", text), vue_id)
     text = "carried (anyhow) or waist (worn at the lower back): chooses the other defaults"
     placement = declare(node, "placement", defaults.get("placement", "carried"), text)
-    base = PdrConfig.from_mapping({**defaults, "placement": placement}).flat()
+    base = PdrConfig.from_mapping({**defaults, "placement": placement})
     values = {
-        name: declare(
-            node, name, list(value) if isinstance(value, tuple) else value, "see PdrConfig"
-        )
-        for name, value in base.items()
+        name: declare(node, name, list(value) if isinstance(value, tuple) else value, text)
+        for name, value, text in base.entries()
     }
     text = "listen to imu once velocities have so many subscribers, and steps one less (30 s)"
     return PdrParameters(

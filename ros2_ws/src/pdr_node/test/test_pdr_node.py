@@ -143,6 +143,9 @@ def test_every_entry_of_the_config_is_a_read_only_parameter(make: Any) -> None:
         given = node.get_parameter(name).value
         assert (tuple(given) if isinstance(value, tuple) else given) == value
         assert node.describe_parameter(name).read_only
+    assert node.describe_parameter("steps.bout_steps").description == (
+        "peaks in a row that start a bout"
+    )
     assert node.get_parameter("vue").value == "vue_1"
     changed = {"weinberg_k": 0.5, "steps.bout_steps": 4, "hard_iron_t": [1e-6, 0.0, 2e-6]}
     assert make(**changed)._core.config == PdrConfig(
@@ -163,11 +166,11 @@ def test_placement_and_scenario_choose_defaults_that_explicit_values_override(ma
     ("parameters", "message"),
     [
         ({"vue": "a b"}, "vue: 'a b' is no device name"),
-        ({"weinberg_k": -1.0}, r"pdr.weinberg_k must be finite and > 0, got -1.0"),
+        ({"weinberg_k": -1.0}, r"pdr.weinberg_k must be in \[1e-09, 1e\+09\], got -1.0"),
         ({"subscribers": -1}, "subscribers must be >= 0, got -1"),
         ({"placement": "ankle"}, "placement must be carried or waist, got 'ankle'"),
-        ({"length_model": "guess"}, "length_model must be frequency or weinberg"),
-        ({"steps.smooth_sd_s": -1.0}, "steps.smooth_sd_s must be finite and > 0"),
+        ({"length_model": "guess"}, "length_model must be one of frequency, weinberg"),
+        ({"steps.smooth_sd_s": -1.0}, r"steps.smooth_sd_s must be in \[1e-09, 1e\+09\], got -1.0"),
         ({"scenario": "absent"}, "no scenario 'absent'"),
         ({"scenario": "pedestrian_walk", "vue": "vue_7"}, "has vue_1, not vue_7"),
     ],

@@ -86,15 +86,13 @@ def _moments(
 
 
 @kernel
-def fuse_bearing(
-    mean: Array, cov: Array, row: Array, variance: float, again: bool = False
-) -> bool:
+def fuse_bearing(mean: Array, cov: Array, row: Array, variance: float) -> bool:
     """Fuse a plain bearing with ``variance`` [rad^2] into mean (n,) and cov (n, n) in place;
     False, and nothing done, where the prior is degenerate.
 
-    again : one of many. As far as the prior is a strip along the bearing already, the range then
-        keeps its second moment about the prior's mean, as if what lies behind the RSU were folded
-        to its front: the bearing tells the side once more, and no distance.
+    As far as the prior is a strip along the bearing already, by those before, the range keeps its
+    second moment about the prior's mean, as if what lies behind the RSU were folded to its front:
+    the bearing tells the side once more, and no distance.
     """
     angle = row[VALUE] + math.atan2(row[AXES + 1], row[AXES])
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
@@ -116,8 +114,7 @@ def fuse_bearing(
             break
         width = max(_REACH_SD * sd, (high - low) / _NODES)
         low, high = max(r - width, 0.0), r + width
-    if again:
-        c_rr += max(1.0 - P[1, 1] / rr, 0.0) * (r - a[0]) ** 2
+    c_rr += max(1.0 - P[1, 1] / rr, 0.0) * (r - a[0]) ** 2
     C = np.array([[c_rr, c_rc], [c_rc, c_cc]])
     prior_2d = cov[:2, :2].copy()
     gain = np.linalg.solve(prior_2d, cov[:2].copy()).T.copy()
@@ -148,7 +145,7 @@ def fuse_around(mean: Array, cov: Array, rows: Array, height_m: float, work: Arr
     use = work[W_USE, :m].copy()
     for i in range(m):
         wanted = use[i] == 1.0 and is_plain_bearing(rows[i])
-        if wanted and fuse_bearing(mean, cov, rows[i], rows[i, VARIANCE], True):
+        if wanted and fuse_bearing(mean, cov, rows[i], rows[i, VARIANCE]):
             use[i] = 0.0
     innovation, H = linearise(rows, mean, height_m)
     variance = rows[:, VARIANCE].copy()

@@ -39,15 +39,13 @@ class Robust(IntEnum):
 
 
 @leaf
-def unblock(
-    row: Array, innovation: float, spread: float, noise: float, prior: float, excess_m: float
-) -> None:
+def unblock(row: Array, innovation: float, spread: float, prior: float, excess_m: float) -> None:
     """Replace a range or time by the measurement equivalent to the mixture of a direct and a
     blocked path; its column BLOCKED, the prior where it is > 0, becomes the posterior.
 
-    spread : variance of the innovation; noise : of the row, with what linearising leaves out
+    spread : variance of the innovation
     """
-    prior = row[BLOCKED] if row[BLOCKED] > 0.0 else prior
+    prior, noise = row[BLOCKED] if row[BLOCKED] > 0.0 else prior, row[VARIANCE]
     row[BLOCKED], shift, variance = nlos_mixture_exponential(
         innovation, spread, noise, prior, excess_m
     )
@@ -112,8 +110,7 @@ def condition(
             if may_be_late(row):
                 innovation = innovation_row(row, mean, height_m, h)
                 spread = innovation_variance(row, mean, cov, height_m, row[VARIANCE], h)
-                noise = row[VARIANCE] + curvature_variance(row, mean, cov, height_m)
-                unblock(row, innovation, spread, noise, nlos_probability, nlos_excess_m)
+                unblock(row, innovation, spread, nlos_probability, nlos_excess_m)
     if robust == Robust.NONE:
         return
     innovations, H = linearise(rows, mean, height_m)

@@ -1,4 +1,4 @@
-"""Cholesky factors of covariances that may be singular."""
+"""Cholesky factors of covariances that may be singular; eigenvalues of small ones."""
 
 from __future__ import annotations
 
@@ -6,11 +6,20 @@ import math
 
 import numpy as np
 
-from netpos.filters.compile import kernel
+from netpos.filters.compile import inlined, kernel
 from netpos.messages.values import Array
 
 # A pivot below this share of its variance is rounding.
 _RANK = 1e-14
+
+
+@inlined
+def eigenvalues(xx: float, xy: float, yy: float) -> tuple[float, float]:
+    """Smallest and largest eigenvalue of a symmetric 2 x 2 matrix."""
+    middle, radius = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
+    outer = middle + math.copysign(radius, middle)  # of the larger magnitude: nothing cancels
+    inner = (xx * yy - xy * xy) / outer if outer != 0.0 else 0.0
+    return (inner, outer) if outer >= 0.0 else (outer, inner)
 
 
 @kernel

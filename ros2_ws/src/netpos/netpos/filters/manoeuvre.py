@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 
 from netpos.filters.compile import leaf
+from netpos.filters.factor import eigenvalues
 from netpos.filters.measurement import GATE_VARIANCE, innovation_row, innovation_variance
 from netpos.filters.motion import add_jump
 from netpos.messages.values import Array
@@ -37,7 +38,7 @@ def unnoticed_s(
         xx += h[0] * h[0] / variance
         xy += h[0] * h[1] / variance
         yy += h[1] * h[1] / variance
-    least = (xx + yy) / 2.0 - math.hypot((xx - yy) / 2.0, xy)
+    least, _ = eigenvalues(xx, xy, yy)
     typical = math.sqrt(2.0 * gate / (xx + yy)) / speed if xx + yy > 0.0 else math.inf
     longest = math.sqrt(gate / least) / speed if least > 1e-12 * (xx + yy) else math.inf
     return _FOLLOWED * typical, longest

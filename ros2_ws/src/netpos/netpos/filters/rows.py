@@ -89,12 +89,6 @@ def scalar_kinds(fields: int, convention: AngleConvention) -> tuple[Kind, ...]:
 
 
 @leaf
-def _cosine_var(angle: float, variance: float) -> float:
-    """Variance of sin(angle), at end-fire no smaller than the second-order term."""
-    return max(math.cos(angle) ** 2 * variance, variance * variance / 2.0)
-
-
-@leaf
 def _put(rows: Array, at: int, kind: Kind, value: float, variance: float, place: Array) -> int:
     """Write a row; the index of the next one."""
     row = rows[at]
@@ -110,6 +104,19 @@ def _put(rows: Array, at: int, kind: Kind, value: float, variance: float, place:
         for i in range(3):
             row[AXES + i] = place[_ALONG + i]
     return at + 1
+
+
+@leaf
+def _put_angle(
+    rows: Array, at: int, kind: Kind, angle: float, variance: float, place: Array, cone: bool
+) -> int:
+    """``_put`` of an azimuth or elevation; of the sine, which is a direction cosine, where it is
+    that of a cone. Its variance is at end-fire no smaller than the second-order term."""
+    if not cone:
+        return int(_put(rows, at, kind, angle, variance, place))
+    cosine = Kind.COSINE_Y if kind == Kind.AZIMUTH else Kind.COSINE_Z
+    of_sine = max(math.cos(angle) ** 2 * variance, variance * variance / 2.0)
+    return int(_put(rows, at, cosine, math.sin(angle), of_sine, place))
 
 
 @leaf
@@ -138,22 +145,13 @@ def put_scalars(
     """Write the rows of the scalar quantities that ``fields`` names from ``rows[at]`` on; the
     index after the last one.
 
-    place : (18,) of ``rsu_place``; forward, left, up : lever arm [m]; the rest as
-    measured
+    place : (18,) of ``rsu_place``; forward, left, up : lever arm [m]; the rest as measured
     """
     first, c = at, SPEED_OF_LIGHT_MPS
     if fields & _AZIMUTH:
-        if cone:
-            variance = _cosine_var(azimuth, azimuth_var)
-            at = _put(rows, at, Kind.COSINE_Y, math.sin(azimuth), variance, place)
-        else:
-            at = _put(rows, at, Kind.AZIMUTH, azimuth, azimuth_var, place)
+        at = _put_angle(rows, at, Kind.AZIMUTH, azimuth, azimuth_var, place, cone)
     if fields & _ELEVATION:
-        if cone:
-            variance = _cosine_var(elevation, elevation_var)
-            at = _put(rows, at, Kind.COSINE_Z, math.sin(elevation), variance, place)
-        else:
-            at = _put(rows, at, Kind.ELEVATION, elevation, elevation_var, place)
+        at = _put_angle(rows, at, Kind.ELEVATION, elevation, elevation_var, place, cone)
     if fields & _TOA:
         at = _put(rows, at, Kind.TOA, c * toa, c * c * toa_var, place)
     if fields & _RANGE:

@@ -25,10 +25,9 @@ def condition_in_space(
     if nlos_probability > 0.0:
         for i in range(rows.shape[0]):
             if may_be_late(rows[i]):
-                noise = rows[i, VARIANCE] + bend[i]
-                spread = noise + H[i] @ cov @ H[i]
+                spread = rows[i, VARIANCE] + bend[i] + H[i] @ cov @ H[i]
                 before = rows[i, VALUE]
-                unblock(rows[i], innovations[i], spread, noise, nlos_probability, nlos_excess_m)
+                unblock(rows[i], innovations[i], spread, nlos_probability, nlos_excess_m)
                 innovations[i] += rows[i, VALUE] - before
     if robust != Robust.NONE:
         weigh(cov, rows, innovations, H, bend, robust, parameter)

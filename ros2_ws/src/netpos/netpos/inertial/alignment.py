@@ -23,10 +23,10 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from netpos.inertial.attitude import GRAVITY_MPS2
+from netpos.least_squares import minimise
 
 Array = npt.NDArray[np.float64]
 
-_ITERATIONS = 30
 _HEADINGS = 8
 _ACCELERATION_SD = 1.0
 """Prior of the mean forward acceleration [m/s^2]."""
@@ -155,36 +155,21 @@ def _fit(
 ) -> tuple[float, Array, Array] | None:
     """Cost, parameters and normal matrix (5, 5) from one heading, by Levenberg-Marquardt."""
 
-    def residuals(x: Array) -> tuple[Array, Array]:
+    def equations(x: Array) -> tuple[float, Array, Array]:
         predicted, J = _predict(way, x)
         whitened = np.einsum("kij,kjl->kil", root, J.reshape(-1, 2, 5)).reshape(-1, 5)
         r = np.einsum("kij,kj->ki", root, position - predicted).ravel()
         prior = np.array([0.0, 0.0, 0.0, 0.0, 1.0 / _ACCELERATION_SD])
-        return np.append(r, -x[4] / _ACCELERATION_SD), np.vstack([whitened, prior])
+        r, J = np.append(r, -x[4] / _ACCELERATION_SD), np.vstack([whitened, prior])
+        return float(r @ r), J.T @ r, J.T @ J
 
     span = float(np.linalg.norm(way.A[-1])) or 1.0
     speed = max(float(np.linalg.norm(position[-1] - position[0])) / span, 0.0)
-    x = np.array([*position[0], heading, speed, 0.0])
-    r, J = residuals(x)
-    cost, damping = float(r @ r), 1e-3
-    for _ in range(_ITERATIONS):
-        normal = J.T @ J
-        try:
-            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), J.T @ r)
-        except np.linalg.LinAlgError:
-            return None
-        r_new, J_new = residuals(x + step)
-        new = float(r_new @ r_new)
-        if new < cost:
-            done = cost - new < 1e-6 * (1.0 + cost)
-            x, r, J, cost, damping = x + step, r_new, J_new, new, max(damping / 10, 1e-12)
-            if done:
-                break
-        else:
-            damping *= 10.0
-            if damping > 1e8:
-                break
-    normal = J.T @ J
+    start = np.array([*position[0], heading, speed, 0.0])
+    try:
+        cost, x, normal = minimise(equations, start, np.linalg.solve)
+    except np.linalg.LinAlgError:
+        return None
     scale = np.sqrt(np.diag(normal))
     if not (scale > 0.0).all() or np.linalg.cond(normal / np.outer(scale, scale)) > 1e12:
         return None

@@ -25,6 +25,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from netpos.parameters import check_fields, not_negative, positive, real
+
 Array = npt.NDArray[np.float64]
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -38,36 +40,39 @@ GRAVITY_MPS2 = 9.80665
 class AttitudeConfig:
     """Gains and gates of ``AttitudeFilter``; a bad value raises ``ValueError`` here."""
 
-    alignment_time_s: float = 0.5
-    tilt_gain_per_s: float = 0.3
-    bias_gain_per_s2: float = 0.003
-    heading_gain_per_s: float = 0.3
-    max_bias_radps: float = 0.1
-    acceleration_gate_mps2: float = 2.0
-    gravity_tolerance_mps2: float = 3.0
-    rest_gyro_radps: float = 0.15
-    rest_acceleration_sd_mps2: float = 0.15
-    rest_bias_memory_s: float = 15.0
-    rest_bias_gate_radps: float = 0.02
-    declination_rad: float = 0.0
-    field_tolerance: float = 0.25
-    dip_tolerance_rad: float = 0.26
-    field_memory_s: float = 15.0
-    magnetic_heading_sd_rad: float = 0.09
-    first_heading_sd_rad: float = 0.5
-    gyro_heading_drift_radps: float = 0.005
+    alignment_time_s: float = positive(0.5, "the first attitude is the mean over this long")
+    tilt_gain_per_s: float = not_negative(0.3, "gain of the accelerometer on the tilt")
+    bias_gain_per_s2: float = not_negative(0.003, "gain of the accelerometer on the gyro bias")
+    heading_gain_per_s: float = not_negative(0.3, "gain of the magnetometer on the heading")
+    max_bias_radps: float = positive(0.1, "largest gyro bias per axis")
+    acceleration_gate_mps2: float = positive(
+        2.0, "a specific force this far from 1 g says nothing of the tilt"
+    )
+    gravity_tolerance_mps2: float = positive(
+        3.0, "a first mean force further from 1 g than this is no gravity"
+    )
+    rest_gyro_radps: float = positive(0.15, "first attitude: a body at rest turns slower")
+    rest_acceleration_sd_mps2: float = positive(0.15, "first attitude: a body at rest shakes less")
+    rest_bias_memory_s: float = positive(15.0, "the gyro bias is the mean of this much rest")
+    rest_bias_gate_radps: float = positive(
+        0.02, "a rate at rest further from the known bias than this is a turn"
+    )
+    declination_rad: float = real(
+        0.0, -math.pi, math.pi, "magnetic declination, east of north positive"
+    )
+    field_tolerance: float = positive(
+        0.25, "share by which the norm of an undisturbed field may differ from the local one"
+    )
+    dip_tolerance_rad: float = positive(0.26, "the same of its dip [rad]")
+    field_memory_s: float = positive(15.0, "how slowly the local field is followed")
+    magnetic_heading_sd_rad: float = positive(0.09, "heading sd of a magnetic sample")
+    first_heading_sd_rad: float = positive(0.5, "heading sd of the first sample of a field")
+    gyro_heading_drift_radps: float = positive(
+        0.005, "growth of the heading sd without field samples"
+    )
 
     def __post_init__(self) -> None:
-        for name in self.__slots__:
-            value = getattr(self, name)
-            if name == "declination_rad":
-                if not abs(value) <= math.pi:
-                    raise ValueError(f"attitude.{name} must be in [-pi, pi] rad, got {value}")
-            elif name in ("bias_gain_per_s2", "tilt_gain_per_s", "heading_gain_per_s"):
-                if not 0 <= value < math.inf:
-                    raise ValueError(f"attitude.{name} must be finite and >= 0, got {value}")
-            elif not 0 < value < math.inf:
-                raise ValueError(f"attitude.{name} must be finite and > 0, got {value}")
+        check_fields(self, "attitude.")
 
 
 def wrap_angle(angle_rad: float) -> float:

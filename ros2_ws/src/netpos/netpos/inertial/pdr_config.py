@@ -3,38 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from netpos.inertial.attitude import AttitudeConfig
-from netpos.inertial.length import LengthModel
 from netpos.inertial.steps import StepConfig
+from netpos.parameters import (
+    check_fields,
+    choice,
+    described,
+    not_negative,
+    positive,
+    real,
+    typed,
+)
 
 Placement = Literal["carried", "waist"]
-
-_POSITIVE = (
-    "output_rate_hz",
-    "height_m",
-    "weinberg_k",
-    "length_scale",
-    "length_scale_sd",
-    "step_sd_fraction",
-    "heading_sd_rad",
-    "still_speed_sd_mps",
-    "turning_speed_sd_mps",
-    "undecided_speed_sd_mps",
-    "still_rate_radps",
-    "max_gap_s",
-    "min_rate_hz",
-    "max_rate_hz",
-    "accelerometer_range_mps2",
-    "gyro_range_radps",
-    "max_mount_tilt_rad",
-    "field_patience_s",
-    "clock_reset_s",
-)
-_NOT_NEGATIVE = ("heading_drift_radps", "gap_rate_sd_radps", "speed_drift_mps2", "field_hold_s")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,80 +27,77 @@ class PdrConfig:
     """All parameters of the core; a bad value raises ``ValueError`` here.
 
     The defaults are for a device carried anyhow, ``of("waist")`` for one worn at the waist.
-
-    length_model, height_m, weinberg_k : see ``inertial.length``; k in m (m/s^2)^(-1/4)
-    length_scale, length_scale_sd : true over modelled step length of this person before any
-        calibration; people of a height differ by about a tenth
-    step_sd_fraction : sd of single steps about their scaled model, over the length
-    heading_sd_rad : heading sd at alignment, or with a magnetometer in use
-    heading_drift_radps : growth of the heading sd without an accepted magnetic sample
-    mount_heading_rad : walking direction minus the body x axis, counter-clockwise
-    max_mount_tilt_rad : a mean specific force further from the body z axis than this means
-        swapped axes: the heading is then unknown; pi for a device carried anyhow
-    hard_iron_t, field_matrix : the field is matrix (reading - hard iron), of
-        ``magnetic_calibration.fit_iron``; the matrix by rows
-    field_hold_s : a field sample is used this long after its stamp, so that it does not matter
-        whether it or the IMU sample of the same time arrives first
-    field_patience_s : how long the heading may do without magnetic samples before it is said
-    turning_speed_sd_mps : of the zero velocity of a body that only turns
-    speed_drift_mps2 : growth of the velocity sd with the age of the last step: people stop within
-        a step, and the next step is known only ``steps.delay_s`` after it
-    gap_rate_sd_radps : how fast the device may turn unseen, for the heading sd after a gap
-    clock_reset_s : a stamp this far in the past restarts the core instead of being refused
     """
 
-    output_rate_hz: float = 10.0
-    length_model: LengthModel = "weinberg"
-    height_m: float = 1.75
-    weinberg_k: float = 0.41
-    length_scale: float = 1.0
-    length_scale_sd: float = 0.1
-    step_sd_fraction: float = 0.06
-    heading_sd_rad: float = 0.1
-    heading_drift_radps: float = 0.001
-    mount_heading_rad: float = 0.0
-    max_mount_tilt_rad: float = math.pi
-    hard_iron_t: tuple[float, ...] = (0.0, 0.0, 0.0)
-    field_matrix: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-    field_hold_s: float = 0.1
-    field_patience_s: float = 3.0
-    still_speed_sd_mps: float = 0.05
-    turning_speed_sd_mps: float = 0.3
-    undecided_speed_sd_mps: float = 1.0
-    still_rate_radps: float = 0.2
-    speed_drift_mps2: float = 0.5
-    max_gap_s: float = 0.25
-    gap_rate_sd_radps: float = 0.5
-    min_rate_hz: float = 25.0
-    max_rate_hz: float = 2000.0
-    accelerometer_range_mps2: float = 156.0
-    gyro_range_radps: float = 34.8
-    clock_reset_s: float = 1.0
+    output_rate_hz: float = positive(10.0, "rate of the velocities")
+    length_model: Literal["frequency", "weinberg"] = choice(
+        "weinberg",
+        ("frequency", "weinberg"),
+        "weinberg (by the bounce) | frequency (by cadence and height), see inertial.length",
+    )
+    height_m: float = positive(1.75, "frequency: height of the person")
+    weinberg_k: float = positive(0.41, "weinberg: k [m (m/s^2)^(-1/4)]")
+    length_scale: float = positive(
+        1.0, "true over modelled step length of this person before any calibration"
+    )
+    length_scale_sd: float = positive(0.1, "its sd; people of a height differ by about a tenth")
+    step_sd_fraction: float = positive(
+        0.06, "sd of single steps about their scaled model, over the length"
+    )
+    heading_sd_rad: float = positive(0.1, "heading sd at alignment, or with a magnetometer in use")
+    heading_drift_radps: float = not_negative(
+        0.001, "growth of the heading sd without an accepted magnetic sample"
+    )
+    mount_heading_rad: float = real(
+        0.0, -math.pi, math.pi, "walking direction minus the body x axis, counter-clockwise"
+    )
+    max_mount_tilt_rad: float = positive(
+        math.pi,
+        "a mean specific force further from the body z axis than this means swapped axes: the"
+        " heading is then unknown; pi for a device carried anyhow",
+    )
+    hard_iron_t: tuple[float, ...] = described(
+        (0.0, 0.0, 0.0),
+        "the field is matrix (reading - hard iron), of magnetic_calibration.fit_iron",
+    )
+    field_matrix: tuple[float, ...] = described(
+        (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), "the matrix of hard_iron_t, by rows"
+    )
+    field_hold_s: float = not_negative(
+        0.1,
+        "a field sample is used this long after its stamp, so that it does not matter whether it"
+        " or the IMU sample of the same time arrives first; 0: at once",
+    )
+    field_patience_s: float = positive(
+        3.0, "how long the heading may do without magnetic samples before it is said"
+    )
+    still_speed_sd_mps: float = positive(0.05, "of the zero velocity of a body that stands")
+    turning_speed_sd_mps: float = positive(0.3, "of the zero velocity of a body that only turns")
+    undecided_speed_sd_mps: float = positive(
+        1.0, "of the velocity of a body that neither stands nor walks"
+    )
+    still_rate_radps: float = positive(0.2, "a body that stands turns slower")
+    speed_drift_mps2: float = not_negative(
+        0.5,
+        "growth of the velocity sd with the age of the last step: people stop within a step, and"
+        " the next step is known only steps.delay_s after it",
+    )
+    max_gap_s: float = positive(0.25, "a longer gap of the IMU starts anew")
+    gap_rate_sd_radps: float = not_negative(
+        0.5, "how fast the device may turn unseen, for the heading sd after a gap"
+    )
+    min_rate_hz: float = positive(25.0, "slowest IMU that is good enough")
+    max_rate_hz: float = positive(2000.0, "fastest IMU that is believed")
+    accelerometer_range_mps2: float = positive(156.0, "the accelerometer is cut off there")
+    gyro_range_radps: float = positive(34.8, "the gyro is cut off there")
+    clock_reset_s: float = positive(
+        1.0, "a stamp this far in the past restarts the core instead of being refused"
+    )
     attitude: AttitudeConfig = field(default_factory=AttitudeConfig)
     steps: StepConfig = field(default_factory=StepConfig)
 
     def __post_init__(self) -> None:
-        if self.length_model not in ("frequency", "weinberg"):
-            raise ValueError(
-                f"pdr.length_model must be frequency or weinberg, got {self.length_model!r}"
-            )
-        for name in _POSITIVE:
-            value = getattr(self, name)
-            if not 0 < value < math.inf:
-                raise ValueError(f"pdr.{name} must be finite and > 0, got {value}")
-        for name in _NOT_NEGATIVE:
-            value = getattr(self, name)
-            if not 0 <= value < math.inf:
-                raise ValueError(f"pdr.{name} must be finite and >= 0, got {value}; use 0 for off")
-        for name, size in (("hard_iron_t", 3), ("field_matrix", 9)):
-            numbers = getattr(self, name)
-            if len(numbers) != size or not all(map(math.isfinite, numbers)):
-                raise ValueError(f"pdr.{name} must be {size} finite numbers, got {numbers}")
-        if not abs(self.mount_heading_rad) <= math.pi:
-            raise ValueError(
-                f"pdr.mount_heading_rad must be in [-pi, pi] rad, got {self.mount_heading_rad}; "
-                "is it in degrees?"
-            )
+        check_fields(self, "pdr.")
         if self.max_rate_hz <= self.min_rate_hz:
             raise ValueError(
                 f"pdr.max_rate_hz ({self.max_rate_hz}) must exceed min_rate_hz "
@@ -155,7 +137,7 @@ class PdrConfig:
         for name, value in given.items():
             if name not in known:
                 raise ValueError(f"no parameter {name} of pdr; known: {', '.join(sorted(known))}")
-            known[name] = _like(known[name], value, name)
+            known[name] = typed(f"pdr.{name}", known[name], value)
         inner = {
             part: type(getattr(base, part))(
                 **{n.split(".")[1]: v for n, v in known.items() if n.startswith(f"{part}.")}
@@ -166,24 +148,14 @@ class PdrConfig:
 
     def flat(self) -> dict[str, Any]:
         """Every number and word by name; those of ``attitude`` and ``steps`` with a dot."""
-        out: dict[str, Any] = {}
+        return {name: value for name, value, _ in self.entries()}
+
+    def entries(self) -> Iterator[tuple[str, Any, str]]:
+        """Name as in ``flat``, value and sentence of every number and word."""
         for entry in fields(self):
             value = getattr(self, entry.name)
             if isinstance(value, AttitudeConfig | StepConfig):
-                out.update(
-                    {f"{entry.name}.{e.name}": getattr(value, e.name) for e in fields(value)}
-                )
+                for e in fields(value):
+                    yield f"{entry.name}.{e.name}", getattr(value, e.name), e.metadata["text"]
             else:
-                out[entry.name] = value
-        return out
-
-
-def _like(default: Any, value: Any, name: str) -> Any:
-    """The value in the type of the default; whole numbers may stand for floats."""
-    if isinstance(default, tuple) and isinstance(value, Sequence) and not isinstance(value, str):
-        return tuple(_like(0.0, number, name) for number in value)
-    if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if type(value) is not type(default):
-        raise ValueError(f"pdr.{name} must be a {type(default).__name__}, got {value!r}")
-    return value
+                yield entry.name, value, entry.metadata["text"]

@@ -29,6 +29,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from netpos.parameters import check_fields, choice, count, positive, real
+
 Array = npt.NDArray[np.float64]
 Vector = tuple[float, float, float]
 
@@ -46,37 +48,30 @@ class StepConfig:
     ``min_prominence`` is in m/s^2 of ``bounce`` and in m/s^3 of ``impact``, which has no trend.
     """
 
-    signal: Literal["bounce", "impact"] = "bounce"
-    smooth_sd_s: float = 0.08
-    trend_sd_s: float = 0.4
-    filter_half_width_s: float = 0.5
-    peak_half_width_s: float = 0.1
-    min_prominence: float = 0.3
-    prominence_fraction: float = 0.4
-    prominence_memory_s: float = 4.0
-    min_height_fraction: float = 0.1
-    min_impact_hz: float = 5.0
-    min_interval_s: float = 0.3
-    min_interval_fraction: float = 0.45
-    max_interval_s: float = 1.5
-    contact_lag_s: float = -0.05
-    gravity_memory_s: float = 1.0
-    max_tilt_change_rad: float = 0.26
-    bout_steps: int = 3
-    still_window_s: float = 1.0
-    still_acceleration_sd_mps2: float = 0.15
+    signal: Literal["bounce", "impact"] = choice(
+        "bounce", ("bounce", "impact"), "bounce (of the body) | impact (of the foot)"
+    )
+    smooth_sd_s: float = positive(0.08, "sd of the Gaussian that smooths the signal")
+    trend_sd_s: float = positive(0.4, "bounce: sd of the Gaussian taken off as trend")
+    filter_half_width_s: float = positive(0.5, "half width of both")
+    peak_half_width_s: float = positive(0.1, "a peak is the largest value within this")
+    min_prominence: float = positive(0.3, "smallest prominence of a step's peak")
+    prominence_fraction: float = positive(0.4, "the same as a share of the running prominence")
+    prominence_memory_s: float = positive(4.0, "decay of the running prominence")
+    min_height_fraction: float = positive(0.1, "smallest height over prominence of a peak")
+    min_impact_hz: float = positive(5.0, "impact: lowest frequency of a foot contact")
+    min_interval_s: float = positive(0.3, "shortest time between two steps")
+    min_interval_fraction: float = positive(0.45, "the same as a share of the typical period")
+    max_interval_s: float = positive(1.5, "longest time between two steps of a bout")
+    contact_lag_s: float = real(-0.05, -0.3, 0.3, "from the peak to the foot contact")
+    gravity_memory_s: float = positive(1.0, "time constant of the direction of gravity")
+    max_tilt_change_rad: float = positive(0.26, "a device that tilts more is being handled")
+    bout_steps: int = count(3, "peaks in a row that start a bout")
+    still_window_s: float = positive(1.0, "length of the window of stillness")
+    still_acceleration_sd_mps2: float = positive(0.15, "a still body shakes less")
 
     def __post_init__(self) -> None:
-        for name in self.__slots__:
-            value = getattr(self, name)
-            if name == "signal":
-                if value not in ("bounce", "impact"):
-                    raise ValueError(f"steps.signal must be bounce or impact, got {value!r}")
-            elif name == "contact_lag_s":
-                if not -0.3 <= value <= 0.3:
-                    raise ValueError(f"steps.{name} must be within +-0.3 s, got {value}")
-            elif not 0 < value < math.inf:
-                raise ValueError(f"steps.{name} must be finite and > 0, got {value}")
+        check_fields(self, "steps.")
         if self.min_impact_hz >= 0.5 / CELL_S:
             raise ValueError(
                 f"steps.min_impact_hz must be below {0.5 / CELL_S:g} Hz, got {self.min_impact_hz}"

@@ -44,7 +44,13 @@ class ClockModel:
         The second differences of the offsets here are eta T, white. Those of a continuous clock
         (w, q) have the variance 2 w^2 T + 2/3 q^2 T^3 and the covariance -w^2 T + q^2 T^3 / 6 with
         the next: white, too, where w^2 = q^2 T^2 / 6.
+
+        Raises ``ValueError`` for a step that is no time, and where beta is not 1.
         """
+        if self.beta != 1.0:
+            raise ValueError(f"beta must be 1, got {self.beta}: no white and random-walk noise")
+        if not 0.0 < step_s < math.inf:
+            raise ValueError(f"step_s must be finite and > 0 s, got {step_s}")
         return (
             self.drift_step_sd * math.sqrt(step_s / 6.0),
             self.drift_step_sd / math.sqrt(step_s),

@@ -4,13 +4,11 @@ here."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from netpos.filters.motion import ProcessNoise
-from netpos.tracking.parameters import check_fields, from_mapping
-from netpos.tracking.parameters import choice as _choice
-from netpos.tracking.parameters import real as _real
+from netpos.parameters import check_fields, choice, count, described, from_mapping, real
 from netpos.tracking.rsus import StepErrors
 
 FILTERS = ("ekf", "iekf", "ukf", "srukf", "kf")
@@ -36,234 +34,216 @@ class TrackerConfig:
     Raises ``ValueError`` naming the parameter, its value and the accepted range.
     """
 
-    filter: str = _choice(
+    filter: str = choice(
         "iekf",
         FILTERS,
         "ekf | iekf (linearised again at its own result) | ukf | srukf (square root) | kf (linear:"
         " position fixes and velocities only)",
     )
-    backend: str = _choice(
+    backend: str = choice(
         "compiled", BACKENDS, "compiled | filterpy (reference for ekf and ukf, slow)"
     )
-    motion_model: str = _choice(
+    motion_model: str = choice(
         "constant_velocity",
         MOTION_MODELS,
         "constant_velocity | constant_turn | constant_acceleration | interacting (stop, straight,"
         " turn) | inertial (driven by the device's IMU) | rigid_body (several antennas give a"
         " heading of its own) | strapdown (three dimensions, driven by the device's IMU)",
     )
-    process_noise: str = _choice(
+    process_noise: str = choice(
         "continuous",
         tuple(noise.name.lower() for noise in ProcessNoise),
         "continuous | werner (fokin2020:eq.4) | white_acceleration (eq.36)",
     )
-    accel_density_mps2_sqrthz: float = _real(
+    accel_density_mps2_sqrthz: float = real(
         1.0, 1e-6, 1e3, "continuous: density of the white acceleration [m/s^2/sqrt(Hz)]"
     )
-    steady_accel_density_mps2_sqrthz: float = _real(
+    steady_accel_density_mps2_sqrthz: float = real(
         0.0,
         0.0,
         1e3,
         "continuous: the same while velocities in map are reported, well known and unchanged; not"
         " with an IMU; 0: not looked at",
     )
-    accel_sd_mps2: float = _real(1.0, 1e-6, 1e3, "white_acceleration: acceleration sd per step")
-    velocity_step_sd_mps: float = _real(0.1, 1e-9, 1e3, "werner: velocity sd per step")
-    drift_step_sd: float = _real(
+    accel_sd_mps2: float = real(1.0, 1e-6, 1e3, "white_acceleration: acceleration sd per step")
+    velocity_step_sd_mps: float = real(0.1, 1e-9, 1e3, "werner: velocity sd per step")
+    drift_step_sd: float = real(
         1e-4, 0.0, 1.0, "werner, white_acceleration: clock drift sd per step [s/s]"
     )
-    turn_rate_density: float = _real(
+    turn_rate_density: float = real(
         0.3, 1e-9, 1e3, "not constant_velocity: walk of the turn rate [rad/s/sqrt(s)]"
     )
-    jerk_density: float = _real(
+    jerk_density: float = real(
         1.0, 0.0, 1e4, "constant_acceleration: density of the white jerk [m/s^3/sqrt(Hz)]"
     )
-    accel_state_sd_mps2: float = _real(
+    accel_state_sd_mps2: float = real(
         2.0, 1e-6, 1e3, "constant_acceleration: initial acceleration sd per axis"
     )
-    rest_speed_sd_mps: float = _real(0.05, 1e-6, 1e3, "interacting: speed sd of a device at rest")
-    sojourn_s: float = _real(
+    rest_speed_sd_mps: float = real(0.05, 1e-6, 1e3, "interacting: speed sd of a device at rest")
+    sojourn_s: float = real(
         5.0, 1e-3, 1e6, "interacting: mean time a device keeps to one of the models"
     )
-    inertial_accel_density_mps2_sqrthz: float = _real(
+    inertial_accel_density_mps2_sqrthz: float = real(
         0.1,
         1e-6,
         1e3,
         "inertial: noise of the forward acceleration and side slip; strapdown: of each axis",
     )
-    gyro_noise_density: float = _real(
+    gyro_noise_density: float = real(
         5e-3, 1e-9, 10.0, "inertial, strapdown: noise of the gyros [rad/s/sqrt(Hz)]"
     )
-    gyro_bias_sd_radps: float = _real(
+    gyro_bias_sd_radps: float = real(
         0.01,
         1e-9,
         10.0,
         "inertial: initial sd of the yaw-rate bias; strapdown: sd of each gyro bias",
     )
-    gyro_bias_walk: float = _real(
+    gyro_bias_walk: float = real(
         1e-4, 0.0, 1.0, "inertial: walk of the yaw-rate bias [rad/s/sqrt(s)]"
     )
-    accel_bias_sd_mps2: float = _real(
+    accel_bias_sd_mps2: float = real(
         0.2,
         1e-9,
         100.0,
         "inertial: initial sd of the forward acceleration's bias; strapdown: of each axis",
     )
-    accel_bias_walk: float = _real(
+    accel_bias_walk: float = real(
         1e-2, 0.0, 10.0, "inertial: walk of the forward acceleration's bias [m/s^2/sqrt(s)]"
     )
-    bias_correlation_time_s: float = _real(
+    bias_correlation_time_s: float = real(
         100.0, 1.0, 1e6, "strapdown: correlation time of the IMU's biases (first-order Markov)"
     )
-    sideways_sd_mps: float = _real(
+    sideways_sd_mps: float = real(
         0.0, 0.0, 10.0, "strapdown: a vehicle's speed to the side, ten times a second; 0: free"
     )
-    upwards_sd_mps: float = _real(
+    upwards_sd_mps: float = real(
         0.0, 0.0, 10.0, "strapdown: a vehicle's speed off its floor, ten times a second; 0: free"
     )
-    standstill_sd_mps: float = _real(
+    standstill_sd_mps: float = real(
         0.0, 0.0, 10.0, "strapdown: speed of a vehicle whose IMU is quiet; 0: not looked at"
     )
-    still_force_mps2: float = _real(
+    still_force_mps2: float = real(
         0.2, 0.0, 100.0, "strapdown: a quiet IMU's specific force stays this close to its mean"
     )
-    still_rate_radps: float = _real(0.05, 0.0, 10.0, "strapdown: a quiet IMU turns slower")
-    gravity_mps2: float = _real(9.80665, 9.0, 11.0, "strapdown: gravity of the place")
-    earth_rate: bool = field(
-        default=False, metadata={"text": "strapdown: the earth turns, as at latitude_deg"}
-    )
-    latitude_deg: float = _real(0.0, -90.0, 90.0, "strapdown: of the place, with earth_rate")
-    position_gain_min: float = _real(
+    still_rate_radps: float = real(0.05, 0.0, 10.0, "strapdown: a quiet IMU turns slower")
+    gravity_mps2: float = real(9.80665, 9.0, 11.0, "strapdown: gravity of the place")
+    earth_rate: bool = described(False, "strapdown: the earth turns, as at latitude_deg")
+    latitude_deg: float = real(0.0, -90.0, 90.0, "strapdown: of the place, with earth_rate")
+    position_gain_min: float = real(
         0.0, 0.0, 1.0, "kf: floor of the position gain (dvornikov2017: 0.0926)"
     )
-    velocity_gain_min: float = _real(
+    velocity_gain_min: float = real(
         0.0, 0.0, 10.0, "kf: floor of the velocity gain [1/s] (dvornikov2017: 0.008)"
     )
-    accel_gain_min: float = _real(
+    accel_gain_min: float = real(
         0.0, 0.0, 10.0, "kf: floor of the acceleration gain [1/s^2] (dvornikov2017: 0.0003)"
     )
-    clock_white_density: float = _real(
+    clock_white_density: float = real(
         1e-10, 0.0, 1.0, "continuous: clock white frequency noise [s/sqrt(s)]"
     )
-    clock_walk_density: float = _real(
+    clock_walk_density: float = real(
         2.5e-7, 0.0, 1.0, "continuous: clock random-walk frequency noise [(s/s)/sqrt(s)]"
     )
-    clock_offset_sd_s: float = _real(1e-4, 0.0, 1e3, "initial clock offset sd, mean 0")
-    clock_drift_mean: float = _real(25e-6, -1.0, 1.0, "initial clock drift [s/s]")
-    clock_drift_sd: float = _real(30e-6, 0.0, 1.0, "initial clock drift sd [s/s]")
-    initial_speed_sd_mps: float = _real(5.0, 1e-3, 1e3, "initial velocity sd per axis, mean 0")
-    require_initial_pose: bool = field(
-        default=False, metadata={"text": "wait for initialpose instead of the first measurements"}
+    clock_offset_sd_s: float = real(1e-4, 0.0, 1e3, "initial clock offset sd, mean 0")
+    clock_drift_mean: float = real(25e-6, -1.0, 1.0, "initial clock drift [s/s]")
+    clock_drift_sd: float = real(30e-6, 0.0, 1.0, "initial clock drift sd [s/s]")
+    initial_speed_sd_mps: float = real(5.0, 1e-3, 1e3, "initial velocity sd per axis, mean 0")
+    require_initial_pose: bool = described(
+        False, "wait for initialpose instead of the first measurements"
     )
-    initial_position_sd_max_m: float = _real(
+    initial_position_sd_max_m: float = real(
         5.0, 1e-3, 1e4, "a first fix is taken once its position sd is below this"
     )
-    initial_window_s: float = _real(3.0, 0.01, 60.0, "measurements used for the first fix")
-    coverage_radius_m: float = _real(
+    initial_window_s: float = real(3.0, 0.01, 60.0, "measurements used for the first fix")
+    coverage_radius_m: float = real(
         150.0, 1.0, 1e5, "a device is about this far from an RSU that hears it"
     )
-    device_height_m: float = _real(0.0, -1e4, 1e4, "height of the device's antenna in map")
-    gate_probability: float = _real(
+    device_height_m: float = real(0.0, -1e4, 1e4, "height of the device's antenna in map")
+    gate_probability: float = real(
         0.9999, 0.5, 1.0, "share of true measurements the chi-square gate accepts; 1: no gate"
     )
-    robust: str = _choice(
+    robust: str = choice(
         "none", ROBUST, "none | huber | student_t: what fits badly is fused with a larger variance"
     )
-    robust_parameter: float = _real(
+    robust_parameter: float = real(
         4.0, 0.1, 1e3, "huber: distance [sd] from which it grows; student_t: degrees of freedom"
     )
-    nlos_probability: float = _real(
+    nlos_probability: float = real(
         0.0, 0.0, 0.99, "share of ranges and times that come late by a blocked path; 0: none"
     )
-    nlos_mean_excess_m: float = _real(20.0, 1e-3, 1e5, "mean excess of a blocked path")
-    nlos_memory: float = _real(
+    nlos_mean_excess_m: float = real(20.0, 1e-3, 1e5, "mean excess of a blocked path")
+    nlos_memory: float = real(
         100.0, 1.0, 1e9, "measurements over which the share of each RSU is learned"
     )
-    ambiguity: str = _choice(
+    ambiguity: str = choice(
         "hypotheses",
         AMBIGUITY,
         "how the sector of a phase difference is found: hypotheses (a weighted filter per sector)"
         " | step_heading (petukhov:eq.16-18, once per first fix)",
     )
-    sector_probability: float = _real(
+    sector_probability: float = real(
         0.999, 0.5, 1.0 - 1e-9, "hypotheses: TRACKING once a sector is this probable"
     )
-    sector_slip_probability: float = _real(
+    sector_slip_probability: float = real(
         1e-6, 1e-12, 1e-2, "hypotheses: least probability of a sector, so that a rival can return"
     )
-    velocity_correlation_s: float = _real(
+    velocity_correlation_s: float = real(
         0.0,
         0.0,
         60.0,
         "velocities in map: power spectral density at 0 of their errors over their variance (the"
         " duration of a step where one error lasts a step); 0: white",
     )
-    step_length_factor_sd: float = _real(
+    step_length_factor_sd: float = real(
         0.0,
         0.0,
         1.0,
         "velocities in map: sd of the logarithm of true over reported length of all steps of the"
         " person, estimated on the way, over what their covariance holds; 0: not estimated",
     )
-    step_heading_offset_sd_rad: float = _real(
+    step_heading_offset_sd_rad: float = real(
         0.0,
         0.0,
         1.0,
         "velocities in map: sd of the angle from reported to true heading of all steps, estimated"
         " on the way, over what their covariance holds; 0: not estimated",
     )
-    step_error_time_s: float = _real(
+    step_error_time_s: float = real(
         3600.0, 1.0, 1e6, "correlation time of both (first-order Markov)"
     )
-    isolate_rsus: bool = field(
-        default=True, metadata={"text": "refuse an RSU that at least two others contradict"}
-    )
-    manoeuvre_speed_sd_mps: float = _real(
+    isolate_rsus: bool = described(True, "refuse an RSU that at least two others contradict")
+    manoeuvre_speed_sd_mps: float = real(
         0.0, 0.0, 1e3, "velocity step a measurement that fails the gate may reveal; 0: none"
     )
-    inflate_after_epochs: int = field(
-        default=2,
-        metadata={
-            "low": 1,
-            "high": 10000,
-            "text": "epochs rejected in a row before the velocity opens to its initial sd",
-        },
+    inflate_after_epochs: int = count(
+        2, "epochs rejected in a row before the velocity opens to its initial sd"
     )
-    max_rejected_epochs: int = field(
-        default=10,
-        metadata={
-            "low": 1,
-            "high": 10000,
-            "text": "epochs rejected in a row before a new first fix",
-        },
-    )
-    max_gap_s: float = _real(30.0, 0.1, 1e5, "a silence longer than this starts a new first fix")
-    coast_after_s: float = _real(1.0, 0.01, 1e4, "COASTING after this long without a measurement")
-    hold_s: float = _real(
+    max_rejected_epochs: int = count(10, "epochs rejected in a row before a new first fix")
+    max_gap_s: float = real(30.0, 0.1, 1e5, "a silence longer than this starts a new first fix")
+    coast_after_s: float = real(1.0, 0.01, 1e4, "COASTING after this long without a measurement")
+    hold_s: float = real(
         0.25, 0.0, 10.0, "longest wait for measurements still missing at an epoch; 0: do not wait"
     )
 
-    odometry_rate_hz: float = _real(
+    odometry_rate_hz: float = real(
         0.0,
         0.0,
         1000.0,
         "strapdown: odometry at multiples of its inverse, too, by the IMU; 0: at epochs only",
     )
-    history_s: float = _real(
+    history_s: float = real(
         1.0, 0.0, 60.0, "how late a measurement may come and still be applied in order"
     )
-    max_future_s: float = _real(
+    max_future_s: float = real(
         60.0, 0.1, 1e9, "a stamp this far ahead counts only once a second one confirms it"
     )
-    fixed_lag_s: float = _real(
+    fixed_lag_s: float = real(
         0.0, 0.0, 60.0, "smoothed odometry is given out this long after the epoch; 0: none"
     )
-    integrity_risk: float = _real(
+    integrity_risk: float = real(
         1e-4, 1e-12, 0.5, "probability with which the error may exceed the protection level"
     )
-    network: str = field(
-        default="", metadata={"text": "the network whose RSUs count, one of several; empty: all"}
-    )
+    network: str = described("", "the network whose RSUs count, one of several; empty: all")
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -68,7 +68,25 @@ class Estimate(Protocol):
         """An independent copy."""
 
 
-class Single:
+class OneModel:
+    """The motion model of a filter that has one."""
+
+    _motion: Array  # (Parameter,)
+
+    @property
+    def motion(self) -> Array:
+        return self._motion
+
+    def drive(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
+        self._motion[Parameter.YAW_INCREMENT] = yaw_rad
+        self._motion[Parameter.SPEED_INCREMENT] = speed_mps
+        self._motion[Parameter.GYRO] = gyro_density
+
+    def shake(self, accel_density: float) -> None:
+        self._motion[Parameter.ACCEL] = accel_density
+
+
+class Single(OneModel):
     """One motion model in the compiled engine."""
 
     decided = True
@@ -94,10 +112,6 @@ class Single:
         return engine.to_cov(self._spread, self._options) if self._factored else self._spread
 
     @property
-    def motion(self) -> Array:
-        return self._motion
-
-    @property
     def prior(self) -> tuple[Array, Array]:
         spread = self._spare[1 : self.mean.size + 1]
         cov = engine.to_cov(spread, self._options) if self._factored else spread
@@ -108,14 +122,6 @@ class Single:
             mean, cov = grown(self.mean, self.cov, sd)
             self.mean, self._spread = mean, engine.to_spread(cov, self._options)
             self._make_room(self._rows)
-
-    def drive(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
-        self._motion[Parameter.YAW_INCREMENT] = yaw_rad
-        self._motion[Parameter.SPEED_INCREMENT] = speed_mps
-        self._motion[Parameter.GYRO] = gyro_density
-
-    def shake(self, accel_density: float) -> None:
-        self._motion[Parameter.ACCEL] = accel_density
 
     def predict(self, stamp_ns: int, bias: Array) -> None:
         dt = (stamp_ns - self.stamp_ns) * 1e-9
@@ -304,7 +310,7 @@ class Interacting(_Looks):
         return twin
 
 
-class Reference(_Looks):
+class Reference(OneModel, _Looks):
     """One motion model on FilterPy: slow, for comparison."""
 
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
@@ -327,20 +333,8 @@ class Reference(_Looks):
     def _set_state(self, state: tuple[Array, ...]) -> None:
         self.mean, self.cov = state
 
-    @property
-    def motion(self) -> Array:
-        return self._motion
-
     def grow(self, sd: Array) -> None:
         self.mean, self.cov = grown(self.mean, self.cov, sd)
-
-    def drive(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
-        self._motion[Parameter.YAW_INCREMENT] = yaw_rad
-        self._motion[Parameter.SPEED_INCREMENT] = speed_mps
-        self._motion[Parameter.GYRO] = gyro_density
-
-    def shake(self, accel_density: float) -> None:
-        self._motion[Parameter.ACCEL] = accel_density
 
     def _note_jump(self, *steps: float) -> None:
         engine.note_jump(self._motion, *steps)

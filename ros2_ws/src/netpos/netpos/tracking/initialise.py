@@ -37,11 +37,11 @@ from netpos.filters.measurement import (
     wrap,
 )
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.least_squares import minimise
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.rsus import Rsu
 
-_ITERATIONS = 30
 _REFINED = 12
 _ATTEMPT_NS = 100_000_000
 # A second solution this much worse in cost (chi-square 0.99, 2 dof) does not count as a rival.
@@ -90,21 +90,9 @@ def _solve(
     state: Array, problem: tuple[Array, Array, float, Array, Array]
 ) -> tuple[float, Array, Array]:
     """Levenberg-Marquardt from one start: cost, state, covariance of the fit."""
-    damping = 1e-3
-    cost, b, A = _normal_equations(state, *problem)
-    for _ in range(_ITERATIONS):
-        step = _inverse(A + damping * np.diag(np.diag(A))) @ b
-        new_cost, new_b, new_A = _normal_equations(state + step, *problem)
-        if new_cost < cost:
-            done = cost - new_cost < 1e-6 * (1.0 + cost)
-            state, cost, b, A = state + step, new_cost, new_b, new_A
-            damping = max(damping / 10.0, 1e-12)
-            if done:
-                break
-        else:
-            damping *= 10.0
-            if damping > 1e8:
-                break
+    cost, state, A = minimise(
+        lambda x: _normal_equations(x, *problem), state, lambda A, b: _inverse(A) @ b
+    )
     return cost, state, _inverse(A)
 
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from netpos.filters.compile import leaf
+from netpos.filters.factor import eigenvalues
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages.values import Array, ClockState, Odometry, TrackState
 from netpos.tracking.config import TrackerConfig
@@ -25,19 +26,11 @@ _COVS = np.array(  # of pose and twist
 _POSITION, _QUATERNION, _VELOCITY, _RATE, _VECTORS = 0, 3, 7, 10, 13
 
 
-def eigenvalues(xx: float, xy: float, yy: float) -> tuple[float, float]:
-    """Smallest and largest eigenvalue of a symmetric 2 x 2 matrix."""
-    middle, radius = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
-    outer = middle + math.copysign(radius, middle)  # of the larger magnitude: nothing cancels
-    inner = (xx * yy - xy * xy) / outer if outer else 0.0
-    return min(inner, outer), max(inner, outer)
-
-
 @leaf
 def largest_sd(cov: Array) -> float:
     """Standard deviation [m] of the position along its worst horizontal direction."""
-    xx, xy, yy = cov[0, 0], cov[0, 1], cov[1, 1]
-    return math.sqrt(max(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy), 0.0))
+    _, largest = eigenvalues(cov[0, 0], cov[0, 1], cov[1, 1])
+    return math.sqrt(max(largest, 0.0))
 
 
 def heading(mean: Array, cov: Array, last: float, index: int = -1) -> tuple[float, float]:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from netpos.filters.compile import kernel, leaf
+from netpos.filters.factor import eigenvalues
 from netpos.filters.fusion import W_GAIN, fuse
 from netpos.filters.manoeuvre import add_manoeuvre, unnoticed_s
 from netpos.filters.measurement import GROUP, VARIANCE, curvature_variance, innovation_row
@@ -33,11 +34,10 @@ RISK_MIN, RISK_MAX = 1e-15, 0.5
 def gaussian_radius(xx: float, xy: float, yy: float, risk: float) -> float:
     """Radius r with P(|e| > r) = risk for e ~ N(0, [[xx, xy], [xy, yy]]); see
     ``protection_level``. Takes what it is given."""
-    centre, spread = (xx + yy) / 2.0, math.hypot((xx - yy) / 2.0, xy)
-    large = centre + spread
+    small, large = eigenvalues(xx, xy, yy)
     if large <= 0.0:
         return 0.0
-    ratio = max(centre - spread, 0.0) / large
+    ratio = max(small, 0.0) / large
     log_risk = math.log(risk)
     circular = -2.0 * log_risk
     # Laplace's approximation of the mean over the angles: nearly there
@@ -64,7 +64,7 @@ def gaussian_radius(xx: float, xy: float, yy: float, risk: float) -> float:
 def radius_limit(xx: float, xy: float, yy: float, risk: float) -> float:
     """What ``gaussian_radius`` never exceeds: the radius of a circular error that is everywhere as
     large as this one is along its longer axis."""
-    large = (xx + yy) / 2.0 + math.hypot((xx - yy) / 2.0, xy)
+    _, large = eigenvalues(xx, xy, yy)
     return math.sqrt(-2.0 * math.log(risk) * max(large, 0.0))
 
 

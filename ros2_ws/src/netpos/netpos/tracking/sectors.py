@@ -9,11 +9,11 @@ import numpy as np
 
 from netpos.filters.compile import leaf
 from netpos.filters.measurement import BIAS, COMMON, GROUP, KIND, Kind
-from netpos.filters.motion import Parameter
 from netpos.messages.values import Array
 from netpos.tracking import engine, sector_bank
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.engine import Option
+from netpos.tracking.estimates import OneModel
 from netpos.tracking.models import grown, initial_extra_sd, motions_of, options_of
 from netpos.tracking.phase_fix import TWO_PI, phase_scale, spawn
 from netpos.tracking.protection import protection_level
@@ -39,7 +39,7 @@ def sectors_of(phase: Array) -> int:
     return int(2 * math.ceil(turns + 0.5) + 1)
 
 
-class Sectors:
+class Sectors(OneModel):
     """Bank of filters of ``sector_bank`` with the interface of ``estimates.Estimate``.
 
     Decided once a sector has the probability ``sector_probability``: then mean and covariance are
@@ -124,10 +124,6 @@ class Sectors:
         return self._view()[1]
 
     @property
-    def motion(self) -> Array:
-        return self._motion
-
-    @property
     def prior(self) -> tuple[Array, Array]:
         return self._prior
 
@@ -179,14 +175,6 @@ class Sectors:
             means[s], larger = grown(self._means[s], cov, sd)
             spreads[s] = engine.to_spread(larger, self._options)
         self._means, self._spreads, self._seen = means, spreads, None
-
-    def drive(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
-        self._motion[Parameter.YAW_INCREMENT] = yaw_rad
-        self._motion[Parameter.SPEED_INCREMENT] = speed_mps
-        self._motion[Parameter.GYRO] = gyro_density
-
-    def shake(self, accel_density: float) -> None:
-        self._motion[Parameter.ACCEL] = accel_density
 
     def _advance(self, stamp_ns: int, jump_sd: float, unheard_s: float, bias: Array) -> None:
         dt = (stamp_ns - self.stamp_ns) * 1e-9

@@ -8,6 +8,7 @@ from operator import attrgetter
 
 import numpy as np
 
+from netpos.filters.factor import eigenvalues
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.filters.rows import rsu_axes
 from netpos.messages.fields import MAP_FRAME
@@ -22,7 +23,6 @@ from netpos.messages.values import (
     RsuMeasurement,
     Velocity,
 )
-from netpos.tracking.output import eigenvalues
 
 # Plain integers: arithmetic of flags costs ten times as much
 _SCALARS = (

@@ -13,7 +13,7 @@ import pytest
 from imported_bag import values
 from netpos.bags import BagError, BagReader
 from netpos.bags.importers import import_uwb_trolley
-from netpos.bags.importers.uwb_trolley import TAGS_M, LinkErrors
+from netpos.bags.importers.uwb_trolley import ERRORS, TAGS_M
 from netpos.messages.values import Field, Odometry
 from netpos.tracking import TrackerConfig
 from netpos.tracking.settings import bag_settings
@@ -69,7 +69,7 @@ def test_links_and_ranges_by_hand(tmp_path: Path) -> None:
     assert {m.expected for m in second.values()} == {21}
     assert not {"a7_t0", "a7_t1", "a7_t2"} & second.keys()
     assert first["a3_t2"].fields == Field.RANGE
-    assert first["a3_t2"].range_var == LinkErrors().range_sd_m ** 2
+    assert first["a3_t2"].range_var == ERRORS.range_sd_m**2
     np.testing.assert_array_equal(first["a3_t2"].lever_arm, [0.2034, 0.1451, -0.0008])
 
 

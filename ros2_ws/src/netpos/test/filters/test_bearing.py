@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 
+import filter_rows
 import numpy as np
 import pytest
 from netpos.filters import ekf
-from netpos.filters.bearing import fuse_bearing, is_plain_bearing, on_top
-from netpos.filters.fusion import W_USE
-from netpos.filters.measurement import BIAS, HEADING
+from netpos.filters.bearing import fuse_around, fuse_bearing, is_plain_bearing, on_top
+from netpos.filters.fusion import W_COV, W_PRIOR, W_USE
+from netpos.filters.measurement import BIAS, HEADING, VARIANCE, Kind, curvature_variance, linearise
 from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 
@@ -46,7 +47,8 @@ def _prior(offset: list[float], correlation: float) -> tuple[Array, Array]:
 
 def _integrated(mean: Array, cov: Array, azimuth: float) -> tuple[Array, Array]:
     """Posterior moments: the position on a polar grid, the rest by the blocks of the prior's
-    information matrix."""
+    information matrix. As far as the prior is longer along the bearing than across, its second
+    moment along it, about the prior's mean, is kept."""
     angle = azimuth + SD * np.linspace(-6, 6, 241)
     r = np.linspace(0, 80, 8001)[1:]
     place = RSU + np.stack(
@@ -59,6 +61,10 @@ def _integrated(mean: Array, cov: Array, azimuth: float) -> tuple[Array, Array]:
     weight /= weight.sum()
     center = weight @ place
     C = (place - center).T @ ((place - center) * weight[:, None])
+    along = np.array([math.cos(azimuth), math.sin(azimuth)])
+    long = along @ cov[:2, :2] @ along
+    strip = max(2.0 - np.trace(cov[:2, :2]) / long, 0.0)
+    C += strip * (along @ (center - mean[:2])) ** 2 * np.outer(along, along)
     information = np.linalg.inv(cov)
     rest = np.linalg.inv(information[2:, 2:])
     slope = -rest @ information[2:, :2]
@@ -68,22 +74,71 @@ def _integrated(mean: Array, cov: Array, azimuth: float) -> tuple[Array, Array]:
     return mean + joint @ (center - mean[:2]), expected
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.8])
 @pytest.mark.parametrize(
-    ("offset", "azimuth"),
-    [([8.0, 3.0], 0.4), ([6.0, 0.0], 2.5), ([0.5, 0.5], -1.0), ([-4.0, 5.0], -0.6)],
+    ("offset", "azimuth", "correlations"),
+    [
+        ([8.0, 3.0], 0.4, (0.0, 0.8, 20.0)),
+        ([6.0, 0.0], 2.5, (0.0, 0.8)),
+        ([0.5, 0.5], -1.0, (0.0, 0.8, 20.0)),
+        ([-4.0, 5.0], -0.6, (0.0, 0.8)),
+    ],
     ids=["ahead", "behind", "on top", "far behind"],
 )
 def test_moments_are_those_of_the_plane(
-    offset: list[float], azimuth: float, correlation: float
+    offset: list[float], azimuth: float, correlations: tuple[float, ...]
 ) -> None:
-    mean, cov = _prior(offset, correlation)
-    expected, expected_cov = _integrated(mean, cov, azimuth)
-    x, P = mean.copy(), cov.copy()
-    assert fuse_bearing(x, P, _row(azimuth, yaw=0.7), SD**2)
-    sd = np.sqrt(np.diag(expected_cov))
-    assert (np.abs(x - expected) < 0.01 * sd).all()
-    np.testing.assert_allclose(P / np.outer(sd, sd), expected_cov / np.outer(sd, sd), atol=0.01)
+    """Correlation 20: a strip across the bearing, much narrower than its shadow on it."""
+    for correlation in correlations:
+        mean, cov = _prior(offset, correlation)
+        expected, expected_cov = _integrated(mean, cov, azimuth)
+        x, P = mean.copy(), cov.copy()
+        assert fuse_bearing(x, P, _row(azimuth, yaw=0.7), SD**2)
+        sd = np.sqrt(np.diag(expected_cov))
+        scale = np.outer(sd, sd)
+        assert (np.abs(x - expected) < 0.01 * sd).all()
+        np.testing.assert_allclose(P / scale, expected_cov / scale, atol=0.01)
+
+
+@pytest.mark.parametrize(("aside", "rel"), [(0.5, 0.02), (60.0, 0.05)])
+def test_a_bearing_that_contradicts_is_weighed_like_any(aside: float, rel: float) -> None:
+    """A narrow prior 100 m away: across the bearing two normals, half a metre or 60 m apart."""
+    mean, cov = np.array([*RSU, 0.0, 0.0, 0.0, 0.0]), np.eye(6)
+    mean[:2] += 100.0, aside
+    cov[0, 0] = 1e-4
+    assert fuse_bearing(mean, cov, _row(0.0), 0.01**2)
+    assert mean[1] - RSU[1] == pytest.approx(aside / 2.0, rel=rel)
+    assert cov[1, 1] == pytest.approx(0.5, rel=rel)
+    assert mean[0] - RSU[0] == pytest.approx(100.0, abs=0.1)
+
+
+def test_other_rows_follow_at_the_result() -> None:
+    """A range beside the bearing, and one that is not used; a bearing under a prior that is none
+    is fused linearised, too."""
+    mean, cov = _prior([6.0, 0.0], 0.3)
+    rows = np.array(
+        [
+            filter_rows.row(Kind.RANGE, 9.0, 0.2, 0, (8.0, 5.0, 1.0)),
+            _row(2.5),
+            filter_rows.row(Kind.RANGE, 1.0, 0.2, 2, (8.0, 5.0, 1.0)),
+        ]
+    )
+    for is_flat in (False, True):
+        if is_flat:
+            cov[0], cov[:, 0] = 0.0, 0.0
+        work = ekf.workspace(6, 3)
+        work[W_PRIOR], work[W_COV : W_COV + 6], work[W_USE, :3] = mean, cov, (1.0, 1.0, 0.0)
+        x, P = np.full(6, 7.0), np.full((6, 6), 7.0)
+        fuse_around(x, P, rows, 0.5, work)
+        expected, expected_cov, linear = mean.copy(), cov.copy(), rows[:2]
+        if not is_flat:
+            assert fuse_bearing(expected, expected_cov, rows[1], SD**2)
+            linear = rows[:1]
+        z, H = linearise(linear, expected, 0.5)
+        extra = [curvature_variance(r, expected, expected_cov, 0.5) for r in linear]
+        gain = expected_cov @ H.T
+        gain @= np.linalg.inv(H @ gain + np.diag(linear[:, VARIANCE] + extra))
+        np.testing.assert_allclose(x, expected + gain @ z, rtol=1e-9)
+        np.testing.assert_allclose(P, expected_cov - gain @ H @ expected_cov, atol=1e-9)
 
 
 def test_far_away_it_is_the_linear_update() -> None:
@@ -98,6 +153,26 @@ def test_far_away_it_is_the_linear_update() -> None:
     np.testing.assert_allclose(x, mean + cov @ h * 0.002 / s, atol=0.03)
     np.testing.assert_allclose(P, cov - np.outer(cov @ h, cov @ h) / s, atol=0.02 * 400.0)
     assert abs(P[0, 0] / (cov - np.outer(cov @ h, cov @ h) / s)[0, 0] - 1) < 0.01
+
+
+def test_a_strip_across_a_far_bearing_is_cut_where_it_is() -> None:
+    """A kilometre long and some centimetres wide, 1.3 km away: the linear update, on a piece of
+    the bearing that is a ten thousandth of what the prior leaves open."""
+    mean, cov = np.array([*RSU, 1.0, -1.0, 5.0, 0.2]), np.eye(6)
+    mean[:2] += 1200.0, 500.0
+    turn = np.array([[12.0, -5.0], [5.0, 12.0]]) / 13.0  # along and across the bearing
+    strip = 200.0**2 * np.array([[1.0, 1.0], [1.0, 1.0 + 1e-8]])
+    cov[:2, :2] = turn @ strip @ turn.T
+    row = _row(math.atan2(5.0, 12.0))
+    x, P = mean.copy(), cov.copy()
+    assert fuse_bearing(x, P, row, 1e-10)
+    h = np.zeros(6)
+    h[:2] = turn[:, 1] / 1300.0
+    gain = cov @ h / (h @ cov @ h + 1e-10)
+    expected = cov - np.outer(gain, h @ cov)
+    sd = np.sqrt(np.diag(expected))
+    assert (np.abs(x - mean) < 0.01 * sd).all()
+    np.testing.assert_allclose(P / np.outer(sd, sd), expected / np.outer(sd, sd), atol=0.01)
 
 
 def test_only_plain_bearings_are_taken() -> None:
@@ -125,24 +200,14 @@ def test_a_device_behind_the_rsu_is_not_put_on_top_of_it() -> None:
 
 
 def test_the_same_bearing_again_tells_the_side_and_no_distance() -> None:
-    """A strip along the bearing, cut in its middle: the range keeps its second moment, which of a
-    half-normal is that of the normal."""
+    """A strip along the bearing, cut in its middle: the range has the mean of a half-normal and
+    keeps its second moment, which is that of the normal."""
     mean, cov = np.array([*RSU, 0.0, 0.0, 0.0, 0.0]), np.eye(6)
     cov[0, 0], cov[1, 1] = 36.0, 1e-4
-    once, again = (mean.copy(), cov.copy()), (mean.copy(), cov.copy())
-    assert fuse_bearing(*once, _row(0.0), SD**2)
-    assert fuse_bearing(*again, _row(0.0), SD**2, True)
-    np.testing.assert_array_equal(once[0], again[0])
-    moved = once[0][0] - RSU[0]
-    strip = 1.0 - 1e-4 / 36.0
-    assert again[1][0, 0] == pytest.approx(once[1][0, 0] + strip * moved**2, rel=1e-9)
-    assert again[1][0, 0] == pytest.approx(36.0, rel=0.03)
-    np.testing.assert_allclose(again[1][1:, 1:], once[1][1:, 1:], rtol=1e-9)
-    round_cov = 4.0 * np.eye(6)
-    first, other = (mean.copy(), round_cov.copy()), (mean.copy(), round_cov.copy())
-    fuse_bearing(*first, _row(0.4), SD**2)
-    fuse_bearing(*other, _row(0.4), SD**2, True)
-    np.testing.assert_allclose(other[1], first[1], rtol=1e-9, atol=1e-12)
+    assert fuse_bearing(mean, cov, _row(0.0), SD**2)
+    assert mean[0] - RSU[0] == pytest.approx(6.0 * math.sqrt(2.0 / math.pi), rel=0.03)
+    assert cov[0, 0] == pytest.approx(36.0, rel=0.03)
+    np.testing.assert_array_equal(cov[2:, 2:], np.eye(4))
 
 
 def test_bearings_cut_at_the_rsu_do_not_make_sure() -> None:
@@ -156,10 +221,10 @@ def test_bearings_cut_at_the_rsu_do_not_make_sure() -> None:
     assert error**2 < 12.0 * cov[0, 0]
 
 
-@pytest.mark.parametrize(("distance", "near"), [(1.99, True), (2.01, False)])
+@pytest.mark.parametrize(("distance", "near"), [(3.99, True), (4.01, False)])
 def test_an_rsu_is_near_within_two_sd(distance: float, near: bool) -> None:
     rows, work = _row(0.0)[None], ekf.workspace(6, 1)
-    cov, mean = np.diag([0.5, 0.5, 1.0, 1.0, 1.0, 1.0]), np.zeros(6)
+    cov, mean = np.diag([1.5, 2.5, 1.0, 1.0, 1.0, 1.0]), np.zeros(6)
     mean[:2] = RSU + distance * np.array([0.6, -0.8])
     work[W_USE, 0] = 1.0
     assert on_top(mean, cov, rows, work) is near

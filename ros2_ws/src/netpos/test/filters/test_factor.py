@@ -1,11 +1,15 @@
-"""Cholesky factors, also of singular covariances, against NumPy's."""
+"""Cholesky factors, also of singular covariances, and eigenvalues against NumPy's."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
 from filter_rows import random_spd
-from netpos.filters.factor import factor, solve_factored
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from netpos.filters.factor import eigenvalues, factor, solve_factored
 
 
 @pytest.mark.parametrize("scale", [1e-20, 1.0, 1e20])
@@ -65,3 +69,26 @@ def test_along_what_is_known_exactly_the_solution_is_zero() -> None:
     solve_factored(L, X)
     np.testing.assert_array_equal(X[1], 0.0)
     np.testing.assert_allclose(X[others], np.linalg.solve(rest, B[others]), rtol=1e-9)
+
+
+@settings(max_examples=200, deadline=None)
+@given(*[st.floats(-1e6, 1e6)] * 3)
+def test_eigenvalues_of_any_symmetric_matrix(xx: float, xy: float, yy: float) -> None:
+    scale = max(abs(xx), abs(xy), abs(yy))
+    expected = np.linalg.eigvalsh(np.array([[xx, xy], [xy, yy]]))
+    np.testing.assert_allclose(eigenvalues(xx, xy, yy), expected, atol=1e-14 * scale + 1e-150)
+
+
+def test_a_small_eigenvalue_beside_a_large_one_keeps_its_digits() -> None:
+    """Of R diag(1, 1e-9) R', with R a turn by 0.3 rad."""
+    c, s, small = math.cos(0.3), math.sin(0.3), 1e-9
+    matrix = c * c + s * s * small, c * s * (1 - small), s * s + c * c * small
+    found = eigenvalues(*matrix)
+    np.testing.assert_allclose(found, [small, 1.0], rtol=1e-6)
+
+
+def test_eigenvalues_of_a_negative_matrix_keep_their_order() -> None:
+    assert eigenvalues(-3.0, 0.0, -1.0) == (-3.0, -1.0)
+    assert eigenvalues(-0.0, 2.0, -0.0) == (-2.0, 2.0)
+    assert eigenvalues(0.0, 0.0, 0.0) == (0.0, 0.0)
+    assert eigenvalues(math.inf, 0.0, 1.0)[1] == math.inf

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from netpos.filters.motion import (
     Model,
     Parameter,
     ProcessNoise,
+    _turn,
     extra_states,
     motion_parameters,
     noise,
@@ -107,6 +109,23 @@ def test_constant_acceleration_is_the_differential_equation() -> None:
     np.testing.assert_allclose(result, solved, rtol=1e-10)
 
 
+@pytest.mark.parametrize("angle", [9.9e-5, -5e-5, 0.0])
+def test_a_hardly_turning_device_follows_the_power_series(angle: float) -> None:
+    """sin(r t) / r and (1 - cos(r t)) / r and what they change with r, by exact fractions."""
+    dt, x = 0.5, Fraction(angle)
+    turn: list[Fraction] = [Fraction(0)] * 4
+    for k in range(4):
+        sign, odd, even = (-1) ** k, math.factorial(2 * k + 1), math.factorial(2 * k + 2)
+        turn[0] += sign * x ** (2 * k) / odd
+        turn[1] += sign * x ** (2 * k + 1) / even
+        turn[2] += sign * 2 * k * x ** max(2 * k - 1, 0) / odd
+        turn[3] += sign * (2 * k + 1) * x ** (2 * k) / even
+    expected = [dt * float(turn[0]), dt * float(turn[1])]
+    expected += [dt**2 * float(turn[2]), dt**2 * float(turn[3])]
+    share = np.array([0.0, angle**2 / 9.0, angle**2 / 9.0, 0.0]) + 1e-14  # what is left out
+    assert (np.abs(np.subtract(_turn(angle / dt, dt), expected)) <= share * np.abs(expected)).all()
+
+
 def test_stationary_stands_still() -> None:
     mean = np.array([3.0, -2.0, 8.0, 5.0, 100.0, 0.4])
     result = moved(mean, 2.0, motion_parameters(Model.STATIONARY))
@@ -125,11 +144,17 @@ def van_loan(A: Array, Qc: Array, dt: float) -> Array:
 
 @pytest.mark.parametrize("dt", [0.01, 0.5, 4.0])
 @pytest.mark.parametrize(
-    "model", [Model.CONSTANT_VELOCITY, Model.CONSTANT_ACCELERATION, Model.CONSTANT_TURN]
+    "model",
+    [
+        Model.CONSTANT_VELOCITY,
+        Model.CONSTANT_ACCELERATION,
+        Model.CONSTANT_TURN,
+        Model.RIGID_BODY,
+    ],
 )
 def test_continuous_noise_is_van_loans(model: Model, dt: float) -> None:
     """White acceleration or jerk, the two-state clock, biases; a walking turn rate acts on itself
-    only."""
+    only, or on the heading of a rigid body."""
     extras = extra_states(model)
     n = 6 + extras + 2
     motion = motion_parameters(
@@ -145,6 +170,8 @@ def test_continuous_noise_is_van_loans(model: Model, dt: float) -> None:
         Qc[2, 2] = Qc[3, 3] = 0.7**2
     if model == Model.CONSTANT_TURN:
         Qc[6, 6] = 0.15**2
+    if model == Model.RIGID_BODY:
+        A[6, 7], Qc[7, 7] = 1.0, 0.15**2
     for i in range(2):
         k = 6 + extras + i
         A[k, k], Qc[k, k] = -1.0 / BIAS[1, i], 2.0 * BIAS[0, i] ** 2 / BIAS[1, i]

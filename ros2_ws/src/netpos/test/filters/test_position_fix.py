@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import pytest
-from netpos.filters.measurement import KIND, ROW_WIDTH, VALUE, VARIANCE, Kind
+from netpos.filters.measurement import GROUP, KIND, ROW_WIDTH, VALUE, VARIANCE, Kind
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
-from netpos.filters.position_fix import FixStatus, fix_position, start_of
+from netpos.filters.position_fix import FixStatus, _invert, fix_position, start_of
 from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.filters.space import place_rows, value_at
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
@@ -99,6 +99,40 @@ def test_without_noise_times_give_the_place(fields: Field, n: int) -> None:
     fix = fix_position(rows, start_of(rows, 0.0))
     assert fix.status == FixStatus.CONVERGED
     np.testing.assert_allclose(fix.position, PLACE, atol=1e-3)
+
+
+def test_a_clock_far_off_costs_no_digits() -> None:
+    """Three seconds, 1e9 m: fixes, steps and covariance as without."""
+    rng = np.random.default_rng(11)
+    for _ in range(10):
+        near = rows_at(rng.uniform([0, 0, 0], [100, 100, 3]), CORNERS[:4], TIMES, rng)
+        far = near.copy()
+        far[near[:, KIND] == Kind.TOA, VALUE] += 1e9
+        fix, other = (fix_position(rows, np.full(3, 50.0)) for rows in (near, far))
+        assert (fix.status, fix.iterations) == (FixStatus.CONVERGED, other.iterations)
+        np.testing.assert_allclose(fix.position, other.position, atol=1e-5)
+        np.testing.assert_allclose(fix.cov, other.cov, rtol=1e-5)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_a_matrix_without_inverse_is_told_from_one_with(scale: float) -> None:
+    """Sums of two and of three squares, their axes of very different size."""
+    rng = np.random.default_rng(12)
+    for _ in range(50):
+        H, found = rng.normal(size=(3, 3)) * [scale, 1.0, 1.0], np.empty((3, 3))
+        assert not _invert(H[:2].T @ H[:2], found)
+        assert _invert(H.T @ H, found)
+        size = np.sqrt(np.diag(np.linalg.inv(H.T @ H)))
+        outer = np.outer(size, size)
+        np.testing.assert_allclose(found / outer, np.linalg.inv(H.T @ H) / outer, atol=1e-6)
+
+
+def test_the_last_iteration_counts() -> None:
+    """From ever further away, 50 m a step: a hundred settle, no more."""
+    rows = place_rows(PLACE, np.eye(3), (0.0, 0.0, 0.0))
+    for distance, status in ((4940.0, FixStatus.CONVERGED), (4960.0, FixStatus.NOT_CONVERGED)):
+        fix = fix_position(rows, PLACE + np.array([distance, 0.0, 0.0]))
+        assert (fix.status, fix.iterations) == (status, 100)
 
 
 def test_one_station_without_a_clock_gives_no_fix() -> None:
@@ -239,6 +273,10 @@ def test_a_known_height_closes_the_geometry() -> None:
 
 def test_start_follows_the_nearest_station_with_angles() -> None:
     rows = rows_at(PLACE, CORNERS, ALL, None, Rotation.from_euler("z", 1.0))
+    nearest = np.linalg.norm(CORNERS - PLACE, axis=1).argmin()
+    rows[(rows[:, KIND] == Kind.AZIMUTH) & (rows[:, GROUP] != nearest), VALUE] += 0.5
     np.testing.assert_allclose(start_of(rows, 0.0), PLACE, atol=1e-9)
+    west = rows[[0, 1, 8]]  # angles of one station, the range of another north of it
+    np.testing.assert_allclose(start_of(west, 2.0), [*CORNERS[2, :2], 2.0], atol=1e-9)
     ranges = rows_at(PLACE, CORNERS, Field.RANGE, None)
     np.testing.assert_allclose(start_of(ranges, 2.0), [80.0, 40.0, 2.0], atol=1e-9)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from netpos.filters import robust
 from netpos.messages.values import Array
-from scipy import integrate, optimize, stats
+from scipy import integrate, optimize, special, stats
 
 # S, R, prior, mean excess
 MIXTURES = [
@@ -241,8 +241,14 @@ def test_truncated_normal_in_its_tails(z: float) -> None:
 # adaptive prior
 
 
+@pytest.mark.parametrize("z", [-1e3, -60.0, -40.01, -39.99, -5.01, -4.99, 3.0])
+def test_mills_ratio_is_scipys(z: float) -> None:
+    expected = special.log_ndtr(z) - stats.norm.logpdf(z)
+    assert robust._log_mills(z) == pytest.approx(expected, rel=1e-12, abs=5e-9)
+
+
 def test_prior_follows_and_comes_back() -> None:
-    a0, b0 = 1.0, 9.0
+    a0, b0 = 2.0, 18.0
     a, b = a0, b0
     for _ in range(400):
         a, b = robust.update_prior(a, b, 1.0, 0.98, a0, b0)

@@ -24,6 +24,7 @@ from netpos.filters.space import (
     bend_variance,
     direction_rows,
     innovation_at,
+    linearise_in_space,
     place_rows,
     value_at,
 )
@@ -188,6 +189,40 @@ def test_place_rows_hold_the_whole_covariance() -> None:
 def test_a_flat_covariance_is_refused() -> None:
     with pytest.raises(np.linalg.LinAlgError):
         place_rows(np.zeros(3), np.diag([1.0, 1.0, 0.0]), (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_bend_variance_of_each_kind(seed: int) -> None:
+    """Half the squared trace of what lies across the line of sight over its length; of angles the
+    squared entries, over the fourth power, of a bearing in the plane."""
+    rng = np.random.default_rng(seed)
+    nav, A = state(rng), rng.normal(size=(ERR, ERR))
+    cov, origin = A @ A.T, rng.normal(0.0, 20.0, 3)
+    d, P = nav[:3] - origin, cov[:3, :3]
+    r2, rho2 = d @ d, d[:2] @ d[:2]
+    ranged = np.trace((np.eye(3) - np.outer(d, d) / r2) @ P) ** 2 / r2
+    angle = np.linalg.norm(P) ** 2 / r2**2
+    for kind, twice in (
+        (Kind.RANGE, ranged),
+        (Kind.TOA, ranged),
+        (Kind.AZIMUTH, np.linalg.norm(P[:2, :2]) ** 2 / rho2**2),
+        (Kind.ELEVATION, angle),
+        (Kind.COSINE_Y, angle),
+        *((kind, 0.0) for kind in SpaceKind),
+    ):
+        row = filter_rows.row(Kind.RANGE, 0.0, 1.0, 0, origin)
+        row[KIND] = kind
+        assert bend_variance(row, nav, cov) == pytest.approx(twice / 2.0, rel=1e-10)
+
+
+def test_all_rows_are_linearised_in_their_order() -> None:
+    rng = np.random.default_rng(6)
+    nav, rows, A = state(rng), all_rows(rng), rng.normal(size=(ERR, ERR))
+    found = linearise_in_space(rows, nav, A @ A.T)
+    for row, z, h, bend in zip(rows, *found, strict=True):
+        expected, gradient = innovation(row, nav)
+        assert (z, bend) == (expected, bend_variance(row, nav, A @ A.T))
+        np.testing.assert_array_equal(h, gradient)
 
 
 @pytest.mark.parametrize("kind", [Kind.RANGE, Kind.AZIMUTH, Kind.ELEVATION])

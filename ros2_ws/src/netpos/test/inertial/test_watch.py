@@ -253,13 +253,16 @@ def test_conditions_are_told_when_they_begin_and_end() -> None:
         ({"placement": "ankle"}, "placement must be carried or waist"),
         ({"height": 1.8}, "no parameter height of pdr; known: .*height_m"),
         ({"steps.bounce": 1}, "no parameter steps.bounce"),
-        ({"height_m": "tall"}, "pdr.height_m must be a float, got 'tall'"),
-        ({"steps.bout_steps": 2.5}, "pdr.steps.bout_steps must be a int, got 2.5"),
+        ({"height_m": "tall"}, "pdr.height_m must be of type float, got 'tall'"),
+        ({"steps.bout_steps": 2.5}, "pdr.steps.bout_steps must be of type int, got 2.5"),
         ({"hard_iron_t": [1e-6, 0.0]}, "pdr.hard_iron_t must be 3 finite numbers"),
         ({"hard_iron_t": [1e-6, math.nan, 0.0]}, "pdr.hard_iron_t must be 3 finite numbers"),
-        ({"field_matrix": "none"}, "pdr.field_matrix must be a tuple, got 'none'"),
-        ({"height_m": True}, "pdr.height_m must be a float, got True"),
-        ({"attitude.tilt_gain_per_s": -1.0}, "attitude.tilt_gain_per_s must be finite"),
+        ({"field_matrix": "none"}, "pdr.field_matrix must be of type tuple, got 'none'"),
+        ({"height_m": True}, "pdr.height_m must be of type float, got True"),
+        (
+            {"attitude.tilt_gain_per_s": -1.0},
+            r"attitude.tilt_gain_per_s must be in \[0, 1e\+09\], got -1.0",
+        ),
     ],
 )
 def test_bad_mapping_is_one_clear_error(values: dict[str, Any], message: str) -> None:

@@ -65,6 +65,14 @@ def test_a_continuous_clock_has_the_same_offsets(step_s: float) -> None:
     np.testing.assert_allclose(covariance, expected, atol=1e-12 * expected[0, 0])
 
 
+def test_no_continuous_clock_has_the_offsets_of_what_is_no_step() -> None:
+    for step_s in (0.0, -0.1, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match=f"step_s must be finite and > 0 s, got {step_s}"):
+            ClockModel().densities(step_s)
+    with pytest.raises(ValueError, match=r"beta must be 1, got 0\.9"):
+        ClockModel(beta=0.9).densities(0.1)
+
+
 def test_bad_model_is_refused() -> None:
     with pytest.raises(ValueError, match="drift_sd"):
         ClockModel(drift_sd=-1.0)

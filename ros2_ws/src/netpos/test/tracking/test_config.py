@@ -69,6 +69,7 @@ def test_mapping_takes_what_yaml_writes() -> None:
         ({"hold_s": None}, "hold_s must be of type float, got None"),
         ({"require_initial_pose": 2}, "require_initial_pose must be true or false, got 2"),
         ({"hold_s": -1}, "hold_s must be in"),
+        ({"hold_s": True}, "hold_s must be of type float, got True"),
         ({"max_rejected_epochs": 2.5}, "max_rejected_epochs must be of type int, got 2.5"),
     ],
 )

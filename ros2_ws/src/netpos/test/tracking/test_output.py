@@ -6,8 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from netpos.messages.values import Array, TrackState
 from netpos.tracking import TrackerConfig, output
 from netpos.tracking.protection import protection_level
@@ -105,24 +103,6 @@ def test_clock_state_in_seconds() -> None:
     assert clock.offset_s == pytest.approx(30.0 / speed_of_light, rel=1e-14)
     assert clock.drift == pytest.approx(0.5 / speed_of_light, rel=1e-14)
     np.testing.assert_allclose(clock.cov, cov[4:6, 4:6] / speed_of_light**2, rtol=1e-14)
-
-
-@settings(max_examples=200, deadline=None)
-@given(*[st.floats(-1e6, 1e6)] * 3)
-def test_eigenvalues_of_any_symmetric_matrix(xx: float, xy: float, yy: float) -> None:
-    scale = max(abs(xx), abs(xy), abs(yy))
-    expected = np.linalg.eigvalsh(np.array([[xx, xy], [xy, yy]]))
-    np.testing.assert_allclose(
-        output.eigenvalues(xx, xy, yy), expected, atol=1e-14 * scale + 1e-150
-    )
-
-
-def test_a_small_eigenvalue_beside_a_large_one_keeps_its_digits() -> None:
-    """Of R diag(1, 1e-9) R', with R a turn by 0.3 rad."""
-    c, s, small = math.cos(0.3), math.sin(0.3), 1e-9
-    matrix = c * c + s * s * small, c * s * (1 - small), s * s + c * c * small
-    found = output.eigenvalues(*matrix)
-    np.testing.assert_allclose(found, [small, 1.0], rtol=1e-6)
 
 
 def test_largest_sd() -> None:

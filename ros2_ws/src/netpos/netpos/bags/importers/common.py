@@ -42,6 +42,13 @@ class Row:
             raise self.error(f"{name} is {value}, not finite")
         return value
 
+    def positive(self, column: int, name: str) -> float:
+        """A number of metres above 0; BagError otherwise."""
+        value = self.number(column, name)
+        if value <= 0:
+            raise self.error(f"{name} {value} m is not positive")
+        return value
+
     def integer(self, column: int, name: str) -> int:
         """A whole number that is not negative; BagError otherwise."""
         try:
@@ -51,6 +58,32 @@ class Row:
         if value < 0:
             raise self.error(f"{name} {value} is negative")
         return value
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RangeErrors:
+    """Error model of ranges: white noise of some correlation time, a bias of each RSU and one that
+    those of a network share."""
+
+    range_sd_m: float
+    noise_correlation_time_s: float
+    range_bias_sd_m: float
+    bias_correlation_time_s: float
+    common_range_bias_sd_m: float
+    common_bias_correlation_time_s: float
+
+    def declared(self, rsu_id: str, position: Sequence[float], network: str = "") -> RsuInfo:
+        """An RSU that says so."""
+        return RsuInfo(
+            rsu_id=rsu_id,
+            position=np.array(position),
+            network=network,
+            range_bias_sd_m=self.range_bias_sd_m,
+            bias_correlation_time_s=self.bias_correlation_time_s,
+            common_range_bias_sd_m=self.common_range_bias_sd_m,
+            common_bias_correlation_time_s=self.common_bias_correlation_time_s,
+            noise_correlation_time_s=self.noise_correlation_time_s,
+        )
 
 
 def read_rows(file: Path, columns: int, *, header: bool) -> Iterator[Row]:

@@ -9,14 +9,13 @@ within 3 deg in the median while the tag moves.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import yaml
 
 from netpos.bags.errors import BagError
-from netpos.bags.importers.common import read_rows, truth_of_poses, write_recording
+from netpos.bags.importers.common import RangeErrors, read_rows, truth_of_poses, write_recording
 from netpos.messages.values import Field, Odometry, RsuInfo, RsuMeasurement
 
 # The two anchors above each other (1.97 m and 0.5 m) tell the tag's height from the ranges alone;
@@ -31,25 +30,21 @@ TRACKER = {
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RangeErrors:
-    """Error model of one anchor.
-
-    Found without the truth: range sd and its correlation time from the difference of the two
-    anchors above each other, the anchors' own biases from its mean. What all anchors share (the
-    tag's antenna delay, received power) does not show in differences: 0.15 m is a prior.
-    """
-
-    range_sd_m: float = 0.04
-    range_bias_sd_m: float = 0.02
-    bias_correlation_time_s: float = 60.0
-    common_range_bias_sd_m: float = 0.15
-    common_bias_correlation_time_s: float = 20.0
-    noise_correlation_time_s: float = 1.0
+# Found without the truth: range sd and its correlation time from the difference of the two
+# anchors above each other, the anchors' own biases from its mean. What all anchors share (the
+# tag's antenna delay, received power) does not show in differences: 0.15 m is a prior.
+ERRORS = RangeErrors(
+    range_sd_m=0.04,
+    noise_correlation_time_s=1.0,
+    range_bias_sd_m=0.02,
+    bias_correlation_time_s=60.0,
+    common_range_bias_sd_m=0.15,
+    common_bias_correlation_time_s=20.0,
+)
 
 
 def import_uwb_anchors(
-    path: Path, bag: Path, *, vue_id: str = "vue_1", errors: RangeErrors | None = None
+    path: Path, bag: Path, *, vue_id: str = "vue_1", errors: RangeErrors = ERRORS
 ) -> dict[str, int]:
     """Write one recording as a bag: /rsu/info, /rsu/measurements, /VUE/ground_truth (8 Hz).
 
@@ -62,7 +57,7 @@ def import_uwb_anchors(
     BagError  missing folder or file, or a line that cannot be understood
     FileExistsError  ``bag`` exists
     """
-    path, errors = Path(path), errors or RangeErrors()
+    path = Path(path)
     if not path.is_dir():
         raise BagError(f"{path} is not a folder; give the LOS or NLOS folder of the recording")
     files = sorted(path.glob("A*.csv"), key=lambda file: (len(file.stem), file.stem))
@@ -81,16 +76,13 @@ def import_uwb_anchors(
 
 
 def _anchor(file: Path, vue_id: str, errors: RangeErrors) -> tuple[RsuInfo, list[RsuMeasurement]]:
-    position: tuple[float, ...] | None = None
+    position: tuple[float, ...] = ()
     ranges: list[RsuMeasurement] = []
     for row in read_rows(file, 9, header=True):
         here = tuple(row.number(3 + axis, f"anchor {name}") for axis, name in enumerate("xyz"))
         position = position or here
         if here != position:
             raise row.error(f"anchor moved from {position} to {here}")
-        distance = row.number(6, "distance")
-        if distance <= 0:
-            raise row.error(f"distance {distance} m is not positive")
         ranges.append(
             RsuMeasurement(
                 stamp_ns=row.integer(1, "stamp"),
@@ -98,20 +90,11 @@ def _anchor(file: Path, vue_id: str, errors: RangeErrors) -> tuple[RsuInfo, list
                 vue_id=vue_id,
                 fields=Field.RANGE,
                 rssi_dbm=row.number(7, "RSSI"),
-                range_m=distance,
+                range_m=row.positive(6, "distance"),
                 range_var=errors.range_sd_m**2,
             )
         )
-    info = RsuInfo(
-        rsu_id=file.stem,
-        position=np.array(position),
-        range_bias_sd_m=errors.range_bias_sd_m,
-        bias_correlation_time_s=errors.bias_correlation_time_s,
-        common_range_bias_sd_m=errors.common_range_bias_sd_m,
-        common_bias_correlation_time_s=errors.common_bias_correlation_time_s,
-        noise_correlation_time_s=errors.noise_correlation_time_s,
-    )
-    return info, ranges
+    return errors.declared(file.stem, position), ranges
 
 
 def _truth(file: Path, vue_id: str) -> list[Odometry]:

@@ -9,7 +9,6 @@ quaternion's columns the second and third are w and z. The time zone is unknown:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -17,7 +16,13 @@ import numpy as np
 import yaml
 
 from netpos.bags.errors import BagError
-from netpos.bags.importers.common import Row, read_rows, truth_of_poses, write_recording
+from netpos.bags.importers.common import (
+    RangeErrors,
+    Row,
+    read_rows,
+    truth_of_poses,
+    write_recording,
+)
 from netpos.messages.values import Field, Odometry, RsuInfo, RsuMeasurement
 
 ANCHORS_M = (
@@ -50,28 +55,24 @@ _TRUTH_INTERVAL_NS = 50_000_000  # stamps jitter by milliseconds: no velocity fr
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LinkErrors:
-    """Error model of one link, anchor to tag.
-
-    Found without the truth, from a fit of poses and one constant per link to the distances alone.
-    The constants are mostly the anchors' (mean 0.17 m, scatter 0.06 m, of the tags of one anchor
-    0.03 m): the common bias is that of the three links of one anchor and lasts. The residuals (sd
-    0.07 m) have an autocorrelation of 0.62 after one sample, 0.47 after 0.1 s and then
-    0.45 exp(-t / 1.6 s). The slow part and the links' own scatter are the own bias; the fast part,
-    0.052 m, has a spectral density at 0 of about 0.05 to 0.1 s times its variance.
-    """
-
-    range_sd_m: float = 0.055
-    noise_correlation_time_s: float = 0.1
-    range_bias_sd_m: float = 0.05
-    bias_correlation_time_s: float = 2.0
-    common_range_bias_sd_m: float = 0.2
-    common_bias_correlation_time_s: float = 300.0
+# Of one link, anchor to tag; found without the truth, from a fit of poses and one constant per
+# link to the distances alone. The constants are mostly the anchors' (mean 0.17 m, scatter 0.06 m,
+# of the tags of one anchor 0.03 m): the common bias is that of the links of one anchor and lasts.
+# The residuals (sd 0.07 m) have an autocorrelation of 0.62 after one sample, 0.47 after 0.1 s and
+# then 0.45 exp(-t / 1.6 s). The slow part and the links' own scatter are the own bias; the fast
+# part, 0.052 m, has a spectral density at 0 of about 0.05 to 0.1 s times its variance.
+ERRORS = RangeErrors(
+    range_sd_m=0.055,
+    noise_correlation_time_s=0.1,
+    range_bias_sd_m=0.05,
+    bias_correlation_time_s=2.0,
+    common_range_bias_sd_m=0.2,
+    common_bias_correlation_time_s=300.0,
+)
 
 
 def import_uwb_trolley(
-    path: Path, bag: Path, *, vue_id: str = "vue_1", errors: LinkErrors | None = None
+    path: Path, bag: Path, *, vue_id: str = "vue_1", errors: RangeErrors = ERRORS
 ) -> dict[str, int]:
     """Write the recording as a bag: /rsu/info, /rsu/measurements, /VUE/ground_truth (20 Hz).
 
@@ -87,7 +88,7 @@ def import_uwb_trolley(
     BagError  missing folder or file, or a line that cannot be understood
     FileExistsError  ``bag`` exists
     """
-    path, errors = Path(path), errors or LinkErrors()
+    path = Path(path)
     if not path.is_dir():
         raise BagError(f"{path} is not a folder; give the folder with UWB_*.csv")
     measurements = _ranges(_only(path, "UWB_*.csv"), vue_id, errors)
@@ -114,24 +115,15 @@ def _stamp_ns(row: Row) -> int:
     return (when - _EPOCH) // timedelta(microseconds=1) * 1000
 
 
-def _links(errors: LinkErrors) -> list[RsuInfo]:
+def _links(errors: RangeErrors) -> list[RsuInfo]:
     return [
-        RsuInfo(
-            rsu_id=f"a{anchor}_t{tag}",
-            position=np.array(position),
-            network=f"a{anchor}",
-            range_bias_sd_m=errors.range_bias_sd_m,
-            bias_correlation_time_s=errors.bias_correlation_time_s,
-            common_range_bias_sd_m=errors.common_range_bias_sd_m,
-            common_bias_correlation_time_s=errors.common_bias_correlation_time_s,
-            noise_correlation_time_s=errors.noise_correlation_time_s,
-        )
+        errors.declared(f"a{anchor}_t{tag}", position, network=f"a{anchor}")
         for anchor, position in enumerate(ANCHORS_M)
         for tag in range(len(TAGS_M))
     ]
 
 
-def _ranges(file: Path, vue_id: str, errors: LinkErrors) -> list[RsuMeasurement]:
+def _ranges(file: Path, vue_id: str, errors: RangeErrors) -> list[RsuMeasurement]:
     measurements: list[RsuMeasurement] = []
     last_ns = -1
     for row in read_rows(file, 1 + len(ANCHORS_M) * len(TAGS_M), header=False):
@@ -143,16 +135,13 @@ def _ranges(file: Path, vue_id: str, errors: LinkErrors) -> list[RsuMeasurement]
             anchor, tag = divmod(link, len(TAGS_M))
             if not row.values[1 + link].strip():
                 continue
-            distance = row.number(1 + link, f"distance a{anchor}-t{tag}")
-            if distance <= 0:
-                raise row.error(f"distance a{anchor}-t{tag} {distance} m is not positive")
             measurements.append(
                 RsuMeasurement(
                     stamp_ns=stamp_ns,
                     rsu_id=f"a{anchor}_t{tag}",
                     vue_id=vue_id,
                     fields=Field.RANGE,
-                    range_m=distance,
+                    range_m=row.positive(1 + link, f"distance a{anchor}-t{tag}"),
                     range_var=errors.range_sd_m**2,
                     lever_arm=TAGS_M[tag],
                 )

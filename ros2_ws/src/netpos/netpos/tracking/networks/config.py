@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from netpos.filters.intersection import METHODS
-from netpos.tracking.parameters import check_fields, choice, from_mapping, real
+from netpos.parameters import check_fields, choice, from_mapping, real
 
 ASSOCIATIONS = ("motion", "names")
 

@@ -1,0 +1,98 @@
+"""Parameters as fields of a dataclass: ranges, words and sentences in their metadata, from which
+nodes describe them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import field, fields
+from typing import Any, TypeVar
+
+Config = TypeVar("Config")
+
+_LEAST = 1e-9
+
+
+def real(default: float, low: float, high: float, text: str) -> Any:
+    """A number of a configuration, with its range and a sentence."""
+    return field(default=default, metadata={"low": low, "high": high, "text": text})
+
+
+def positive(default: float, text: str) -> Any:
+    """A number above 0 whose size nothing else limits."""
+    return real(default, _LEAST, 1.0 / _LEAST, text)
+
+
+def not_negative(default: float, text: str) -> Any:
+    """A number not below 0 whose size nothing else limits."""
+    return real(default, 0.0, 1.0 / _LEAST, text)
+
+
+def count(default: int, text: str) -> Any:
+    """A whole number from 1 on."""
+    return field(default=default, metadata={"low": 1, "high": 10000, "text": text})
+
+
+def described(default: bool | str | tuple[float, ...], text: str) -> Any:
+    """A switch, a name, or as many finite numbers as the default has."""
+    return field(default=default, metadata={"text": text})
+
+
+def choice(default: str, choices: tuple[str, ...], text: str) -> Any:
+    """A word of a configuration, with the words allowed and a sentence."""
+    return field(default=default, metadata={"choices": choices, "text": text})
+
+
+def check_fields(config: Any, prefix: str = "") -> None:
+    """Raises ``ValueError`` naming, after ``prefix``, the first field out of its range or
+    words."""
+    for entry in fields(config):
+        name, value = prefix + entry.name, getattr(config, entry.name)
+        choices = entry.metadata.get("choices")
+        if choices is not None and value not in choices:
+            raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
+        if "low" in entry.metadata:
+            low, high = entry.metadata["low"], entry.metadata["high"]
+            if not (math.isfinite(value) and low <= value <= high):
+                raise ValueError(f"{name} must be in [{low:g}, {high:g}], got {value!r}")
+        if isinstance(entry.default, tuple):
+            size = len(entry.default)
+            if len(value) != size or not all(map(math.isfinite, value)):
+                raise ValueError(f"{name} must be {size} finite numbers, got {value}")
+
+
+def from_mapping(config: type[Config], values: Mapping[str, Any], what: str) -> Config:
+    """A configuration of named values over its defaults; raises ``ValueError`` for a name that
+    does not exist."""
+    known = {entry.name for entry in fields(config)}  # type: ignore[arg-type]
+    unknown = sorted(set(values) - known)
+    if unknown:
+        names = ", ".join(entry.name for entry in fields(config))  # type: ignore[arg-type]
+        raise ValueError(f"unknown {what} parameter {unknown[0]!r}; the parameters are {names}")
+    plain = config()
+    return config(**{name: typed(name, getattr(plain, name), v) for name, v in values.items()})
+
+
+def typed(name: str, default: Any, value: Any) -> Any:
+    """``value`` in the type of the default; YAML writes 1 for 1.0 and 1e-4 for a string.
+
+    Raises ``ValueError`` naming the parameter.
+    """
+    if isinstance(default, bool):
+        if isinstance(value, bool):
+            return value
+        if str(value).lower() in {"true", "false"}:
+            return str(value).lower() == "true"
+        raise ValueError(f"{name} must be true or false, got {value!r}")
+    kind = type(default)
+    try:
+        if isinstance(value, bool) or (kind is tuple and isinstance(value, str)):
+            raise ValueError(value)
+        if kind is tuple:
+            return tuple(typed(name, 0.0, number) for number in value)
+        made = kind(value)
+        if kind is int and made != float(value):
+            raise ValueError(value)
+        return made
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be of type {kind.__name__}, got {value!r}") from None
