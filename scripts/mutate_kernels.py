@@ -59,10 +59,11 @@ EQUIVALENT = {
     ("bearing", "fuse_bearing", "operator swapped: high - low"),  # nearer still than it has to be
     ("bearing", "fuse_bearing", "operator swapped: reach - 0.5 * a[0]"),  # ends beyond all weight
     ("measurement", "wrap", "operator swapped: angle + math.pi"),  # a whole turn away
-    ("srukf", "fuse", "left out: continue"),
+    ("srukf", "_eliminate", "left out: continue"),
     ("sigma", "_regress", "left out: E[i, n] *= _SHIFT_WEIGHT"),  # is 1
     ("sigma", "_regress", "operator swapped: E[i, n] *= _SHIFT_WEIGHT"),
     ("ekf", "_passes", "operator swapped: stop - start"),
+    ("manoeuvre", "unnoticed_s", "operator swapped: xy += h[0] * h[1] / variance"),  # its mirror
     ("error_state", "correct", "left out: posterior = cov"),  # set anew by the first iteration
     *(  # starts lie symmetrically around
         (
