@@ -14,9 +14,9 @@ import math
 from collections import deque
 
 import numpy as np
-from scipy.special import chdtri
 
 from netpos.filters import ekf
+from netpos.filters.chi_square import chi_square_bound
 from netpos.filters.compile import kernel
 from netpos.filters.fit import misfit
 from netpos.filters.measurement import (
@@ -161,7 +161,7 @@ class Initialiser:
 
     def _consistent(self, fit: tuple[float, Array, Array], rows: int) -> bool:
         """Whether the cost of a fit is one that true measurements have."""
-        return bool(fit[0] <= chdtri(rows, 1.0 - self._config.gate_probability))
+        return bool(fit[0] <= chi_square_bound(rows, 1.0 - self._config.gate_probability))
 
     def _without_one(self, rows: Array, ages: Array) -> list[tuple[float, Array, Array]]:
         """Consistent fits without one of the RSUs, best first; none of fewer than three RSUs."""

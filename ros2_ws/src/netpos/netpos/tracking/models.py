@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import chdtri
 
+from netpos.filters.chi_square import chi_square_bound
 from netpos.filters.motion import (
     SPEED_OF_LIGHT_MPS,
     Model,
@@ -24,8 +24,8 @@ FILTER_ITERATIONS = {"ekf": 1, "iekf": 8}
 def gate_thresholds(probability: float) -> Array:
     """Largest accepted squared Mahalanobis distance for 0, 1, ... degrees of freedom (chi-square
     quantiles)."""
-    thresholds: Array = np.append(0.0, chdtri(np.arange(1, GATE_SIZE), 1.0 - probability))
-    return thresholds
+    bounds = [chi_square_bound(dof, 1.0 - probability) for dof in range(1, GATE_SIZE)]
+    return np.array([0.0, *bounds])
 
 
 def options_of(config: TrackerConfig) -> Array:

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from functools import lru_cache
 
 import numpy as np
-from scipy.special import chdtri
 
+from netpos.filters.chi_square import chi_square_bound
 from netpos.filters.compile import kernel, leaf
 from netpos.filters.factor import eigenvalues
 from netpos.filters.fusion import W_GAIN, fuse
@@ -103,11 +102,6 @@ def radius_of(cov2: Array, risk: float) -> float:
     return math.nan
 
 
-@lru_cache(1024)
-def _bound(dof: int, tail: float) -> float:
-    return float(chdtri(dof, tail))
-
-
 class NisWindow:
     """Factor on the sd from the NIS of the last epochs.
 
@@ -140,7 +134,7 @@ class NisWindow:
     def inflation(self) -> float:
         """Factor on the sd, >= 1."""
         dof, nis = self._dof, sum(self._nis)
-        if dof == 0 or nis <= _bound(dof, self._tail):
+        if dof == 0 or nis <= chi_square_bound(dof, self._tail):
             return 1.0
         return math.sqrt(nis / dof)
 

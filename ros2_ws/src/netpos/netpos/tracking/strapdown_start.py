@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import chdtri
 
+from netpos.filters.chi_square import chi_square_bound
 from netpos.filters.measurement import BIAS, COMMON, GROUP, KIND, LEVER, VARIANCE, Kind
 from netpos.filters.position_fix import FixStatus, fix_position, start_of
 from netpos.filters.space import linearise_in_space
@@ -183,5 +183,5 @@ def _misfit(rows: Array, position: Array) -> tuple[float, float, int]:
     if times.any():
         residual[times] -= np.average(residual[times], weights=weight[times])
     dof = len(rows) - (4 if times.any() else 3)
-    limit = float(chdtri(dof, _FALSE_ALARM)) if dof > 0 else math.inf
+    limit = chi_square_bound(dof, _FALSE_ALARM) if dof > 0 else math.inf
     return float(weight @ residual**2), limit, dof

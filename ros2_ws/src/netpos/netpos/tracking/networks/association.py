@@ -18,8 +18,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
-from scipy.special import chdtri
 
+from netpos.filters.chi_square import chi_square_bound
 from netpos.messages.values import Array
 from netpos.tracking.networks.common_instant import Moved
 from netpos.tracking.networks.config import FusionConfig
@@ -37,11 +37,7 @@ class PairScores:
 
     def __init__(self, config: FusionConfig) -> None:
         self._memory_s = config.memory_s
-        self._gate = (
-            float(chdtri(_DOF, 1.0 - config.gate_probability))
-            if config.gate_probability < 1.0
-            else np.inf
-        )
+        self._gate = chi_square_bound(_DOF, 1.0 - config.gate_probability)
         self._weight: Array = np.zeros((0, 0))  # remembered time [s]
         self._distance: Array = np.zeros((0, 0))  # times the mean squared distance
         self._cost: Array = np.zeros((0, 0))  # times the mean -2 ln likelihood
