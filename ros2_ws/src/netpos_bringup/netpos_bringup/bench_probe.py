@@ -2,7 +2,8 @@
 
 ``latency``  measurement to odometry, tracker and relay in turns
 ``load``     many devices: messages handled, processor time, lag, memory
-``ready``    time from the start of the process to the first odometry
+``ready``    time from the start of the process until it takes measurements, and to the first
+             odometry
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ _APART_S = 0.002  # between the measurements of two RSUs, and before the next ep
 _POLL_S = 0.002
 _ATTEMPT_S = 0.01
 _SETTLE_S = 2.0
+_READY_WORDS = "tracking vue_1"
 _STAMP = struct.Struct("<iI")  # the first field of a serialised message with a header
 
 
@@ -332,16 +334,19 @@ def handled_messages(diagnostics: Subscription, sent: int) -> int:
 
 
 def ready(tracker: str, starts: int) -> dict[str, Any]:
-    """Start the tracker and send measurements until it answers with an odometry."""
+    """Start the tracker and send measurements until it answers with an odometry; ``ready_s``: when
+    it says that it tracks."""
     probe, device = Probe(), Device.draw("vue_1", 1)
     answer = probe.listen(Odometry, topics.of_vue("vue_1", topics.ODOMETRY))
     poses = probe.pose_publisher("vue_1")
     attempts = range(round(_START_S / _ATTEMPT_S))
-    seconds, cpu, memory = [], [], 0.0
-    for _ in range(starts):
+    ready_s, seconds, cpu, memory = [], [], [], 0.0
+    for start in range(starts):
         begin = time.perf_counter()
         with started([tracker]) as (process,):
             for epoch in attempts:
+                if len(ready_s) == start and process.has_said(_READY_WORDS):
+                    ready_s.append(time.perf_counter() - begin)
                 poses.publish(device.pose(epoch))
                 for measurement in device.measurements(epoch):
                     probe.tracker.publish(measurement)
@@ -356,7 +361,9 @@ def ready(tracker: str, starts: int) -> dict[str, Any]:
                 raise TimeoutError(f"no odometry within {_START_S:g} s")
         for _ in taken(answer):
             pass
-    return {"ready_s": seconds, "cpu_s": cpu, "memory_mb": memory}
+        if len(ready_s) == start:
+            raise RuntimeError(f"the tracker answered and never said {_READY_WORDS!r}")
+    return {"ready_s": ready_s, "odometry_s": seconds, "cpu_s": cpu, "memory_mb": memory}
 
 
 def main() -> int:

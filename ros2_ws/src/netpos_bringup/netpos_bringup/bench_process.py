@@ -46,6 +46,10 @@ class Measured:
             text = self._log.read_text(encoding="utf-8", errors="replace")[-2000:]
             raise RuntimeError(f"{self._name} ended early:\n{text}")
 
+    def has_said(self, words: str) -> bool:
+        """Whether its output holds ``words`` by now."""
+        return words in self._log.read_text(encoding="utf-8", errors="replace")
+
     def cpu_s(self) -> float:
         """Processor time of all its threads so far, user and system."""
         stat = Path(f"/proc/{self._popen.pid}/stat").read_text(encoding="ascii")

@@ -124,11 +124,17 @@ def test_quadratic_cost_is_not_ok(prefix: Prefix) -> None:
 
 
 def test_ready_takes_the_median(prefix: Prefix) -> None:
-    figures = {"ready_s": [9.0, 1.0, 1.5], "cpu_s": [1.2, 0.8, 0.9], "memory_mb": 251.0}
+    figures = {
+        "ready_s": [9.0, 1.0, 1.5],
+        "odometry_s": [9.1, 2.5, 1.6],
+        "cpu_s": [1.2, 0.8, 0.9],
+        "memory_mb": 251.0,
+    }
     prefix.answers({"ready": figures})
-    ready, memory = as_rows(ready_rows(quick=True))
+    ready, odometry, memory = as_rows(ready_rows(quick=True))
     assert (ready.ours, ready.ratio, ready.ok) == (1.5, 0.75, True)
     assert "9.00, 1.00, 1.50 s; 0.80 s of processor time" in ready.note
+    assert (odometry.ours, odometry.ok) == (2.5, False)
     assert not memory.ok
 
 
