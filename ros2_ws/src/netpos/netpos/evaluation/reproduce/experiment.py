@@ -13,7 +13,7 @@ from netpos.evaluation.bounds import bound_covariances
 from netpos.evaluation.metrics import NS
 from netpos.evaluation.reproduce.integrity import protection_levels
 from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
-from netpos.filters.motion import N_CORE, NO_BIAS, SPEED_OF_LIGHT_MPS
+from netpos.filters.motion import N_CORE, SPEED_OF_LIGHT_MPS
 from netpos.messages.values import Array, ImuSample
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.simulation import Beacons
@@ -31,12 +31,17 @@ VUE = "vue_1"
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Experiment:
     """A scenario with single values changed before validation, as ``load_scenario`` takes them,
-    and settings of the tracker over the scenario's own."""
+    and settings of the tracker over the scenario's own.
+
+    start_drawn: the filter starts not where the scenario says but off the truth by a draw from its
+    own start covariance, as its bound takes for granted.
+    """
 
     name: str
     scenario: str
     changes: tuple[tuple[str, object], ...] = ()
     tracker: tuple[tuple[str, object], ...] = ()
+    start_drawn: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,11 +83,6 @@ class Setup:
     """What all seeds of an experiment share."""
 
     def __init__(self, experiment: Experiment) -> None:
-        """
-        Raises
-        ------
-        ValueError  the tracker's motion models interact
-        """
         scenario = load_scenario(experiment.scenario, changes=dict(experiment.changes))
         self.simulation = Simulation(scenario)
         """Under the scenario's own seed."""
@@ -91,8 +91,7 @@ class Setup:
         self._options = options_of(self.config)
         self._extra_sd = initial_extra_sd(self.config)
         self._motions = motions_of(self.config)
-        if len(self._motions) > 1:
-            raise ValueError(f"{experiment.name}: interacting motion models are not supported")
+        self._start_drawn = experiment.start_drawn
 
     def run(self, seed: int) -> Track:
         """Simulate, estimate and bound one seed.
@@ -105,17 +104,22 @@ class Setup:
         simulation = self.simulation.with_seed(seed)
         mean, cov = self._start(simulation)
         heard, epochs = self._epochs(simulation)
+        prior = self._grown(mean, cov, epochs)[1]
+        truth = _truth(simulation.beacons(VUE), heard, len(prior))
+        if self._start_drawn:
+            mean = np.random.default_rng([seed, 1]).multivariate_normal(truth[0, :N_CORE], cov)
         if self.config.use_imu:
             if epochs.bias.size:
                 raise ValueError(
                     "an inertial motion model takes no RSU biases here; undeclare them"
                 )
-            done, *filled, motions = self._driven(epochs, mean, cov, simulation.imu(VUE))
+            done, *filled, motions = self._stepped(epochs, mean, cov, simulation.imu(VUE))
+        elif self.config.motion_model == "interacting":
+            done, *filled, _ = self._stepped(epochs, mean, cov, None)
+            motions = self._motions[1:2]  # straight on: bound and level know one model
         else:
             done, *filled = self._compiled(epochs, mean, cov)
             motions = self._motions
-        prior = self._grown(mean, cov, epochs)[1]
-        truth = _truth(simulation.beacons(VUE), heard, len(prior))
         height_m, risk = self.config.device_height_m, self.config.integrity_risk
         bound = bound_covariances(*epochs[:3], truth, prior, height_m, motions, epochs.bias)
         means, covs, nis, dof, taken = (array[:done] for array in filled)
@@ -168,29 +172,32 @@ class Setup:
         """The start with the motion model's own states and the biases."""
         return grown(mean, cov, np.append(self._extra_sd, epochs.bias[0]))
 
-    def _driven(
-        self, epochs: Epochs, mean: Array, cov: Array, samples: list[ImuSample]
+    def _stepped(
+        self, epochs: Epochs, mean: Array, cov: Array, samples: list[ImuSample] | None
     ) -> tuple[int, Array, Array, Array, Array, Array, Array]:
-        """As ``_compiled``, epoch by epoch with the IMU between them; also the motions
-        (N, Parameter) with its increments. Without biases."""
+        """As ``_compiled``, epoch by epoch; also the motions (N, Parameter). The IMU's samples
+        drive the filter between them (None: no IMU)."""
         imu = ImuBuffer()
-        for sample in samples:
+        for sample in samples or ():
             imu.add(sample)
         count, config = epochs.stamps_ns.size, self.config
-        filled = _room(count, mean.size + self._extra_sd.size)
+        mean, cov = self._grown(mean, cov, epochs)
+        filled = _room(count, mean.size)
         means, covs, nis, dof, groups = filled
         motions = np.tile(self._motions[0], (count, 1))
         heard_ns = int(epochs.stamps_ns[0])
         estimate = estimates.start(config, heard_ns, mean, cov)
         rejected = 0
         for k, stamp in enumerate(epochs.stamps_ns.tolist()):
-            yaw, speed, _ = imu.increments(estimate.stamp_ns, stamp)
-            estimate.drive(yaw, speed, config.gyro_noise_density)
+            if samples is not None:
+                yaw, speed, _ = imu.increments(estimate.stamp_ns, stamp)
+                estimate.drive(yaw, speed, config.gyro_noise_density)
             rows = epochs.rows[epochs.row_start[k] : epochs.row_start[k + 1]].copy()
             unheard_s = (stamp - heard_ns) / NS
-            nis[k], dof[k], taken = estimate.step(stamp, unheard_s, rejected, rows, NO_BIAS)
-            means[k], covs[k], motions[k] = estimate.mean, estimate.cov, estimate.motion
-            groups[k] = taken.sum()
+            nis[k], dof[k], taken = estimate.step(stamp, unheard_s, rejected, rows, epochs.bias)
+            means[k], covs[k], groups[k] = estimate.mean, estimate.cov, taken.sum()
+            if samples is not None:
+                motions[k] = estimate.motion
             rejected = 0 if 2 * taken.sum() >= taken.size else rejected + 1
             heard_ns = stamp if dof[k] else heard_ns
             if rejected >= config.max_rejected_epochs:

@@ -7,6 +7,7 @@ fokin2020:eq.32, 33 ask for.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -85,14 +86,31 @@ RSU_CLOCKS = tuple(
 _POSE = (("devices.0.initial_pose_sd_m", 5.0),)
 FIG_5_SLOW = Experiment(name="Fig. 5, T = 0.1 s", scenario="fast_pass", changes=_POSE)
 FIG_5_FAST = Experiment(name="Fig. 5, T = 0.01 s", scenario="fast_pass_100hz", changes=_POSE)
+FIG_5_DRAWN = tuple(
+    replace(
+        experiment, name=f"{experiment.name}, start drawn from its covariance", start_drawn=True
+    )
+    for experiment in (FIG_5_SLOW, FIG_5_FAST)
+)
 
 _WITH_IMU = (("motion_model", "inertial"),)
 _WITHOUT_IMU = (("motion_model", "constant_velocity"),)
-# Per d_los: without the inertial sensor, and bridging with it.
+_TOLD = (  # the settings of metis_madrid for 3 m/s: it keeps its speed, its turns are manoeuvres
+    *_WITHOUT_IMU,
+    ("process_noise", "continuous"),
+    ("accel_density_mps2_sqrthz", 0.1),
+    ("manoeuvre_speed_sd_mps", 3.0 * math.sqrt(2.0)),
+)
+# Per d_los: the paper's filter, which knows of no turn; one that is told; and
+# bridging with the inertial sensor.
 FIG_6 = tuple(
-    (
-        Experiment(name=f"Fig. 6, d_los = {d_los_m} m", scenario=scenario, tracker=_WITHOUT_IMU),
-        Experiment(name=f"Fig. 6, d_los = {d_los_m} m, IMU", scenario=scenario, tracker=_WITH_IMU),
+    tuple(
+        Experiment(name=f"Fig. 6, d_los = {d_los_m} m{label}", scenario=scenario, tracker=tracker)
+        for label, tracker in (
+            ("", _WITHOUT_IMU),
+            (", turns told", _TOLD),
+            (", IMU", _WITH_IMU),
+        )
     )
     for d_los_m, scenario in ((40, "intersection_turn"), (30, "intersection_turn_30m"))
 )
@@ -110,6 +128,7 @@ def reproduce(work: Work) -> Outcome:
     wander = monte_carlo(work, WANDER)
     clocks = [monte_carlo(work, e) for e in RSU_CLOCKS]
     fast = [monte_carlo(work, e, series=True) for e in (FIG_5_SLOW, FIG_5_FAST)]
+    drawn = [monte_carlo(work, e) for e in FIG_5_DRAWN]
     turns = [[monte_carlo(work, e, series=True) for e in variants] for variants in FIG_6]
     rows = [
         *(
@@ -117,9 +136,10 @@ def reproduce(work: Work) -> Outcome:
             for summary, (_, rmse_m, clock_sd_ns) in zip(metis, targets, strict=True)
             for row in _on_metis(summary, rmse_m, clock_sd_ns)
         ),
-        *_wander(wander),
+        *_near_its_bound(wander),
         *_rsu_clocks(clocks[0], clocks[1]),
         *_fast_pass(fast[0], fast[1]),
+        *(row for summary in drawn for row in _near_its_bound(summary)),
         *(row for variants in turns for row in _turn(variants)),
         *_line_of_sight(),
         *(row for summary in (metis[0], fast[1]) for row in _priority_passage(summary)),
@@ -156,7 +176,8 @@ def _on_metis(summary: Summary, rmse_m: float, clock_sd_ns: float) -> Iterator[R
         yield required(share, "1", rate, rate == 0.0)
 
 
-def _wander(summary: Summary) -> Iterator[Row]:
+def _near_its_bound(summary: Summary) -> Iterator[Row]:
+    """Where truth and start are as the filter, and so its bound, assumes."""
     name, ratio = summary.experiment.name, summary.bound_ratio
     yield shown(f"{name}: RMSE", "m", summary.rmse_m)
     yield from _common(summary)
@@ -196,8 +217,9 @@ def _fast_pass(slow: Summary, fast: Summary) -> Iterator[Row]:
         yield shown(f"{name}: updates until within 1 m", "1", _updates_to_converge(summary), 20.0)
         yield shown(f"{name}: clock offset sd", "ns", summary.clock_sd_ns)
         yield from _common(summary)
-        ratio = summary.bound_ratio
-        yield required(f"{name}: RMSE over bound", "1", ratio, ratio <= BOUND_RATIO_MAX)
+        # The bound is an average over starts drawn from the filter's; this one is always 42 m/s.
+        label = f"{name}: RMSE over the bound of a start drawn from its covariance"
+        yield shown(label, "1", summary.bound_ratio)
     ratio = between[0] / between[1]
     yield required("Fig. 5: RMSE at T = 0.1 s over that at 0.01 s", "1", ratio, ratio > 1.0)
 

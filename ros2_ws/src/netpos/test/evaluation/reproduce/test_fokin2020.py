@@ -91,6 +91,25 @@ def test_the_inertial_sensor_bridges_the_turn(result: Reproduction, d_los_m: int
     assert (without.ok, bridged.ok) == (None, True)
 
 
+@pytest.mark.parametrize("d_los_m", [40, 30])
+def test_a_filter_that_knows_of_turns_turns(result: Reproduction, d_los_m: int) -> None:
+    name = f"Fig. 6, d_los = {d_los_m} m"
+    straight = _row(result, f"{name}: RMSE from the turn on")
+    turning = _row(result, f"{name}, turns told: RMSE from the turn on")
+    assert straight.ours is not None
+    assert turning.ours is not None
+    assert turning.ours < straight.ours
+
+
+@pytest.mark.parametrize("interval", ["0.1", "0.01"])
+def test_a_drawn_start_reaches_its_bound(result: Reproduction, interval: str) -> None:
+    name = f"Fig. 5, T = {interval} s, start drawn from its covariance: RMSE over bound"
+    ratio = _row(result, name)
+    assert ratio.ours is not None
+    assert 0.5 < ratio.ours < 2.0  # eight runs
+    assert ratio.ok is (ratio.ours <= 1.15)
+
+
 def test_line_of_sight_rows_are_those_of_the_table(result: Reproduction) -> None:
     """Table 1 at 30 m, computed by hand; the text's 'over 80 % everywhere outdoors' is false."""
     umi = 18 / 30 + math.exp(-30 / 36) * (1 - 18 / 30)

@@ -136,6 +136,8 @@ def test_a_scenario_without_initial_pose_is_refused() -> None:
         ("metis_madrid", 6, "constant_velocity", {"sd_s": 3e-9}),
         ("intersection_turn_30m", 2, "constant_velocity", None),
         ("intersection_turn", 3, "inertial", None),
+        ("intersection_turn", 3, "interacting", None),
+        ("metis_madrid", 6, "interacting", {"sd_s": 3e-9}),
     ],
 )
 def test_a_run_is_what_the_tracker_makes_of_its_measurements(
@@ -177,3 +179,21 @@ def test_metis_routes_keep_the_papers_figures_on_any_number_of_processes() -> No
     assert one.clock_sd_ns < 4.0
     assert one.diverged == 0
     assert 0.5 < one.bound_ratio < 1.5
+
+
+def test_a_drawn_start_is_off_the_truth_by_the_filters_own_covariance() -> None:
+    """The first epoch hears azimuth and TOA of two RSUs: position and clock offset are measured,
+    the velocity is not, and is what was drawn."""
+    experiment = Experiment(
+        name="x",
+        scenario="fast_pass_100hz",
+        changes=(("devices.0.initial_pose_sd_m", 5.0), ("max_duration_s", 0.02)),
+        start_drawn=True,
+    )
+    setup, given = Setup(experiment), Setup(replace(experiment, start_drawn=False))
+    drawn = np.array([(t.mean - t.truth)[0, 2:4] for t in map(setup.run, range(1, 201))])
+    sd = setup.config.initial_speed_sd_mps
+    np.testing.assert_allclose(drawn.mean(axis=0), 0.0, atol=4.0 * sd / np.sqrt(200.0))
+    np.testing.assert_allclose(drawn.std(axis=0), sd, rtol=0.2)
+    np.testing.assert_array_equal(setup.run(1).mean, Setup(experiment).run(1).mean)
+    np.testing.assert_allclose(given.run(1).mean[0, 2:4], 0.0, atol=1e-9)
