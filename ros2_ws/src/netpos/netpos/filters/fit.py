@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 from netpos.filters.compile import kernel
-from netpos.filters.measurement import linearise
+from netpos.filters.factor import factor
+from netpos.filters.measurement import VARIANCE, curvature_variance, linearise
 from netpos.messages.values import Array
 
 
@@ -22,10 +25,10 @@ def distance2(cov: Array, d: Array) -> float:
             continue
         total += y[j] * y[j] / pivot
         for i in range(j + 1, d.size):
-            factor = A[i, j] / pivot
-            y[i] -= factor * y[j]
+            share = A[i, j] / pivot
+            y[i] -= share * y[j]
             for k in range(j + 1, d.size):
-                A[i, k] -= factor * A[j, k]
+                A[i, k] -= share * A[j, k]
     return total
 
 
@@ -41,3 +44,25 @@ def misfit(
     """
     innovation, _ = linearise(rows, x, height_m)
     return float(distance2(cov, x - mean) + (innovation * innovation / variance).sum())
+
+
+@kernel
+def surprise(mean: Array, cov: Array, rows: Array, height_m: float) -> tuple[float, float]:
+    """Squared Mahalanobis distance of ``rows`` (m, ROW_WIDTH) from what mean (n,), cov (n, n)
+    predict of them as the extended Kalman filter sees it, and ln det(2 pi S): minus twice their
+    log density is the sum of the two. What is known exactly is left out."""
+    innovation, H = linearise(rows, mean, height_m)
+    S = H @ cov @ H.T
+    for i in range(innovation.size):
+        S[i, i] += rows[i, VARIANCE] + curvature_variance(rows[i], mean, cov, height_m)
+    L = factor(S)
+    distance, size = 0.0, 0.0
+    for i in range(innovation.size):
+        if L[i, i] == 0.0:
+            continue
+        for k in range(i):
+            innovation[i] -= L[i, k] * innovation[k]
+        innovation[i] /= L[i, i]
+        distance += innovation[i] ** 2
+        size += math.log(2.0 * math.pi * L[i, i] ** 2)
+    return distance, size

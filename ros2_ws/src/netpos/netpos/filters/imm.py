@@ -13,9 +13,8 @@ import numpy as np
 
 from netpos.filters import ekf
 from netpos.filters.compile import kernel
-from netpos.filters.factor import factor
+from netpos.filters.fit import surprise
 from netpos.filters.gate import accepted_rows
-from netpos.filters.measurement import VARIANCE, curvature_variance, linearise
 from netpos.messages.values import Array
 
 # No model is ever ruled out: its way back would take this many e-folds less.
@@ -110,20 +109,8 @@ def _keep_alive(weights: Array) -> None:
 def log_likelihood(mean: Array, cov: Array, rows: Array, height_m: float) -> float:
     """Log density of ``rows`` (m, ROW_WIDTH) as the extended Kalman filter at mean, cov sees
     them."""
-    innovation, H = linearise(rows, mean, height_m)
-    S = H @ cov @ H.T
-    for i in range(innovation.size):
-        S[i, i] += rows[i, VARIANCE] + curvature_variance(rows[i], mean, cov, height_m)
-    L = factor(S)
-    total = 0.0
-    for i in range(innovation.size):
-        if L[i, i] == 0.0:
-            continue
-        for k in range(i):
-            innovation[i] -= L[i, k] * innovation[k]
-        innovation[i] /= L[i, i]
-        total -= 0.5 * innovation[i] ** 2 + math.log(L[i, i]) + 0.5 * math.log(2.0 * math.pi)
-    return total
+    distance, size = surprise(mean, cov, rows, height_m)
+    return float(-0.5 * (distance + size))
 
 
 @kernel

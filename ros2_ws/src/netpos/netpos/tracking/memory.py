@@ -15,6 +15,7 @@ from netpos.tracking.initialise import Initialiser
 from netpos.tracking.networks.secondary import OwnNoise
 from netpos.tracking.phase_start import PhaseStart
 from netpos.tracking.protection import NisWindow
+from netpos.tracking.rivals import Rivals
 from netpos.tracking.rsus import BiasStates
 from netpos.tracking.steadiness import Steadiness
 
@@ -28,6 +29,7 @@ class TrackMemory:
     blockage: Blockage
     phase_start: PhaseStart
     steadiness: Steadiness
+    rivals: Rivals
     segment: int = 0
     estimate: Estimate | None = None
     own: OwnNoise | None = None
@@ -54,6 +56,7 @@ class TrackMemory:
         else:
             twin.estimate = self.estimate.copy()
         twin.nis_window = self.nis_window.copy()
+        twin.rivals = self.rivals.copy()
         twin.rejected = self.rejected.copy()
         twin.velocity_ns = self.velocity_ns.copy()
         twin.steadiness = self.steadiness.copy()

@@ -205,13 +205,13 @@ def level_in(
         for b in range(n):
             wide[a, b] = prior_cov[a, b]
     add_manoeuvre(speed, max(unheard_s, longest_s), wide)
-    _apply_about(x, P, prior_mean, wide, rows, accepted, height_m, scratch)
+    apply_about(x, P, prior_mean, wide, rows, accepted, height_m, scratch)
     apart = math.hypot(x[0] - mean[0], x[1] - mean[1])
     return float(apart + gaussian_radius(P[0, 0], P[0, 1], P[1, 1], risk))
 
 
 @leaf
-def _apply_about(
+def apply_about(
     x: Array,
     P: Array,
     prior_mean: Array,

@@ -34,6 +34,7 @@ from netpos.tracking.networks.secondary import Secondary
 from netpos.tracking.observations import FittedEpoch
 from netpos.tracking.phase_start import PhaseStart, corrections, with_sectors
 from netpos.tracking.report import Applied, TrackOutput, total, track_status
+from netpos.tracking.rivals import Rivals
 from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sectors import Sectors
 from netpos.tracking.sequencer import Epoch, Item
@@ -81,6 +82,7 @@ class Track:
             Blockage.of(self._config),
             PhaseStart(self._config),
             Steadiness(self._config),
+            Rivals(self._config),
         )
 
     @property
@@ -291,11 +293,12 @@ class Track:
         estimate is not sound; ``flags`` (groups,) and ``accepted`` are the same."""
         state, fits = self._state, np.empty((len(batch.rows), 2))
         assert state.estimate is not None
+        unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
         unnoticed_m = fits_and_level(
             *state.estimate.prior,
             batch.rows,
             flags,
-            (stamp_ns - state.last_accepted_ns) * 1e-9,
+            unheard_s,
             state.estimate.mean,
             state.estimate.cov,
             self._options,
@@ -305,12 +308,15 @@ class Track:
         if math.isnan(unnoticed_m):
             return False
         state.unnoticed_m = unnoticed_m
+        if self._config.manoeuvre_speed_sd_mps > 0.0:
+            epoch = stamp_ns, state.estimate, batch.rows, flags, unheard_s, (nis, dof)
+            state.unnoticed_m = state.rivals.level(unnoticed_m, *epoch, state.bias)
         nis, dof = with_refused(batch, accepted, self._gate, nis, dof)
         if math.isfinite(nis):
             state.nis_window.add(nis, dof)
         if self._config.isolate_rsus:
-            epoch = FittedEpoch(stamp_ns, self._vue_id, batch.items, batch.rows, fits, accepted)
-            self._health.hear(epoch)
+            fitted = FittedEpoch(stamp_ns, self._vue_id, batch.items, batch.rows, fits, accepted)
+            self._health.hear(fitted)
         return True
 
     def _watch(self, stamp_ns: int, watched: list[RsuMeasurement]) -> None:

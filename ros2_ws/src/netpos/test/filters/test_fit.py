@@ -9,9 +9,7 @@ import pytest
 from curved_rows import log_posterior_cost, range_problem
 from filter_rows import random_spd
 from netpos.filters import fit
-from netpos.filters.measurement import (
-    VARIANCE,
-)
+from netpos.filters.measurement import VARIANCE, curvature_variance, linearise
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -49,3 +47,13 @@ def test_misfit_is_twice_the_negative_log_posterior(seed: int) -> None:
     assert fit.misfit(mean, cov, rows, rows[:, VARIANCE].copy(), 0.0, x) == pytest.approx(
         expected, rel=1e-9
     )
+
+
+def test_surprise_is_what_scipy_makes_of_it() -> None:
+    mean, cov, rows = range_problem(3)
+    innovation, H = linearise(rows, mean, 0.0)
+    bent = [curvature_variance(row, mean, cov, 0.0) for row in rows]
+    S = H @ cov @ H.T + np.diag(rows[:, VARIANCE] + bent)
+    distance, size = fit.surprise(mean, cov, rows, 0.0)
+    assert distance == pytest.approx(innovation @ np.linalg.solve(S, innovation), rel=1e-9)
+    assert size == pytest.approx(np.linalg.slogdet(2.0 * np.pi * S)[1], rel=1e-9)

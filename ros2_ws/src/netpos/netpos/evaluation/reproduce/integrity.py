@@ -14,6 +14,7 @@ from netpos.filters.motion import Parameter
 from netpos.messages.values import Array
 from netpos.tracking.engine import GATE, GATE_SIZE, Option
 from netpos.tracking.protection import gaussian_radius, level_in, level_scratch, radius_limit
+from netpos.tracking.rivals import no_rivals, rival_level
 
 _WINDOW, _TAIL = 50, 1e-3  # of ``NisWindow``
 _BOUND = np.append(0.0, chdtri(np.arange(1.0, 64.0 * _WINDOW), _TAIL))
@@ -45,17 +46,36 @@ def protection_levels(
     optimism = _optimism(row_start, rows, nis, taken, options)
     x, P, motion = means[0].copy(), covs[0].copy(), motions[0].copy()
     scratch = level_scratch(x.size, np.diff(row_start).max())
-    heard_ns, accepted = stamps_ns[0], np.ones(GATE_SIZE)
+    heard_ns, accepted, rivals = stamps_ns[0], np.ones(GATE_SIZE), no_rivals(x.size)
     for k in range(count):
         level[k] = 0.0
         if options[Option.MANOEUVRE_SPEED] > 0.0 and k > 0:
+            dt = (stamps_ns[k] - stamps_ns[k - 1]) * 1e-9
             unheard_s = (stamps_ns[k] - heard_ns) * 1e-9
             x[:], P[:], motion[:] = means[k - 1], covs[k - 1], motions[min(k, len(motions) - 1)]
             motion[Parameter.JUMP_SPEED] = 0.0
-            ekf.predict(x, P, (stamps_ns[k] - stamps_ns[k - 1]) * 1e-9, motion, bias)
+            ekf.predict(x, P, dt, motion, bias)
             accepted[:] = 1.0 if taken[k] > 0 else 0.0
             own = rows[row_start[k] : row_start[k + 1]]
             level[k] = level_in(x, P, own, accepted, unheard_s, means[k], options, risk, scratch)
+            level[k] = rival_level(
+                level[k],
+                dt,
+                x,
+                P,
+                own,
+                accepted,
+                unheard_s,
+                nis[k],
+                int(dof[k]),
+                means[k],
+                motion,
+                bias,
+                options,
+                risk,
+                rivals,
+                scratch,
+            )
             if taken[k] == 0:
                 level[k] += options[Option.MANOEUVRE_SPEED] * unheard_s
         xx, xy, yy = covs[k, 0, 0], covs[k, 0, 1], covs[k, 1, 1]

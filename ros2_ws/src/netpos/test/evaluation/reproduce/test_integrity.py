@@ -8,21 +8,29 @@ from netpos.evaluation.reproduce.experiment import VUE, Experiment, Setup
 from netpos.messages.values import Beacon, InitialPose
 from netpos.tracking import Tracker
 
-SEED = 5003
 
-
-@pytest.mark.parametrize("speed", [5.9, 0.0])
-def test_levels_are_those_of_the_tracker(speed: float) -> None:
-    """Past a turn of METIS; without manoeuvres the level is that of the covariance."""
+@pytest.mark.parametrize(
+    ("speed", "interval_s", "rsus", "seed"),
+    [(5.9, 0.1673, 2, 5003), (0.0, 0.1673, 2, 5003), (5.9, 0.01673, 1, 5067)],
+)
+def test_levels_are_those_of_the_tracker(
+    speed: float, interval_s: float, rsus: int, seed: int
+) -> None:
+    """Past a turn of METIS, with one RSU among rivals of the estimate; without manoeuvres the
+    level is that of the covariance."""
     experiment = Experiment(
         name="past a turn",
         scenario="metis_madrid",
-        changes=(("devices.0.beacon_interval_s", 0.1673), ("max_duration_s", 40.0)),
+        changes=(
+            ("devices.0.beacon_interval_s", interval_s),
+            ("measurement.nearest", rsus),
+            ("max_duration_s", 40.0),
+        ),
         tracker=(("manoeuvre_speed_sd_mps", speed), ("isolate_rsus", False)),
     )
     setup = Setup(experiment)
-    track = setup.run(SEED)
-    simulation, tracker = setup.simulation.with_seed(SEED), Tracker(setup.config)
+    track = setup.run(seed)
+    simulation, tracker = setup.simulation.with_seed(seed), Tracker(setup.config)
     for info in simulation.rsus:
         tracker.add_rsu(info)
     outputs = []
