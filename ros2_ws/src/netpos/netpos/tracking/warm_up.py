@@ -6,8 +6,12 @@ from functools import cache
 
 import numpy as np
 
+from netpos.filters.motion import NO_BIAS
+from netpos.filters.rows import linear_rows
 from netpos.messages.values import Field, GroundSpeed, InitialPose, RsuInfo, RsuMeasurement
+from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.rivals import Rivals
 from netpos.tracking.tracker import Tracker
 
 
@@ -19,6 +23,7 @@ def warm_up(network: str | None = None) -> None:
         costs a tracker memory and time, too.
     """
     _angles_and_ranges()
+    _rivals()
     if network is None:
         warm_up_anchors()
         Tracker(TrackerConfig(motion_model="strapdown", robust="huber"))
@@ -91,3 +96,12 @@ def _angles_and_ranges() -> None:
     for item in (speed, pose):
         tracker.add(item)
         tracker.process()
+
+
+def _rivals() -> None:
+    """An epoch that fits so badly that rivals of the estimate are looked for."""
+    config, stamp_ns, interval_s = TrackerConfig(manoeuvre_speed_sd_mps=1.0), 100_000_000, 0.1
+    estimate = estimates.start(config, 0, np.zeros(6), np.eye(6))
+    rows = linear_rows(np.full(2, 4.0), np.eye(2), np.eye(6)[:2], 0)
+    _, dof, accepted = estimate.step(stamp_ns, interval_s, 0, rows, NO_BIAS)
+    Rivals(config).level(stamp_ns, estimate, rows, accepted, interval_s, (99.0, dof), NO_BIAS)

@@ -13,7 +13,8 @@ from netpos.filters.manoeuvre import unnoticed_s
 from netpos.filters.motion import Model, Parameter
 from netpos.filters.rows import linear_rows
 from netpos.messages.values import Array
-from netpos.tracking import TrackerConfig
+from netpos.tracking import TrackerConfig, warm_up
+from netpos.tracking import rivals as rivals_module
 from netpos.tracking.engine import GATE
 from netpos.tracking.estimates import Single
 from netpos.tracking.models import motions_of, options_of
@@ -165,3 +166,11 @@ def test_a_turn_along_the_bearing_is_held_by_the_level(seed: int) -> None:
     assert track.error_m[20:].max() > 15.0
     assert (track.error_m > track.level)[20:].sum() < 20
     assert np.median(track.level[20:]) < 5.0
+
+
+def test_the_warm_up_looks_for_rivals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A kernel first needed afterwards would bring the compiler back."""
+    asked = []
+    monkeypatch.setattr(rivals_module, "rival_level", lambda *args: asked.append(args) or 1.0)
+    warm_up._rivals()
+    assert len(asked) == 1
