@@ -293,30 +293,24 @@ class Track:
         estimate is not sound; ``flags`` (groups,) and ``accepted`` are the same."""
         state, fits = self._state, np.empty((len(batch.rows), 2))
         assert state.estimate is not None
-        unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
+        estimate, risk = state.estimate, self._config.integrity_risk
+        fitted = batch.rows, flags, (stamp_ns - state.last_accepted_ns) * 1e-9
         unnoticed_m = fits_and_level(
-            *state.estimate.prior,
-            batch.rows,
-            flags,
-            unheard_s,
-            state.estimate.mean,
-            state.estimate.cov,
-            self._options,
-            self._config.integrity_risk,
-            fits,
+            *estimate.prior, *fitted, estimate.mean, estimate.cov, self._options, risk, fits
         )
         if math.isnan(unnoticed_m):
             return False
         state.unnoticed_m = unnoticed_m
         if self._config.manoeuvre_speed_sd_mps > 0.0:
-            epoch = stamp_ns, state.estimate, batch.rows, flags, unheard_s, (nis, dof)
-            state.unnoticed_m = state.rivals.level(unnoticed_m, *epoch, state.bias)
+            state.unnoticed_m = state.rivals.level(
+                unnoticed_m, stamp_ns, estimate, *fitted, (nis, dof), state.bias
+            )
         nis, dof = with_refused(batch, accepted, self._gate, nis, dof)
         if math.isfinite(nis):
             state.nis_window.add(nis, dof)
         if self._config.isolate_rsus:
-            fitted = FittedEpoch(stamp_ns, self._vue_id, batch.items, batch.rows, fits, accepted)
-            self._health.hear(fitted)
+            epoch = FittedEpoch(stamp_ns, self._vue_id, batch.items, batch.rows, fits, accepted)
+            self._health.hear(epoch)
         return True
 
     def _watch(self, stamp_ns: int, watched: list[RsuMeasurement]) -> None:

@@ -104,4 +104,5 @@ def _rivals() -> None:
     estimate = estimates.start(config, 0, np.zeros(6), np.eye(6))
     rows = linear_rows(np.full(2, 4.0), np.eye(2), np.eye(6)[:2], 0)
     _, dof, accepted = estimate.step(stamp_ns, interval_s, 0, rows, NO_BIAS)
-    Rivals(config).level(stamp_ns, estimate, rows, accepted, interval_s, (99.0, dof), NO_BIAS)
+    epoch = stamp_ns, estimate, rows, accepted, interval_s, (99.0, dof)
+    Rivals(config).level(1.0, *epoch, NO_BIAS)
