@@ -18,15 +18,17 @@ MAX_LINES = 400
 # A room may import itself and the rooms named here; nothing imports backwards.
 MAY_IMPORT: dict[str, set[str]] = {
     "messages": set(),
+    "common": set(),
     "world": {"messages"},
     "radio": {"messages", "world"},
-    "inertial": {"messages", "world", "radio"},
+    "inertial": {"messages", "common", "world", "radio"},
     "filters": {"messages", "inertial"},
     "bags": {"messages", "inertial"},
     "scenario": {"messages", "world", "radio", "inertial", "bags"},
-    "tracking": {"messages", "filters", "inertial", "bags", "scenario"},
+    "tracking": {"messages", "common", "filters", "inertial", "bags", "scenario"},
     "evaluation": {
-        *("messages", "world", "radio", "inertial", "filters", "bags", "scenario", "tracking"),
+        *("messages", "common", "world", "radio", "inertial", "filters", "bags", "scenario"),
+        "tracking",
     },
 }
 

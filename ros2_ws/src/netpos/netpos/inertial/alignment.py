@@ -22,8 +22,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from netpos.common.least_squares import minimise
 from netpos.inertial.attitude import GRAVITY_MPS2
-from netpos.least_squares import minimise
 
 Array = npt.NDArray[np.float64]
 

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from netpos.parameters import check_fields, not_negative, positive, real
+from netpos.common.parameters import check_fields, not_negative, positive, real
 
 Array = npt.NDArray[np.float64]
 Vector = tuple[float, float, float]

@@ -7,9 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from netpos.inertial.attitude import AttitudeConfig
-from netpos.inertial.steps import StepConfig
-from netpos.parameters import (
+from netpos.common.parameters import (
     check_fields,
     choice,
     described,
@@ -18,6 +16,8 @@ from netpos.parameters import (
     real,
     typed,
 )
+from netpos.inertial.attitude import AttitudeConfig
+from netpos.inertial.steps import StepConfig
 
 Placement = Literal["carried", "waist"]
 

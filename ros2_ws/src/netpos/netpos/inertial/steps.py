@@ -29,7 +29,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from netpos.parameters import check_fields, choice, count, positive, real
+from netpos.common.parameters import check_fields, choice, count, positive, real
 
 Array = npt.NDArray[np.float64]
 Vector = tuple[float, float, float]

@@ -15,6 +15,7 @@ from collections import deque
 
 import numpy as np
 
+from netpos.common.least_squares import minimise
 from netpos.filters import ekf
 from netpos.filters.chi_square import chi_square_bound
 from netpos.filters.compile import kernel
@@ -37,7 +38,6 @@ from netpos.filters.measurement import (
     wrap,
 )
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
-from netpos.least_squares import minimise
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.rsus import Rsu

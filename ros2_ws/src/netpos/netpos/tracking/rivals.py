@@ -184,15 +184,13 @@ class Rivals:
         bias: Array,
     ) -> float:
         """``rival_level`` after an epoch; ``fit``: NIS and number of the accepted rows."""
+        dt, self._stamp_ns = (stamp_ns - self._stamp_ns) * 1e-9, stamp_ns
+        if self._state is None and fit[0] <= _UNUSUAL * fit[1]:
+            return level
         epoch = (*estimate.prior, rows, accepted, unheard_s)
         mean, options, risk = estimate.mean, self._options, self._risk
-        dt, self._stamp_ns = (stamp_ns - self._stamp_ns) * 1e-9, stamp_ns
-        if self._state is not None and self._state[0].shape[1] != mean.size:
-            self._state = None  # a bias has joined the states
-        if self._state is None:
-            if fit[0] <= _UNUSUAL * fit[1]:
-                return level
-            self._state = no_rivals(mean.size)
+        if self._state is None or self._state[0].shape[1] != mean.size:
+            self._state = no_rivals(mean.size)  # anew where a bias has joined the states
         motion = estimate.motion if self._straight is None else self._straight
         scratch = level_scratch(mean.size, len(rows))
         reached: float = rival_level(

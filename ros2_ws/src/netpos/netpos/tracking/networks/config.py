@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from netpos.common.parameters import check_fields, choice, from_mapping, real
 from netpos.filters.intersection import METHODS
-from netpos.parameters import check_fields, choice, from_mapping, real
 
 ASSOCIATIONS = ("motion", "names")
 

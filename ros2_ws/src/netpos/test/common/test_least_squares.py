@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from netpos.least_squares import Array, minimise
+from netpos.common.least_squares import Array, minimise
 from scipy.optimize import approx_fprime, least_squares
 
 Residuals = Callable[[Array], Array]
