@@ -19,6 +19,7 @@ from netpos.filters.compile import kernel
 from netpos.filters.fit import surprise
 from netpos.filters.gate import accepted_rows
 from netpos.filters.manoeuvre import add_manoeuvre, unnoticed_s
+from netpos.filters.measurement import GROUP
 from netpos.filters.motion import Model, Parameter
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
@@ -78,11 +79,12 @@ def rival_level(
     """Radius [m] round ``mean`` (n,) that holds ``level`` and the rivals, which are moved by
     ``dt`` seconds, weighed and updated in place; arguments as for ``manoeuvre_level``.
 
-    nis, dof : of the accepted rows. An inertial model has no rivals: only the estimate gets its
-    increments.
+    nis, dof : of the accepted rows. A rival begins in an epoch of a single measurement. An
+    inertial model has no rivals: only the estimate gets its increments.
     """
     means, covs, evidence, beyond = rivals
-    present, unusual = evidence.max() >= 0.0, nis > _UNUSUAL * dof
+    alone = rows[0, GROUP] == rows[rows.shape[0] - 1, GROUP]  # two tell where the device is
+    present, unusual = evidence.max() >= 0.0, alone and nis > _UNUSUAL * dof
     if not (present or unusual) or int(motion[Parameter.MODEL]) == Model.INERTIAL:
         return level
     if present:
@@ -169,8 +171,14 @@ class Rivals:
         self._options, self._risk = options_of(config), config.integrity_risk
         interacting = config.motion_model == "interacting"
         self._straight = motions_of(config)[1] if interacting else None
+        self._able = config.manoeuvre_speed_sd_mps > 0.0
         self._stamp_ns = 0
         self._state: State | None = None
+
+    @property
+    def present(self) -> bool:
+        """Whether there is one; none comes with an epoch of several measurements."""
+        return self._state is not None
 
     def level(
         self,
@@ -185,7 +193,8 @@ class Rivals:
     ) -> float:
         """``rival_level`` after an epoch; ``fit``: NIS and number of the accepted rows."""
         dt, self._stamp_ns = (stamp_ns - self._stamp_ns) * 1e-9, stamp_ns
-        if self._state is None and fit[0] <= _UNUSUAL * fit[1]:
+        usual = accepted.size > 1 or fit[0] <= _UNUSUAL * fit[1]
+        if not self._able or (usual and self._state is None):
             return level
         epoch = (*estimate.prior, rows, accepted, unheard_s)
         mean, options, risk = estimate.mean, self._options, self._risk

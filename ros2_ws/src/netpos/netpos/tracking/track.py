@@ -301,7 +301,7 @@ class Track:
         if math.isnan(unnoticed_m):
             return False
         state.unnoticed_m = unnoticed_m
-        if self._config.manoeuvre_speed_sd_mps > 0.0:
+        if state.rivals.present or len(accepted) == 1:
             state.unnoticed_m = state.rivals.level(
                 unnoticed_m, stamp_ns, estimate, *fitted, (nis, dof), state.bias
             )

@@ -19,13 +19,13 @@ def warm_up(network: str | None = None) -> None:
     """Run tiny tracks through the kernels: first fix, prediction, gate, update.
 
     network : of the tracker, "" where it takes all; None: every kernel, as at set-up. Those for
-        anchors follow with the first anchor (``warm_up_anchors``): a kernel that is only loaded
-        costs a tracker memory and time, too.
+        anchors follow with the first anchor (``warm_up_anchors``), those for rivals with the first
+        (9 MB, 50 ms): a kernel that is only loaded costs a tracker memory and time, too.
     """
     _angles_and_ranges()
-    _rivals()
     if network is None:
         warm_up_anchors()
+        _rivals()
         Tracker(TrackerConfig(motion_model="strapdown", robust="huber"))
     if network != "":
         _fixes_of_a_network()
