@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from netpos.filters import ekf
-from netpos.filters.compile import kernel
+from netpos.filters.compile import kernel, leaf
 from netpos.filters.fit import surprise
 from netpos.filters.gate import accepted_rows
 from netpos.filters.manoeuvre import add_manoeuvre, unnoticed_s
@@ -57,6 +57,29 @@ def no_rivals(n: int) -> State:
     )
 
 
+@leaf
+def _present(evidence: Array) -> bool:
+    """Whether there is a rival."""
+    most = _NONE
+    for k in range(evidence.size):
+        most = max(most, evidence[k])
+    return most >= 0.0
+
+
+@leaf
+def _begins(rows: Array, nis: float, dof: int) -> bool:
+    """Whether a rival may begin: an epoch of a single measurement (two tell where the device is)
+    that fits badly."""
+    alone = rows[0, GROUP] == rows[rows.shape[0] - 1, GROUP]
+    return bool(alone and nis > _UNUSUAL * dof)
+
+
+@leaf
+def matter(rows: Array, nis: float, dof: int, evidence: Array) -> bool:
+    """Whether ``rival_level`` has anything to do."""
+    return bool(_present(evidence) or _begins(rows, nis, dof))
+
+
 @kernel
 def rival_level(
     level: float,
@@ -83,8 +106,7 @@ def rival_level(
     inertial model has no rivals: only the estimate gets its increments.
     """
     means, covs, evidence, beyond = rivals
-    alone = rows[0, GROUP] == rows[rows.shape[0] - 1, GROUP]  # two tell where the device is
-    present, unusual = evidence.max() >= 0.0, alone and nis > _UNUSUAL * dof
+    present, unusual = _present(evidence), _begins(rows, nis, dof)
     if not (present or unusual) or int(motion[Parameter.MODEL]) == Model.INERTIAL:
         return level
     if present:

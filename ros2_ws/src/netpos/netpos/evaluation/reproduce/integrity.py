@@ -14,7 +14,7 @@ from netpos.filters.motion import Parameter
 from netpos.messages.values import Array
 from netpos.tracking.engine import GATE, GATE_SIZE, Option
 from netpos.tracking.protection import gaussian_radius, level_in, level_scratch, radius_limit
-from netpos.tracking.rivals import no_rivals, rival_level
+from netpos.tracking.rivals import matter, no_rivals, rival_level
 
 _WINDOW, _TAIL = 50, 1e-3  # of ``NisWindow``
 _BOUND = np.append(0.0, chdtri(np.arange(1.0, 64.0 * _WINDOW), _TAIL))
@@ -58,24 +58,25 @@ def protection_levels(
             accepted[:] = 1.0 if taken[k] > 0 else 0.0
             own = rows[row_start[k] : row_start[k + 1]]
             level[k] = level_in(x, P, own, accepted, unheard_s, means[k], options, risk, scratch)
-            level[k] = rival_level(
-                level[k],
-                dt,
-                x,
-                P,
-                own,
-                accepted,
-                unheard_s,
-                nis[k],
-                int(dof[k]),
-                means[k],
-                motion,
-                bias,
-                options,
-                risk,
-                rivals,
-                scratch,
-            )
+            if matter(own, nis[k], int(dof[k]), rivals[2]):
+                level[k] = rival_level(
+                    level[k],
+                    dt,
+                    x,
+                    P,
+                    own,
+                    accepted,
+                    unheard_s,
+                    nis[k],
+                    int(dof[k]),
+                    means[k],
+                    motion,
+                    bias,
+                    options,
+                    risk,
+                    rivals,
+                    scratch,
+                )
             if taken[k] == 0:
                 level[k] += options[Option.MANOEUVRE_SPEED] * unheard_s
         xx, xy, yy = covs[k, 0, 0], covs[k, 0, 1], covs[k, 1, 1]
