@@ -41,50 +41,57 @@ def protection_levels(
     motions : (N, Parameter) of each epoch, or (1, Parameter) of all. Where part of the groups was
     refused, which ones is not known here, and the level of a manoeuvre takes them all.
     """
-    count = means.shape[0]
-    level = np.empty(count)
+    level = np.zeros(means.shape[0])
+    if options[Option.MANOEUVRE_SPEED] > 0.0:
+        epochs = (stamps_ns, row_start, rows, means, covs, nis, dof, taken)
+        _allow_for_manoeuvres(*epochs, motions, bias, options, risk, level)
     optimism = _optimism(row_start, rows, nis, taken, options)
+    for k in range(level.size):
+        xx, xy, yy = covs[k, 0, 0], covs[k, 0, 1], covs[k, 1, 1]
+        if level[k] < optimism[k] * radius_limit(xx, xy, yy, risk):
+            level[k] = max(level[k], optimism[k] * gaussian_radius(xx, xy, yy, risk))
+    return level
+
+
+@kernel
+def _allow_for_manoeuvres(
+    stamps_ns: Array,
+    row_start: Array,
+    rows: Array,
+    means: Array,
+    covs: Array,
+    nis: Array,
+    dof: Array,
+    taken: Array,
+    motions: Array,
+    bias: Array,
+    options: Array,
+    risk: float,
+    level: Array,
+) -> None:
+    """Fill ``level`` (N,) with those of a manoeuvre nobody has noticed, rivals of the estimate
+    included."""
     x, P, motion = means[0].copy(), covs[0].copy(), motions[0].copy()
     scratch = level_scratch(x.size, np.diff(row_start).max())
     heard_ns, accepted, rivals = stamps_ns[0], np.ones(GATE_SIZE), no_rivals(x.size)
-    for k in range(count):
-        level[k] = 0.0
-        if options[Option.MANOEUVRE_SPEED] > 0.0 and k > 0:
+    for k in range(level.size):
+        if k > 0:
             dt = (stamps_ns[k] - stamps_ns[k - 1]) * 1e-9
             unheard_s = (stamps_ns[k] - heard_ns) * 1e-9
             x[:], P[:], motion[:] = means[k - 1], covs[k - 1], motions[min(k, len(motions) - 1)]
             motion[Parameter.JUMP_SPEED] = 0.0
             ekf.predict(x, P, dt, motion, bias)
             accepted[:] = 1.0 if taken[k] > 0 else 0.0
-            own = rows[row_start[k] : row_start[k + 1]]
-            level[k] = level_in(x, P, own, accepted, unheard_s, means[k], options, risk, scratch)
-            if matter(own, nis[k], int(dof[k]), rivals[2]):
-                level[k] = rival_level(
-                    level[k],
-                    dt,
-                    x,
-                    P,
-                    own,
-                    accepted,
-                    unheard_s,
-                    nis[k],
-                    int(dof[k]),
-                    means[k],
-                    motion,
-                    bias,
-                    options,
-                    risk,
-                    rivals,
-                    scratch,
-                )
+            own, fit = rows[row_start[k] : row_start[k + 1]], (nis[k], int(dof[k]))
+            epoch = (x, P, own, accepted, unheard_s)
+            level[k] = level_in(*epoch, means[k], options, risk, scratch)
+            if matter(own, *fit, rivals[2]):
+                rest = (motion, bias, options, risk, rivals, scratch)
+                level[k] = rival_level(level[k], dt, *epoch, *fit, means[k], *rest)
             if taken[k] == 0:
                 level[k] += options[Option.MANOEUVRE_SPEED] * unheard_s
-        xx, xy, yy = covs[k, 0, 0], covs[k, 0, 1], covs[k, 1, 1]
-        if level[k] < optimism[k] * radius_limit(xx, xy, yy, risk):
-            level[k] = max(level[k], optimism[k] * gaussian_radius(xx, xy, yy, risk))
         if taken[k] > 0:
             heard_ns = stamps_ns[k]
-    return level
 
 
 @kernel
