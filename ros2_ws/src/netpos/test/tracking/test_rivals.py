@@ -10,6 +10,7 @@ import pytest
 from netpos.evaluation.reproduce.experiment import Experiment, Setup
 from netpos.filters import ekf
 from netpos.filters.manoeuvre import unnoticed_s
+from netpos.filters.measurement import GROUP
 from netpos.filters.motion import Model, Parameter
 from netpos.filters.rows import linear_rows
 from netpos.messages.values import Array
@@ -19,7 +20,7 @@ from netpos.tracking.engine import GATE
 from netpos.tracking.estimates import Single
 from netpos.tracking.models import motions_of, options_of
 from netpos.tracking.protection import gaussian_radius, level_scratch
-from netpos.tracking.rivals import Rivals, no_rivals, rival_level
+from netpos.tracking.rivals import Rivals, matter, no_rivals, rival_level
 from scipy.stats import multivariate_normal
 
 CONFIG = TrackerConfig(manoeuvre_speed_sd_mps=5.0, accel_density_mps2_sqrthz=0.1)
@@ -135,6 +136,20 @@ def test_an_inertial_model_has_no_rivals() -> None:
     rest = (NO_BIAS, OPTIONS, RISK, rivals, level_scratch(6, 2))
     assert rival_level(1.0, DT, *args, motion, *rest) == 1.0
     assert rival_level(1.0, DT, *args, MOTION, *rest) > 1.0
+
+
+def test_no_rival_begins_where_two_measurements_tell_the_place() -> None:
+    """One that has begun is carried on."""
+    rows, twice = linear_rows(np.array([3.0, 3.0]), R, H, 0), linear_rows(np.full(2, 3.0), R, H, 0)
+    twice[1, GROUP] = 1
+    before = (np.zeros(6), np.eye(6) * 0.01)
+    rivals = no_rivals(6)
+    fit, rest = (200.0, 2, np.zeros(6), MOTION), (NO_BIAS, OPTIONS, RISK, rivals)
+    scratch = level_scratch(6, 2)
+    for own, begins in ((twice, False), (rows, True), (twice, True)):
+        assert matter(own, 200.0, 2, rivals[2]) is begins
+        level = rival_level(1.0, DT, *before, own, np.ones(2), DT, *fit, *rest, scratch)
+        assert (level > 1.0) is begins
 
 
 def test_a_copy_goes_its_own_way_and_a_new_state_starts_anew() -> None:
