@@ -20,7 +20,8 @@ def warm_up(network: str | None = None) -> None:
 
     network : of the tracker, "" where it takes all; None: every kernel, as at set-up. Those for
         anchors follow with the first anchor (``warm_up_anchors``), those for rivals with the first
-        (9 MB, 50 ms): a kernel that is only loaded costs a tracker memory and time, too.
+        one (9 MB, as much of the compiler, 50 to 80 ms): a kernel that is only loaded costs a
+        tracker memory and time, too.
     """
     _angles_and_ranges()
     if network is None:
