@@ -1,4 +1,4 @@
-"""Nonlinear least squares by Levenberg-Marquardt.
+"""Nonlinear least squares by Levenberg-Marquardt (Marquardt 1963).
 
 For what a node solves while it runs: SciPy's optimiser would cost it 24 MB.
 """
