@@ -46,7 +46,6 @@ def surroundings() -> dict[str, str]:
         **environment,
         "ROS_DOMAIN_ID": str(1 + os.getpid() % 101),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "OMP_NUM_THREADS": "1",
     }
 
 
@@ -172,31 +171,25 @@ def ready_rows(quick: bool) -> list[Result]:
     """From the start of the process, kernels cached, until it takes measurements and to its first
     odometry; and memory then."""
     figures = probe("ready", "--starts", "1" if quick else "5")
-    begun, answered = (
-        within(
-            f"start of the node {until}, median",
-            statistics.median(seconds),
-            "limit",
-            _READY_S,
-            1.0,
-            note=f"Each start: {', '.join(f'{s:.2f}' for s in seconds)} s; {of_it}.",
-        )
-        for until, seconds, of_it in (
-            (
-                "until it takes measurements",
-                figures["ready_s"],
-                f"{min(figures['cpu_s']):.2f} s of processor time",
-            ),
-            (
-                "to its first odometry",
-                figures["odometry_s"],
-                "with the discovery of two processes",
-            ),
-        )
-    )
+
+    def row(until: str, seconds: list[float], note: str) -> Result:
+        each = ", ".join(f"{s:.2f}" for s in seconds)
+        what = f"start of the node {until}, median"
+        took = statistics.median(seconds)
+        return within(what, took, "limit", _READY_S, 1.0, note=f"Each start: {each} s; {note}.")
+
+    processor_s = min(figures["cpu_s"])
     return [
-        begun,
-        answered,
+        row(
+            "until it takes measurements",
+            figures["ready_s"],
+            f"{processor_s:.2f} s of processor time",
+        ),
+        row(
+            "to its first odometry",
+            figures["odometry_s"],
+            "with the discovery of two processes",
+        ),
         within(
             "resident memory of the node, one device",
             figures["memory_mb"],

@@ -19,6 +19,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
+from threadpoolctl import threadpool_limits
+
 PAPERS = {
     "fokin2020": "netpos.evaluation.reproduce.fokin2020",
     "dvornikov2017": "netpos.evaluation.reproduce.dvornikov2017",
@@ -115,7 +117,8 @@ class Work:
     """Seeds to run and processes to run them on; a context manager.
 
     Processes are forked, so that they share the compiled kernels and start at once; ``workers`` 1
-    runs in this process.
+    runs in this process. Each computes on one thread: the threads of a linear algebra library
+    would wait for each other in loops.
     """
 
     def __init__(
@@ -138,6 +141,7 @@ class Work:
         self._pool: ProcessPoolExecutor | None = None
 
     def __enter__(self) -> Self:
+        self._threads = threadpool_limits(1)  # which forked processes inherit
         if self.workers > 1:
             fork = multiprocessing.get_context("fork")
             self._pool = ProcessPoolExecutor(self.workers, mp_context=fork)
@@ -153,6 +157,7 @@ class Work:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
             self._pool = None
+        self._threads.restore_original_limits()
 
     def with_runs(self, runs: int) -> Work:
         """The same work and processes for another number of runs."""

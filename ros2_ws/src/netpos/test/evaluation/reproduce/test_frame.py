@@ -20,6 +20,7 @@ from netpos.evaluation.reproduce.frame import (
     required,
     shown,
 )
+from threadpoolctl import threadpool_info, threadpool_limits
 
 
 @pytest.mark.parametrize(
@@ -61,6 +62,20 @@ def test_every_seed_is_run_once_and_in_order(workers: int) -> None:
     ]
     assert reports == [("sum", 8, 21), ("sum", 16, 21), ("sum", 21, 21)]
     assert (os.getpid() in {pid for pid, _ in results}) is (workers == 1)
+
+
+def _threads(_: None, seeds: range) -> list[int]:
+    return [int(library["num_threads"]) for library in threadpool_info()]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_process_computes_on_one_thread_while_there_is_work(workers: int) -> None:
+    with threadpool_limits(2):
+        before = _threads(None, range(0))
+        assert 2 in before
+        with Work(1, 1, workers) as work:
+            assert work.over_seeds("threads", _threads, None) == [[1] * len(before)]
+        assert _threads(None, range(0)) == before
 
 
 def _paper(row: Row) -> SimpleNamespace:
