@@ -2,9 +2,9 @@
 
     python scripts/mutate_kernels.py [ROOM|ROOM.KERNEL ...]
 
-A room is a module of the filters (``TESTS_OF`` lists them; all where none is named). The kernels
-run as plain Python here (NUMBA_DISABLE_JIT), so that a change needs no compiling. Exit code 1
-where a change survives.
+A room is a module of the filters, or another with its folder before it, as ``tracking/engine``
+(``TESTS_OF`` lists them; all where none is named). The kernels run as plain Python here
+(NUMBA_DISABLE_JIT), so that a change needs no compiling. Exit code 1 where a change survives.
 """
 
 from __future__ import annotations
@@ -15,16 +15,18 @@ import os
 import signal
 import sys
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 os.environ["NUMBA_DISABLE_JIT"] = "1"
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-TESTS = ROOT / "ros2_ws/src/netpos/test/filters"
+TESTS = ROOT / "ros2_ws/src/netpos/test"
 # Tests that have to notice; without what takes long in Python.
 TESTS_OF = {
     "bearing": "test_bearing.py",
@@ -33,9 +35,10 @@ TESTS_OF = {
     "test_ekf_iteration.py test_ekf_bending.py test_bearing.py test_ekf_wide_prior.py",
     "error_state": "test_error_state_rules.py test_error_state_chunks.py test_error_state.py",
     "factor": "test_factor.py",
-    "fit": "test_fit.py test_gate.py",
+    "fit": "test_fit.py test_gate.py test_imm.py::test_likelihood_of_what_says_the_same_twice",
     "fusion": "test_ekf.py",
     "gate": "test_gate.py test_kf.py",
+    "imm": "test_imm.py -knot+stop_straight_turn",
     "iteration": "test_ekf_iteration.py test_ekf_bending.py test_ekf_wide_prior.py",
     "kf": "test_kf.py test_gate.py",
     "manoeuvre": "test_manoeuvre.py",
@@ -51,8 +54,20 @@ TESTS_OF = {
     "space_conditioning": "test_space_conditioning.py",
     "srukf": "test_srukf.py -knot+ten_thousand",
     "step_velocity": "test_step_velocity.py test_measurement.py",
+    "tracking/engine": "test_engine_parts.py test_engine.py -knot+equals_the_tracker",
+    "tracking/protection": "test_protection.py",
+    "tracking/rivals": "test_rivals.py -knot+turn_along_the_bearing",
     "ukf": "test_ukf.py test_gate.py",
 }
+# Newton's method gets there from anywhere.
+_START = (
+    "-2.0 * log_risk",
+    "circular - math.log(1.0 + math.pi / 2.0 * circular * (1.0 - ratio))",
+    "math.pi / 2.0 * circular * (1.0 - ratio)",
+    "math.pi / 2.0 * circular",
+    "1.0 - ratio",
+    "math.pi / 2.0",
+)
 # Changes that change nothing but time, or nothing at all.
 EQUIVALENT = {
     ("bearing", "_moments", "left out: continue"),  # the sums begin anew
@@ -75,6 +90,20 @@ EQUIVALENT = {
         for a, f in ((0, "cos"), (1, "sin"))
     ),
     ("iteration", "refine_used", "operator swapped: cost - 0.001"),  # the same place again
+    *(
+        ("tracking/protection", "gaussian_radius", f"operator swapped: {where}")
+        for where in _START
+    ),
+    # one that converges as fast, and terms too small for the sum
+    ("tracking/protection", "gaussian_radius", "operator swapped: 1e-06 * u"),
+    ("tracking/protection", "gaussian_radius", "operator swapped: u + 2.0 * _NEGLIGIBLE"),
+    ("tracking/protection", "radius_of", "operator swapped: xx + yy"),  # finite where both are
+    ("tracking/rivals", "_weigh", "left out: rival = math.inf"),  # set by what follows
+    ("tracking/rivals", "_weigh", "left out: continue"),  # no evidence is no number, not taken
+    *(  # memory for more rows than there are
+        ("tracking/engine", "run_epochs", f"operator swapped: {size}")
+        for size in ("row_start[k + 1] - row_start[k] (2)", "k + 1 (3)")
+    ),
     ("iteration", "iterate_from", "left out: x, P = (mean.copy(), cov.copy())"),  # likewise
 }
 CPU_S = 30  # what takes longer does not end
@@ -105,7 +134,9 @@ def drop(node: ast.AST) -> None:
 
 
 def mutants(function: ast.FunctionDef) -> Iterator[tuple[int, str, ast.FunctionDef]]:
-    """Line, description and changed copy of every change to a function's body."""
+    """Line, description and changed copy of every change to a function's body; of several alike
+    the second is marked (2), and so on."""
+    alike: Counter[str] = Counter()
     for index, node in enumerate(ast.walk(function)):
         changes: list[tuple[str, Callable[[ast.AST], None]]] = []
         if isinstance(node, ast.AugAssign | ast.Continue | ast.Assign) or (
@@ -119,9 +150,10 @@ def mutants(function: ast.FunctionDef) -> Iterator[tuple[int, str, ast.FunctionD
         for what, change in changes:
             changed = copy.deepcopy(function)
             target = list(ast.walk(changed))[index]
-            text = ast.unparse(node.test if isinstance(node, ast.If) else node)
+            text = f"{what}: {ast.unparse(node.test if isinstance(node, ast.If) else node)}"
+            alike[text] += 1
             change(target)
-            yield node.lineno, f"{what}: {text}", changed
+            yield node.lineno, text + f" ({alike[text]})" * (alike[text] > 1), changed
 
 
 def is_noticed(kernel: Callable[..., object], changed: ast.FunctionDef, tests: list[str]) -> bool:
@@ -149,9 +181,16 @@ def run(tests: list[str]) -> int:
     return int(pytest.main([*quiet, *tests]))
 
 
-def kernels(room: str) -> Iterator[ast.FunctionDef]:
-    """What a room compiles."""
-    source = Path(str(import_module(f"netpos.filters.{room}").__file__))
+def folder_and_module(room: str) -> tuple[str, ModuleType]:
+    """Where a room is."""
+    folder, _, name = room.rpartition("/")
+    folder = folder or "filters"
+    return folder, import_module(f"netpos.{folder}.{name}")
+
+
+def kernels(module: ModuleType) -> Iterator[ast.FunctionDef]:
+    """What a module compiles."""
+    source = Path(str(module.__file__))
     for node in ast.parse(source.read_text(encoding="utf-8")).body:
         if isinstance(node, ast.FunctionDef):
             decorators = {ast.unparse(decorator) for decorator in node.decorator_list}
@@ -159,18 +198,19 @@ def kernels(room: str) -> Iterator[ast.FunctionDef]:
                 yield node
 
 
-def survivors(room: str, node: ast.FunctionDef, tests: list[str]) -> Iterator[bool]:
+def survivors(
+    room: str, kernel: Callable[..., object], node: ast.FunctionDef, tests: list[str]
+) -> Iterator[bool]:
     """Of each change to a kernel, whether it went unnoticed, which is printed.
 
     Raises ``SystemExit`` where the tests fail without any change, or ``EQUIVALENT`` has a change
     of this kernel that is none.
     """
-    kernel = getattr(import_module(f"netpos.filters.{room}"), node.name)
     if is_noticed(kernel, copy.deepcopy(node), tests):
         raise SystemExit(f"{room}: the tests fail without any change")
     known = {what for where, name, what in EQUIVALENT if (where, name) == (room, node.name)}
     for line, what, changed in mutants(node):
-        if what in known:  # once: the first of several alike
+        if what in known:
             known.remove(what)
             continue
         unnoticed = not is_noticed(kernel, changed, tests)
@@ -187,14 +227,15 @@ def main(rooms: list[str]) -> int:
     unnoticed = total = 0
     for asked in rooms or list(TESTS_OF):
         room, _, only = asked.partition(".")
+        folder, module = folder_and_module(room)
         tests = [
-            name.replace("+", " ") if name.startswith("-") else str(TESTS / name)
+            name.replace("+", " ") if name.startswith("-") else str(TESTS / folder / name)
             for name in TESTS_OF[room].split()
         ]
         run([*tests, "--collect-only", "-qq"])  # imports what all children need
-        for node in kernels(room):
+        for node in kernels(module):
             if only in ("", node.name):
-                found = list(survivors(room, node, tests))
+                found = list(survivors(room, getattr(module, node.name), node, tests))
                 total, unnoticed = total + len(found), unnoticed + sum(found)
         print(f"{asked}: {total} changes so far, {unnoticed} not noticed", flush=True)
     return unnoticed

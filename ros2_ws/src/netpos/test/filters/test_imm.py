@@ -88,6 +88,17 @@ def test_mixture_moments_by_sampling(random_cov: Maker) -> None:
     assert (cov == cov.T).all()
 
 
+def test_spread_of_a_mixture_far_from_the_origin(random_cov: Maker) -> None:
+    """Eastings and northings: the covariance does not change where all means move alike, to the
+    digits of a metre and not of its product with a northing."""
+    rng = np.random.default_rng(5)
+    away, weights = rng.integers(-9, 10, size=(3, 2)) / 8.0, np.array([0.2, 0.5, 0.3])
+    covs, mean, cov = np.array([random_cov(rng, 2) for _ in range(3)]), np.empty(2), np.eye(2)
+    imm.combine(np.array([500_000.0, 6_600_000.0]) + away, covs, weights, mean, cov)
+    expected = np.einsum("k,kab->ab", weights, covs) + np.cov(away.T, aweights=weights, ddof=0)
+    np.testing.assert_allclose(cov, expected, rtol=1e-12)
+
+
 def test_log_likelihood_equals_scipys(row: Maker, random_cov: Maker) -> None:
     rng = np.random.default_rng(3)
     mean, cov, H = rng.normal(size=6), random_cov(rng, 6), rng.normal(size=(3, 6))
@@ -124,6 +135,19 @@ def test_weights_never_die() -> None:
     assert (weights >= 0.999e-12).all()
     imm.mix(np.zeros((3, 1)), np.ones((3, 1, 1)), weights, np.eye(3))
     assert (weights >= 0.999e-12).all()
+
+
+def test_a_model_left_for_long_comes_back() -> None:
+    """Half of its probability passes on each time and nothing back: 2^-2000 is no number."""
+    means, covs = np.array([[0.0], [8.0]]), np.ones((2, 1, 1))
+    weights, transition = np.array([0.5, 0.5]), np.array([[1.0, 0.0], [0.5, 0.5]])
+    for _ in range(2000):
+        imm.mix(means, covs, weights, transition)
+    assert weights[1] == pytest.approx(1e-12, rel=1e-9)
+    assert weights.sum() == pytest.approx(1.0, abs=1e-15)
+    assert means[1, 0] == 8.0
+    assert means[0, 0] == pytest.approx(4.0)
+    assert covs[0, 0, 0] == pytest.approx(17.0)
 
 
 def test_one_decision_for_all_models(row: Maker) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from engine_cases import opened, start
-from netpos.filters import ekf
+from netpos.filters import conditioning, ekf
 from netpos.filters.measurement import (
     GATE_VARIANCE,
     GROUP,
@@ -17,7 +17,7 @@ from netpos.filters.measurement import (
     curvature_variance,
     linearise,
 )
-from netpos.filters.motion import NO_BIAS, SPEED_OF_LIGHT_MPS
+from netpos.filters.motion import NO_BIAS, SPEED_OF_LIGHT_MPS, Parameter, noise
 from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, InitialPose, RsuInfo, RsuMeasurement
 from netpos.scenario import Simulation, load_scenario
@@ -88,23 +88,31 @@ def plain_step(
     rows: Array,
     motion: Array,
     options: Array,
+    allowed: Array | None = None,
 ) -> tuple[Array, Array, float, int, Array]:
-    """The rules: predict; open after too many rejected epochs; a second look where something is
-    refused, taken if it accepts more; nothing accepted leaves the prediction."""
+    """The rules: predict; open after too many rejected epochs; re-weight what is to be; a second
+    look where something is refused, taken if it accepts more; nothing accepted leaves the
+    prediction. What was added to the prediction, if anything was accepted, is added to
+    ``allowed``."""
     prior, prior_cov = mean.copy(), cov.copy()
     ekf.predict(prior, prior_cov, dt, motion, NO_BIAS)
     P = prior_cov
     if rejected >= options[Option.INFLATE_AFTER]:
         P = opened(P, options[Option.INITIAL_SPEED], unheard_s)
+    rows, work = rows.copy(), ekf.workspace(len(mean), len(rows))
+    robust, *weights = options[Option.ROBUST : Option.POSITION_GAIN].tolist()
+    conditioning.condition(prior, P, rows, 0.0, int(robust), *weights, work)
     best = look(prior, P, rows, options)
     sd = options[Option.MANOEUVRE_SPEED]
     if sd > 0.0 and not best[4].all():
         wide = P + turned(prior, prior_cov, rows, unheard_s, options) - prior_cov
         second = look(prior, wide, rows, options)
         if second[4].sum() > best[4].sum():
-            best = second
+            best, P = second, wide
     if not best[4].any():
         return prior, prior_cov, best[2], best[3], best[4]
+    if allowed is not None:
+        allowed += P - prior_cov
     return best
 
 
@@ -139,6 +147,9 @@ CASES = {
     "moved, a second look too narrow": ({"manoeuvre_speed_sd_mps": 0.01}, 0, (), 6.0, 0),
     "second look no better": ({"manoeuvre_speed_sd_mps": 0.5}, 0, (1,), 0.0, 2),
     "opened and second look": ({"manoeuvre_speed_sd_mps": 20.0}, 2, (), 14.0, 3),
+    "opened, moved too far for one look": ({"manoeuvre_speed_sd_mps": 20.0}, 2, (), 40.0, 3),
+    "weighed": ({"robust": "huber", "robust_parameter": 1.3}, 0, (), 1.5, 2),
+    "late": ({"nlos_probability": 0.3}, 0, (), 2.0, 2),
     "no gate": ({"gate_probability": 1.0}, 0, (0, 1), 6.0, 3),
 }
 
@@ -156,14 +167,19 @@ def test_step_follows_the_rules(filter_name: str, name: str) -> None:
     rows = rows_of(truth, np.random.default_rng(3), wrong)
     kept = rows.copy()
     own = motion.copy()  # the step notes there which velocity step it allowed for
+    own[Parameter.JUMP_SPEED] = 7.0  # in the epoch before
     got = compiled_step(mean, cov, 0.1, 1.3, rejected, rows, own, options)
-    want = plain_step(mean, cov, 0.1, 1.3, rejected, rows, motion, options)
+    allowed, noted, without = np.zeros((3, 6, 6))
+    want = plain_step(mean, cov, 0.1, 1.3, rejected, kept, motion, options, allowed)
     assert got[4].sum() == taken
     np.testing.assert_array_equal(got[4], want[4])
     assert (got[2], got[3]) == (pytest.approx(want[2], rel=1e-12), want[3])
     np.testing.assert_allclose(got[0], want[0], rtol=1e-12, atol=1e-13)
     np.testing.assert_allclose(got[1], want[1], rtol=1e-11, atol=1e-13)
-    np.testing.assert_array_equal(rows, kept)
+    noise(mean, 0.1, own, NO_BIAS, noted)
+    noise(mean, 0.1, motion, NO_BIAS, without)
+    np.testing.assert_allclose(noted - without, allowed, rtol=1e-9, atol=1e-11)
+    assert np.array_equal(rows, kept) is (name not in {"weighed", "late"})
     if taken == 0:  # exactly the prediction
         ekf.predict(mean, cov, 0.1, motion, NO_BIAS)
         np.testing.assert_array_equal(got[0], mean)
@@ -191,7 +207,7 @@ def drive(epochs: int = 60) -> tuple[Array, Array, Array]:
 def run(config: TrackerConfig, mean: Array, cov: Array, inputs: Any) -> tuple[int, Any]:
     stamps, starts, rows = inputs
     N, n = len(stamps), len(mean)
-    out = (np.zeros((N, n)), np.zeros((N, n, n)), np.zeros(N), np.zeros(N), np.zeros(N))
+    out = tuple(np.full(shape, np.nan) for shape in ((N, n), (N, n, n), N, N, N))
     before = rows.copy()
     done = engine.run_epochs(
         stamps,
@@ -248,7 +264,7 @@ def test_a_run_ends_where_the_track_is_lost() -> None:
     assert done == lost
     assert taken[29] > 0
     assert (taken[30:33] == 0).all()
-    assert (means[lost:] == 0.0).all()
+    assert np.isnan(means[lost:]).all()
 
 
 # against the tracker

@@ -9,9 +9,14 @@ import numpy as np
 import pytest
 from engine_cases import opened, start
 from netpos.filters import ekf, srukf
+from netpos.filters.measurement import GATE_VARIANCE, VARIANCE
 from netpos.filters.motion import NO_BIAS, noise
+from netpos.filters.rows import linear_rows
 from netpos.tracking import TrackerConfig, engine
 from netpos.tracking.models import motions_of, options_of
+from scipy.stats import chi2
+
+H = np.eye(2, 6)
 
 
 def test_opening_a_factor_is_opening_its_covariance() -> None:
@@ -72,10 +77,17 @@ def test_a_smoother_is_told_of_both_steps(opened_sd: float, turn: float) -> None
         ({"cov": (0, 1, 1.0)}, False),
         ({"cov": (2, 3, -1.0)}, False),
         ({"cov": (4, 5, 1.0)}, True),
+        *(({"block": (p, 4.0, 5.0, 9.0)}, True) for p in (0, 2)),
+        *(({"block": (p, 4.0, 6.5, 9.0)}, False) for p in (0, 2)),
+        *(({"block": (p, 1e6, 0.0, 1e-8)}, True) for p in (0, 2)),
+        *(({"block": (p, 1e6, 0.0, 1e-10)}, False) for p in (0, 2)),
+        *(({"block": (p, 1.0, 1.0 - 4e-15, 1.0)}, True) for p in (0, 2)),
+        *(({"block": (p, 1.0, 1.0 - 1e-15, 1.0)}, False) for p in (0, 2)),
     ],
 )
 def test_what_can_be_a_device(change: dict[str, Any], sound: bool) -> None:
-    """A clock may be known exactly; a position and a velocity may not."""
+    """A clock may be known exactly; a position and a velocity may not, but for rounding: the
+    smaller variance along any axis is no more than 1e-15 of both."""
     mean, cov = np.zeros(6), np.eye(6)
     if "mean" in change:
         at, value = change["mean"]
@@ -83,6 +95,9 @@ def test_what_can_be_a_device(change: dict[str, Any], sound: bool) -> None:
     if "cov" in change:
         i, j, value = change["cov"]
         cov[i, j] = cov[j, i] = value
+    if "block" in change:
+        p, a, b, c = change["block"]
+        cov[p : p + 2, p : p + 2] = [[a, b], [b, c]]
     assert engine.is_sound(mean, cov) is sound
 
 
@@ -111,3 +126,64 @@ def test_predict_does_nothing_for_no_time(name: str) -> None:
     ekf.predict(mean, cov, 0.5, motion, NO_BIAS)  # linear: all the same
     np.testing.assert_allclose(x, mean, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(engine.to_cov(S, options), cov, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["ekf", "iekf", "ukf", "srukf", "kf"])
+def test_every_filter_applies_what_is_linear_alike(name: str) -> None:
+    """Two fixes, the second 100 m off: the information form of the first."""
+    options, (prior, cov) = options_of(TrackerConfig(filter=name)), start()
+    R, fix = np.diag([0.25, 0.16]), prior[:2] + np.array([0.8, -0.5])
+    rows = np.vstack([linear_rows(fix, R, H, 0), linear_rows(fix + 100.0, R, H, 1)])
+    x, S, accepted = prior.copy(), engine.to_spread(cov, options), np.full(2, 9.0)
+    nis, used = engine.update(x, S, rows, options, accepted, ekf.workspace(6, 4))
+    assert accepted.tolist() == [1.0, 0.0]
+    residual, information = fix - prior[:2], np.linalg.inv(cov)
+    expected = residual @ np.linalg.solve(cov[:2, :2] + R, residual)
+    assert (nis, used) == (pytest.approx(expected, rel=1e-7), 2)
+    posterior = np.linalg.inv(information + H.T @ np.linalg.inv(R) @ H)
+    expected_mean = prior + posterior @ H.T @ np.linalg.solve(R, residual)
+    np.testing.assert_allclose(x, expected_mean, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(engine.to_cov(S, options), posterior, rtol=1e-7, atol=1e-9)
+
+
+def test_the_linear_filter_has_its_floors() -> None:
+    """A fix next to nothing is known better than by: the gains are the floors."""
+    floors = {"position_gain_min": 0.5, "velocity_gain_min": 0.25, "accel_gain_min": 0.125}
+    options = options_of(TrackerConfig(filter="kf", **floors))
+    x, P = np.zeros(8), 1e-6 * np.eye(8)
+    rows = linear_rows(np.array([2.0, -1.0]), np.eye(2), H, 0)
+    engine.update(x, P, rows, options, np.zeros(1), ekf.workspace(8, 2))
+    np.testing.assert_allclose(x, [1.0, -0.5, 0.5, -0.25, 0.0, 0.0, 0.25, -0.125], rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["iekf", "srukf"])
+@pytest.mark.parametrize(("share", "is_one"), [(0.999, True), (1.001, False)])
+def test_a_manoeuvre_is_more_than_the_velocity_allows_for(
+    name: str, share: float, is_one: bool
+) -> None:
+    """A fix of variance 5 in all, the same on either axis: a step of 3 m/s shows after the gate's
+    distance over 3 m/s, and is followed for twice that; no time is shorter than the silence. One
+    that no row tells of shows never."""
+    change = {"manoeuvre_speed_sd_mps": 3.0, "gate_probability": 0.999}
+    options = options_of(TrackerConfig(filter=name, **change))
+    cov = np.diag([2.0, 2.0, 12.0 * share, 6.0 * share, 1.0, 1.0])
+    S, rows = engine.to_spread(cov, options), linear_rows(np.zeros(2), 3.0 * np.eye(2), H, 0)
+    shows_s = math.sqrt(chi2.ppf(0.999, 2) * 5.0) / 3.0
+    for unheard_s in (0.1, 2.01 * shows_s):
+        within_s = engine.manoeuvre_s(np.zeros(6), S, rows, unheard_s, options)
+        expected = max(unheard_s, 2.0 * shows_s) if is_one else unheard_s
+        assert within_s == pytest.approx(expected, rel=1e-9)
+        assert engine.manoeuvre_s(np.zeros(6), S, rows[:0], unheard_s, options) == unheard_s
+
+
+@pytest.mark.parametrize("name", ["iekf", "srukf"])
+def test_rows_are_weighed_by_what_is_carried(name: str) -> None:
+    """Huber's factor of a fix 9 m and 7 m off, under the covariance of either filter."""
+    options = options_of(TrackerConfig(filter=name, robust="huber", robust_parameter=1.5))
+    (mean, cov), R, off = start(), np.diag([0.25, 0.16]), np.array([9.0, -7.0])
+    rows = linear_rows(mean[:2] + off, R, H, 0)
+    S, work = engine.to_spread(cov, options), ekf.workspace(6, 2)
+    engine.condition(mean, S, rows, options, work)
+    factor = math.sqrt(off @ np.linalg.solve(cov[:2, :2] + R, off) / 2.0) / 1.5
+    assert factor > 2.0
+    np.testing.assert_allclose(rows[:, [VARIANCE, GATE_VARIANCE]], factor, rtol=1e-9)

@@ -5,16 +5,25 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import filter_rows
 import numpy as np
 import pytest
+from engine_cases import opened
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from netpos.filters.manoeuvre import unnoticed_s
-from netpos.filters.measurement import GROUP, VALUE, linearise
+from netpos.filters.measurement import (
+    GROUP,
+    VALUE,
+    VARIANCE,
+    Kind,
+    curvature_variance,
+    linearise,
+)
 from netpos.filters.rows import linear_rows, rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking import TrackerConfig
-from netpos.tracking.engine import Option
+from netpos.tracking.engine import GATE, Option
 from netpos.tracking.fit import fits_and_level, row_fits
 from netpos.tracking.models import options_of
 from netpos.tracking.protection import (
@@ -93,14 +102,18 @@ def test_monte_carlo() -> None:
         assert low <= count <= high
 
 
+# An angle below 1e-154 has a square of fewer digits, and the covariance made of both is none.
+ANGLES = st.just(0.0) | st.floats(1e-9, math.pi)
+
+
 @settings(max_examples=200, deadline=None)
 @given(
     sd_x=st.floats(1e-3, 1e4),
     ratio=st.floats(0.0, 1.0),
-    angle=st.floats(0.0, math.pi),
+    angle=ANGLES,
     risk=st.floats(RISK_MIN, 0.5),
     more=st.floats(0.0, 1.0),
-    direction=st.floats(0.0, math.pi),
+    direction=ANGLES,
 )
 def test_monotone_in_covariance_and_risk(
     sd_x: float, ratio: float, angle: float, risk: float, more: float, direction: float
@@ -284,6 +297,36 @@ def test_level_of_a_manoeuvre_with_biases_that_tell_nothing() -> None:
         assert np.array_equal(mean[:6], prior)
         assert np.array_equal(P[:6, :6], cov)
     assert levels[0] == pytest.approx(levels[1], rel=1e-9)
+
+
+def test_level_of_a_manoeuvre_is_linearised_at_its_own_answer() -> None:
+    """RSUs some metres away, where bearings and ranges bend: the answer from the estimate, and
+    once more from that answer with the curvature left at it. A third group is refused."""
+    rng, said = np.random.default_rng(7), options()
+    prior, cov = np.array([10.0, 20.0, 3.0, -1.0, 0.5, 0.1]), filter_rows.make_cov(rng, 6)
+    rows = np.array(
+        [
+            filter_rows.row(Kind.AZIMUTH, 1.2, 0.02, 0, (7.0, 15.0, 0.0)),
+            filter_rows.row(Kind.RANGE, 6.5, 0.3, 1, (12.0, 14.0, 3.0)),
+            filter_rows.row(Kind.RANGE, 90.0, 0.3, 2, (0.0, 0.0, 3.0)),
+        ]
+    )
+    accepted, mean, height_m = np.array([1.0, 1.0, 0.0]), prior + 0.4, said[Option.HEIGHT]
+    _, longest_s = unnoticed_s(prior, cov, rows, height_m, said[GATE + 2], 4.0, np.empty(6))
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    times_s = longest_s * (nodes + 1.0) / 2.0
+    wide = sum(w / 2.0 * opened(cov, 4.0, s) for s, w in zip(times_s, weights, strict=True))
+    x, bent, used = mean, np.zeros(2), rows[:2]
+    for _ in range(2):
+        z, H = linearise(used, x, height_m)
+        S = H @ wide @ H.T + np.diag(used[:, VARIANCE] + bent)
+        x = prior + wide @ H.T @ np.linalg.solve(S, z + H @ (x - prior))
+        P = wide - wide @ H.T @ np.linalg.solve(S, H @ wide)
+        bent = np.array([curvature_variance(row, x, P, height_m) for row in used])
+    assert (bent[1:] > 0.01 * used[1:, VARIANCE]).all()
+    expected = np.linalg.norm(x[:2] - mean[:2]) + protection_level(P[:2, :2], 1e-4)
+    level = manoeuvre_level(prior, cov, rows, accepted, 0.1, mean, said, 1e-4)
+    assert level == pytest.approx(expected, rel=1e-9)
 
 
 def test_a_manoeuvre_nobody_could_notice() -> None:
