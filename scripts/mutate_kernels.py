@@ -55,8 +55,13 @@ TESTS_OF = {
     "srukf": "test_srukf.py -knot+ten_thousand",
     "step_velocity": "test_step_velocity.py test_measurement.py",
     "tracking/engine": "test_engine_parts.py test_engine.py -knot+equals_the_tracker",
+    "tracking/fit": "test_protection.py -kfits_and_level+or+is_not_sound",
+    "tracking/initialise": "test_initialise.py test_initialise_fit.py",
+    "tracking/output": "test_output.py",
+    "tracking/phase_fix": "test_phase_fix.py",
     "tracking/protection": "test_protection.py",
     "tracking/rivals": "test_rivals.py -knot+turn_along_the_bearing",
+    "tracking/sector_bank": "test_sector_bank.py",
     "ukf": "test_ukf.py test_gate.py",
 }
 # Newton's method gets there from anywhere.

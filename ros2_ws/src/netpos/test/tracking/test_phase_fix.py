@@ -6,10 +6,28 @@ import math
 
 import numpy as np
 import pytest
-from netpos.filters.measurement import KIND, VALUE, Kind, predict_row
+from netpos.filters.measurement import (
+    BIAS,
+    COMMON,
+    GATE_VARIANCE,
+    HEADING,
+    KIND,
+    LEVER,
+    VALUE,
+    VARIANCE,
+    Kind,
+    predict_row,
+)
 from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
-from netpos.tracking.phase_fix import admissible, nearest_turns, place, spawn, to_fix
+from netpos.tracking.phase_fix import (
+    admissible,
+    nearest_turns,
+    phase_scale,
+    place,
+    spawn,
+    to_fix,
+)
 from scipy.spatial.transform import Rotation
 
 HEIGHT = 1.2
@@ -26,18 +44,19 @@ def anchor(turn_deg: float = 35.0, wavelengths: float = 4.0) -> RsuInfo:
     )
 
 
-def rows_of(info: RsuInfo, xy: Array, range_sd: float = 0.03, phase_sd: float = 0.1) -> Array:
-    """Noise-free range and wrapped phase of a device."""
+def rows_of(info: RsuInfo, xy: Array, lever_m: float = 0.0) -> Array:
+    """Noise-free range and phase of a device whose antenna is ``lever_m`` above its origin."""
     measured = RsuMeasurement(
         stamp_ns=1,
         rsu_id="a",
         vue_id="v",
         fields=Field.RANGE | Field.PHASE,
-        range_var=range_sd**2,
-        phase_difference_var=phase_sd**2,
+        range_var=0.03**2,
+        phase_difference_var=0.1**2,
     )
     rows = rsu_rows(measured, info, rsu_axes(info), 0)
     state = np.array([*xy, 0.0, 0.0, 0.0, 0.0])
+    rows[:, LEVER + 2] = lever_m
     for row in rows:
         row[VALUE] = predict_row(row, state, HEIGHT, np.empty(6))
     return rows
@@ -100,6 +119,44 @@ def test_the_covariance_is_that_of_noisy_measurements() -> None:
     assert np.hypot(*(points.mean(axis=0) - xy)) < 3e-3
 
 
+@pytest.mark.parametrize(("ahead", "right"), [(4.0, 2.0), (3.0, -2.5), (6.0, 0.5)])
+def test_the_covariance_is_that_of_small_errors(ahead: float, right: float) -> None:
+    """By central differences, of an antenna above the device's origin."""
+    info = anchor()
+    rows, turns = wrapped(rows_of(info, in_front(info, ahead, right), lever_m=0.4))
+    point, stated, spare = np.empty(2), np.empty((2, 2)), np.empty((2, 2))
+    assert place(rows[0], rows[1], turns, HEIGHT, point, stated)
+    np.testing.assert_allclose(point, in_front(info, ahead, right), atol=1e-9)
+    slopes = np.empty((2, 2))
+    for i in range(2):
+        ends = np.empty((2, 2))
+        for end, step in zip(ends, (1e-5, -1e-5), strict=True):
+            near = rows.copy()
+            near[i, VALUE] += step
+            assert place(near[0], near[1], turns, HEIGHT, end, spare)
+        slopes[:, i] = (ends[0] - ends[1]) / 2e-5
+    expected = slopes @ np.diag(rows[:, VARIANCE]) @ slopes.T
+    np.testing.assert_allclose(stated, expected, rtol=2e-3, atol=1e-7)
+
+
+def test_biases_and_a_heading_among_the_states_do_not_move_the_place() -> None:
+    info = anchor()
+    rows, turns = wrapped(rows_of(info, in_front(info, 4.0, 2.0)))
+    points, covs = np.empty((2, 2)), np.empty((2, 2, 2))
+    for point, cov in zip(points, covs, strict=True):
+        assert place(rows[0], rows[1], turns, HEIGHT, point, cov)
+        rows[:, [BIAS, COMMON, HEADING]] = 6, 7, 8
+    np.testing.assert_array_equal(points[0], points[1])
+    np.testing.assert_array_equal(covs[0], covs[1])
+
+
+def test_the_scale_is_the_baseline_in_radians_however_it_hangs() -> None:
+    info = anchor()
+    for angles in ((35.0, 0.0, 0.0), (35.0, 20.0, -50.0)):
+        info.quaternion[:] = Rotation.from_euler("zyx", angles, degrees=True).as_quat()
+        assert phase_scale(rows_of(info, np.array([4.0, 4.0]))[1]) == pytest.approx(8.0 * math.pi)
+
+
 def test_no_place_inside_the_array_or_above_it() -> None:
     info = anchor()
     rows = rows_of(info, in_front(info, 4.0, 0.0))
@@ -157,8 +214,13 @@ def test_a_fix_as_linear_rows_has_its_place_and_covariance() -> None:
     point, cov = np.empty(2), np.empty((2, 2))
     place(rows[0], rows[1], turns, HEIGHT, point, cov)
     rows[1, VALUE] += 2 * math.pi * turns
-    assert to_fix(rows, 1, HEIGHT)
+    others = np.full((2, rows.shape[1]), 7.0)
+    rows = np.vstack([others, rows])
+    assert to_fix(rows, 3, HEIGHT)
+    np.testing.assert_array_equal(rows[:2], others)
+    rows = rows[2:]
     assert rows[:, KIND].tolist() == [Kind.LINEAR, Kind.LINEAR]
+    assert (rows[:, [VARIANCE, GATE_VARIANCE]] == 1.0).all()
     H, h = np.empty((2, 6)), np.empty(6)
     for i in range(2):
         predict_row(rows[i], np.zeros(6), HEIGHT, h)
