@@ -61,7 +61,7 @@ TESTS_OF = {
     "tracking/phase_fix": "test_phase_fix.py",
     "tracking/protection": "test_protection.py",
     "tracking/rivals": "test_rivals.py -knot+turn_along_the_bearing",
-    "tracking/sector_bank": "test_sector_bank.py",
+    "tracking/sector_bank": "test_sector_bank_rules.py test_sector_bank.py",
     "ukf": "test_ukf.py test_gate.py",
 }
 # Newton's method gets there from anywhere.
@@ -105,6 +105,7 @@ EQUIVALENT = {
     ("tracking/protection", "radius_of", "operator swapped: xx + yy"),  # finite where both are
     ("tracking/rivals", "_weigh", "left out: rival = math.inf"),  # set by what follows
     ("tracking/rivals", "_weigh", "left out: continue"),  # no evidence is no number, not taken
+    ("tracking/sector_bank", "_gains", "operator swapped: _WIDE_RAD * _WIDE_RAD"),  # is 1
     *(  # memory for more rows than there are
         ("tracking/engine", "run_epochs", f"operator swapped: {size}")
         for size in ("row_start[k + 1] - row_start[k] (2)", "k + 1 (3)")

@@ -1,0 +1,263 @@
+"""The kernels of a bank of filters one by one, in NumPy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from anchor_walk import Walk, rows_at
+from engine_cases import opened
+from netpos.filters import ekf
+from netpos.filters.measurement import KIND, VALUE, Kind, predict_row
+from netpos.filters.motion import NO_BIAS
+from netpos.filters.rows import linear_rows
+from netpos.filters.sigma import innovation_cov, regress
+from netpos.messages.values import Array
+from netpos.tracking import TrackerConfig, engine, sector_bank
+from netpos.tracking.engine import GATE, GATE_SIZE
+from netpos.tracking.models import motions_of, options_of
+from netpos.tracking.phase_fix import place, spawn
+from scipy.special import logsumexp
+
+SLOTS, MIDDLE = 11, 5
+TURN = 2.0 * math.pi
+FIXED = {"filter": "iekf", "initial_speed_sd_mps": 1.5}
+
+
+def informed(mean: Array, cov: Array, z: Array, H: Array) -> tuple[Array, Array]:
+    """What a measurement of unit variances makes of a state: the information form."""
+    posterior = np.linalg.inv(np.linalg.inv(cov) + H.T @ H)
+    return mean + posterior @ H.T @ (z - H @ mean), posterior
+
+
+def test_weights_follow_the_likelihood_and_outliers_decide_nothing() -> None:
+    """Three filters, the first of them not there. Of three groups the second and the third, of
+    more rows than the gate has bounds for, are refused: each counts as one at its gate."""
+    options, rng = options_of(TrackerConfig(**FIXED)), np.random.default_rng(4)
+    sizes = (2, 3, 70)
+    H = [rng.normal(size=(m, 6)) for m in sizes]
+    means = np.vstack([np.full(6, np.nan), 0.3 * rng.normal(size=(2, 6))])
+    A = rng.normal(size=(2, 6, 6))
+    covs = np.concatenate([np.full((1, 6, 6), np.nan), A @ A.transpose(0, 2, 1) / 6.0])
+    z = [np.ones(m) + 1e3 * (g > 0) for g, m in enumerate(sizes)]
+    rows = np.vstack([linear_rows(z[g], np.eye(m), H[g], g) for g, m in enumerate(sizes)])
+    weights = np.array([-math.inf, math.log(0.3), math.log(0.7)])
+    logs, expected = (
+        weights.copy(),
+        [(x.copy(), P.copy()) for x, P in zip(means, covs, strict=True)],
+    )
+    nis_expected = np.full(3, 9.0)
+    for s in (1, 2):
+        x, P = expected[s]
+        for g, m in enumerate(sizes):
+            S, off = H[g] @ P @ H[g].T + np.eye(m), z[g] - H[g] @ x
+            distance = off @ np.linalg.solve(S, off)
+            bound = options[GATE + min(m, GATE_SIZE - 1)]
+            assert bool(distance > bound) is (g > 0)
+            logs[s] -= 0.5 * (min(distance, bound) + np.linalg.slogdet(S)[1])
+            nis_expected[s] = distance if g == 0 else nis_expected[s]
+        expected[s] = informed(x, P, z[0], H[0])
+    accepted, nis, used = np.full((3, 3), 9.0), np.full(3, 9.0), np.full(3, 9.0)
+    work = ekf.workspace(6, len(rows))
+    sector_bank.weigh(means, covs, weights, rows, options, accepted, nis, used, work)
+    np.testing.assert_allclose(weights[1:], (logs - logsumexp(logs))[1:], rtol=1e-7, atol=1e-9)
+    assert weights[0] == -math.inf
+    assert accepted.tolist() == [[9.0] * 3, [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+    np.testing.assert_allclose(nis, nis_expected, rtol=1e-9)
+    assert used.tolist() == [9.0, 2.0, 2.0]
+    for s in range(3):
+        np.testing.assert_allclose(means[s], expected[s][0], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(covs[s], expected[s][1], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("jump_sd", [0.0, 3.0])
+def test_all_filters_that_are_there_move(jump_sd: float) -> None:
+    config, rng = TrackerConfig(**FIXED), np.random.default_rng(1)
+    motion, options = motions_of(config)[0], options_of(config)
+    means, covs = rng.normal(size=(3, 6)), np.array([np.eye(6) * k for k in (1.0, 2.0, 3.0)])
+    weights = np.array([math.log(0.5), -math.inf, math.log(0.5)])
+    expected, spread = means.copy(), covs.copy()
+    for s in (0, 2):
+        ekf.predict(expected[s], spread[s], 0.2, motion, NO_BIAS)
+        spread[s] = opened(spread[s], jump_sd, 1.7)
+    sector_bank.advance(means, covs, weights, 0.2, jump_sd, 1.7, motion, NO_BIAS, options)
+    np.testing.assert_allclose(means, expected, rtol=1e-12)
+    np.testing.assert_allclose(covs, spread, rtol=1e-12, atol=1e-14)
+
+
+def test_weights_sum_to_one_above_their_floor() -> None:
+    """However small all are: only their ratios count."""
+    for scale in (0.0, -5000.0, 5000.0):
+        weights = np.array([0.0, -100.0, -math.inf, math.log(0.25)]) + scale
+        sector_bank.normalise(weights, 1e-4)
+        share = np.array([0.8, 1e-4, 0.0, 0.2]) / (1.0 + 1e-4)
+        share[1] = 1e-4
+        np.testing.assert_allclose(np.exp(weights), share, rtol=1e-9)
+
+
+class Epoch:
+    """One epoch of a walk, as a bank sees it that knows of one sector; slots that are not there
+    hold sevens."""
+
+    def __init__(
+        self, sd: float, height_m: float, range_off_m: float = 0.0, name: str = "iekf"
+    ) -> None:
+        self.walk = Walk(np.array([0.8, 4.5]), 0.3, 0.2, 1)
+        self.rows = rows_at(self.walk, 0, 0.05)
+        self.height_m = height_m
+        self.options = options_of(
+            TrackerConfig(filter=name, initial_speed_sd_mps=1.5, device_height_m=height_m)
+        )
+        self.rows[1, KIND] = Kind.UNWRAPPED_PHASE
+        for row in self.rows[:2]:
+            state = np.array([0.8, 4.5, 0.0, 0.0, 0.0, 0.0])
+            row[VALUE] = predict_row(row, state, height_m, np.empty(6))
+        turns = round(self.rows[1, VALUE] / TURN)
+        self.leader = MIDDLE + turns
+        self.rows[1, KIND] = Kind.PHASE
+        self.rows[:2, VALUE] += range_off_m, -TURN * turns
+        self.prior = np.array([0.81, 4.48, *self.walk.velocity, 0.0, 0.0])
+        self.cov = np.diag([sd, sd, 0.1, 0.1, 1.0, 1.0]) ** 2
+        self.means, self.covs = np.full((SLOTS, 6), 7.0), np.full((SLOTS, 6, 6), 7.0)
+        self.means[self.leader] = self.prior
+        self.covs[self.leader] = engine.to_spread(self.cov, self.options)
+        self.weights = np.full(SLOTS, -math.inf)
+        self.weights[self.leader] = 0.0
+        self.heirs = np.full(SLOTS, 9, dtype=np.int64)
+        self.accepted, self.nis, self.used = np.full((SLOTS, 2), 9.0), *np.full((2, SLOTS), 9.0)
+
+    def turned(self, slot: int) -> Array:
+        rows = self.rows.copy()
+        rows[1, KIND] = Kind.UNWRAPPED_PHASE
+        rows[1, VALUE] += TURN * (slot - MIDDLE)
+        return rows
+
+    def resolve(self) -> None:
+        before = self.rows.copy()
+        told = (self.heirs, self.accepted, self.nis, self.used, ekf.workspace(6, len(before)))
+        state = (self.means, self.covs, self.weights, self.rows)
+        sector_bank.resolve(*state, 1, self.options, 1e-4, *told)
+        np.testing.assert_array_equal(self.rows, before)
+
+    def placed(self, slot: int) -> tuple[Array, Array] | None:
+        """A filter put where range and phase say, then told the velocity."""
+        mean, cov, rows = self.prior.copy(), self.cov.copy(), self.turned(slot)
+        if spawn(mean, cov, rows[0], rows[1], 0, 1.5, self.height_m) == -math.inf:
+            return None
+        H = np.eye(2, 6, k=2) / 0.05
+        return informed(mean, cov, self.walk.velocity / 0.05, H)
+
+
+@pytest.mark.parametrize(
+    ("name", "sd", "height_m"),
+    [("iekf", 0.03, 0.0), ("iekf", 0.03, 3.0), ("iekf", 0.6, 0.0), ("srukf", 0.03, 0.0)],
+)
+def test_sectors_nobody_knows_of_are_placed_anew(name: str, sd: float, height_m: float) -> None:
+    """The filter that is there takes the measurement, or the fix it gives where the tangent does
+    not reach; what it does not explain is put where range and phase say, at the floor, if that is
+    a place at all."""
+    epoch = Epoch(sd, height_m, name=name)
+    leader, mean = epoch.leader, epoch.prior.copy()
+    cov = epoch.covs[leader].copy()
+    accepted, own = np.zeros(2), epoch.turned(leader)
+    epoch.resolve()
+    if sd < 0.1:
+        nis, used = engine.update(mean, cov, own, epoch.options, accepted, ekf.workspace(6, 4))
+        assert epoch.nis[leader] == pytest.approx(nis, rel=1e-9)
+    else:
+        point, R, used = np.empty(2), np.empty((2, 2)), 4
+        assert place(own[0], own[1], 0, height_m, point, R)
+        root = np.linalg.inv(np.linalg.cholesky(R))
+        H = np.vstack([root @ np.eye(2, 6), np.eye(2, 6, k=2) / 0.05])
+        mean, cov = informed(mean, cov, np.r_[root @ point, epoch.walk.velocity / 0.05], H)
+    np.testing.assert_allclose(epoch.means[leader], mean, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(epoch.covs[leader], cov, rtol=1e-7, atol=1e-9)
+    covs = [engine.to_cov(P, epoch.options) for P in epoch.covs]
+    assert (epoch.used[leader], epoch.accepted[leader].tolist()) == (used, [1.0, 1.0])
+    assert epoch.heirs[leader] == leader
+    there = 0
+    for slot in set(range(SLOTS)) - {leader}:
+        if epoch.heirs[slot] == leader:  # a neighbour the wide filter explains
+            assert sd > 0.1
+            there += 1
+            continue
+        assert epoch.heirs[slot] == -1
+        assert sd > 0.1 or (epoch.nis[slot], epoch.used[slot]) == (0.0, 0.0)
+        expected = epoch.placed(slot)
+        assert math.isfinite(epoch.weights[slot]) is (expected is not None)
+        if expected is None:
+            continue
+        there += 1
+        np.testing.assert_allclose(epoch.means[slot], expected[0], rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(covs[slot], expected[1], rtol=1e-7, atol=1e-9)
+        assert epoch.accepted[slot].tolist() == [1.0, 1.0]
+        assert sd > 0.1 or epoch.weights[slot] == pytest.approx(math.log(1e-4), abs=2e-3)
+    assert there == (5 if height_m > 0.0 else 7)
+    assert logsumexp(epoch.weights) == pytest.approx(0.0, abs=1e-2)
+    for slot in (0, 10):  # five turns are none of the array's
+        assert (epoch.means[slot] == 7.0).all()
+        assert epoch.accepted[slot].tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(("variance", "is_wide"), [(0.995, 0.0), (1.005, 1.0)])
+def test_a_tangent_reaches_as_far_as_a_radian(variance: float, is_wide: float) -> None:
+    """Of the prior alone, without the noise of the phase."""
+    epoch = Epoch(0.03, 0.0)
+    rows = epoch.turned(epoch.leader)
+
+    def phase_variance() -> float:
+        L = np.linalg.cholesky(epoch.covs[epoch.leader])
+        _, G, E = regress(epoch.prior, L, rows, 0.0)
+        return float(innovation_cov(G, E, np.zeros(4))[1, 1])
+
+    for _ in range(9):
+        epoch.covs[epoch.leader][:2, :2] *= variance / phase_variance()
+    assert phase_variance() == pytest.approx(variance, abs=1e-6)
+    state = (epoch.means, epoch.covs, epoch.weights)
+    _, wide = sector_bank._gains(*state, epoch.turned(MIDDLE), 1, epoch.options)
+    assert wide[epoch.leader] == is_wide
+
+
+def test_what_the_leader_refuses_places_nobody() -> None:
+    epoch = Epoch(0.03, 0.0, range_off_m=3.0)
+    epoch.resolve()
+    assert epoch.accepted[epoch.leader].tolist() == [0.0, 1.0]
+    weights = np.full(SLOTS, -math.inf)
+    weights[epoch.leader] = 0.0
+    np.testing.assert_array_equal(epoch.weights, weights)
+    assert (np.delete(epoch.means, epoch.leader, axis=0) == 7.0).all()
+    assert epoch.used[epoch.leader] == 2
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_who_is_placed_anew_may_refuse_the_rest(alone: bool) -> None:
+    """A velocity ten metres per second off, or none at all: the place stays as it was put."""
+    epoch = Epoch(0.03, 0.0)
+    if alone:
+        epoch.rows, epoch.accepted = epoch.rows[:2].copy(), epoch.accepted[:, :1].copy()
+    else:
+        epoch.rows[2:, VALUE] += 10.0 / 0.05
+    epoch.resolve()
+    slot, rows = epoch.leader - 1, epoch.turned(epoch.leader - 1)
+    mean, cov = epoch.prior.copy(), epoch.cov.copy()
+    assert math.isfinite(spawn(mean, cov, rows[0], rows[1], 0, 1.5, 0.0))
+    np.testing.assert_array_equal(epoch.means[slot], mean)
+    np.testing.assert_array_equal(epoch.covs[slot], cov)
+    for s in (slot, epoch.leader):
+        assert epoch.accepted[s].tolist() == [1.0, 0.0][: 1 if alone else 2]
+
+
+@pytest.mark.parametrize("name", ["iekf", "srukf"])
+def test_the_whole_bank_has_the_moments_of_its_filters(name: str) -> None:
+    options, rng = options_of(TrackerConfig(filter=name)), np.random.default_rng(8)
+    means, A = rng.normal(size=(3, 6)), rng.normal(size=(3, 6, 6))
+    covs, share = A @ A.transpose(0, 2, 1) + np.eye(6), np.array([0.3, 0.0, 0.7])
+    spreads = np.array([engine.to_spread(P, options) for P in covs])
+    means[1], spreads[1] = np.nan, np.nan
+    weights = np.array([math.log(0.3), -math.inf, math.log(0.7)])
+    mean, cov = sector_bank.combine(means, spreads, weights, options)
+    means[1], covs[1] = 0.0, 0.0
+    np.testing.assert_allclose(mean, share @ means, rtol=1e-12, atol=1e-14)
+    expected = np.einsum("k,kab->ab", share, covs) + np.cov(means.T, aweights=share, ddof=0)
+    np.testing.assert_allclose(cov, expected, rtol=1e-9, atol=1e-12)
