@@ -9,7 +9,7 @@ import pytest
 from anchor_walk import Walk, rows_at
 from engine_cases import opened
 from netpos.filters import ekf
-from netpos.filters.measurement import KIND, VALUE, Kind, predict_row
+from netpos.filters.measurement import KIND, VALUE, VARIANCE, Kind, predict_row
 from netpos.filters.motion import NO_BIAS
 from netpos.filters.rows import linear_rows
 from netpos.filters.sigma import innovation_cov, regress
@@ -57,6 +57,10 @@ def test_weights_follow_the_likelihood_and_outliers_decide_nothing() -> None:
             assert bool(distance > bound) is (g > 0)
             logs[s] -= 0.5 * (min(distance, bound) + np.linalg.slogdet(S)[1])
             nis_expected[s] = distance if g == 0 else nis_expected[s]
+        all_H, off = np.vstack(H), np.concatenate(z) - np.vstack(H) @ x
+        S, flags = all_H @ P @ all_H.T + np.eye(len(rows)), np.zeros(3)
+        evidence = sector_bank._evidence(rows, off, S, options[GATE:], flags)
+        assert evidence == pytest.approx(logs[s] - weights[s], rel=1e-9)
         expected[s] = informed(x, P, z[0], H[0])
     accepted, nis, used = np.full((3, 3), 9.0), np.full(3, 9.0), np.full(3, 9.0)
     work = ekf.workspace(6, len(rows))
@@ -97,13 +101,13 @@ def test_weights_sum_to_one_above_their_floor() -> None:
 
 
 class Epoch:
-    """One epoch of a walk, as a bank sees it that knows of one sector; slots that are not there
-    hold sevens."""
+    """One epoch of a walk, as a bank sees it that knows of one sector, the one before; slots that
+    are not there hold no numbers."""
 
     def __init__(
         self, sd: float, height_m: float, range_off_m: float = 0.0, name: str = "iekf"
     ) -> None:
-        self.walk = Walk(np.array([0.8, 4.5]), 0.3, 0.2, 1)
+        self.walk = Walk(np.array([-0.8, 4.5]), 0.3, 0.2, 1)
         self.rows = rows_at(self.walk, 0, 0.05)
         self.height_m = height_m
         self.options = options_of(
@@ -111,19 +115,19 @@ class Epoch:
         )
         self.rows[1, KIND] = Kind.UNWRAPPED_PHASE
         for row in self.rows[:2]:
-            state = np.array([0.8, 4.5, 0.0, 0.0, 0.0, 0.0])
+            state = np.array([-0.8, 4.5, 0.0, 0.0, 0.0, 0.0])
             row[VALUE] = predict_row(row, state, height_m, np.empty(6))
         turns = round(self.rows[1, VALUE] / TURN)
-        self.leader = MIDDLE + turns
+        self.leader, self.home = MIDDLE + turns, MIDDLE + turns + 1
         self.rows[1, KIND] = Kind.PHASE
         self.rows[:2, VALUE] += range_off_m, -TURN * turns
-        self.prior = np.array([0.81, 4.48, *self.walk.velocity, 0.0, 0.0])
+        self.prior = np.array([-0.79, 4.48, *self.walk.velocity, 0.0, 0.0])
         self.cov = np.diag([sd, sd, 0.1, 0.1, 1.0, 1.0]) ** 2
-        self.means, self.covs = np.full((SLOTS, 6), 7.0), np.full((SLOTS, 6, 6), 7.0)
-        self.means[self.leader] = self.prior
-        self.covs[self.leader] = engine.to_spread(self.cov, self.options)
+        self.means, self.covs = np.full((SLOTS, 6), np.nan), np.full((SLOTS, 6, 6), np.nan)
+        self.means[self.home] = self.prior
+        self.covs[self.home] = engine.to_spread(self.cov, self.options)
         self.weights = np.full(SLOTS, -math.inf)
-        self.weights[self.leader] = 0.0
+        self.weights[self.home] = 0.0
         self.heirs = np.full(SLOTS, 9, dtype=np.int64)
         self.accepted, self.nis, self.used = np.full((SLOTS, 2), 9.0), *np.full((2, SLOTS), 9.0)
 
@@ -148,6 +152,15 @@ class Epoch:
         H = np.eye(2, 6, k=2) / 0.05
         return informed(mean, cov, self.walk.velocity / 0.05, H)
 
+    def fixed(self, slot: int) -> tuple[Array, Array]:
+        """The filter told where range and phase say, and the velocity."""
+        point, R, rows = np.empty(2), np.empty((2, 2)), self.turned(slot)
+        assert place(rows[0], rows[1], 0, self.height_m, point, R)
+        root = np.linalg.inv(np.linalg.cholesky(R))
+        H = np.vstack([root @ np.eye(2, 6), np.eye(2, 6, k=2) / 0.05])
+        told = np.concatenate([root @ point, self.walk.velocity / 0.05])
+        return informed(self.prior, self.cov, told, H)
+
 
 @pytest.mark.parametrize(
     ("name", "sd", "height_m"),
@@ -158,33 +171,24 @@ def test_sectors_nobody_knows_of_are_placed_anew(name: str, sd: float, height_m:
     not reach; what it does not explain is put where range and phase say, at the floor, if that is
     a place at all."""
     epoch = Epoch(sd, height_m, name=name)
-    leader, mean = epoch.leader, epoch.prior.copy()
-    cov = epoch.covs[leader].copy()
-    accepted, own = np.zeros(2), epoch.turned(leader)
+    leader, mean, cov = epoch.leader, epoch.prior.copy(), epoch.covs[epoch.home].copy()
+    accepted, own, used = np.zeros(2), epoch.turned(leader), 4
     epoch.resolve()
     if sd < 0.1:
         nis, used = engine.update(mean, cov, own, epoch.options, accepted, ekf.workspace(6, 4))
         assert epoch.nis[leader] == pytest.approx(nis, rel=1e-9)
     else:
-        point, R, used = np.empty(2), np.empty((2, 2)), 4
-        assert place(own[0], own[1], 0, height_m, point, R)
-        root = np.linalg.inv(np.linalg.cholesky(R))
-        H = np.vstack([root @ np.eye(2, 6), np.eye(2, 6, k=2) / 0.05])
-        mean, cov = informed(mean, cov, np.r_[root @ point, epoch.walk.velocity / 0.05], H)
+        mean, cov = epoch.fixed(leader)
     np.testing.assert_allclose(epoch.means[leader], mean, rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(epoch.covs[leader], cov, rtol=1e-7, atol=1e-9)
     covs = [engine.to_cov(P, epoch.options) for P in epoch.covs]
     assert (epoch.used[leader], epoch.accepted[leader].tolist()) == (used, [1.0, 1.0])
-    assert epoch.heirs[leader] == leader
+    assert epoch.heirs[leader] == epoch.home
     there = 0
     for slot in set(range(SLOTS)) - {leader}:
-        if epoch.heirs[slot] == leader:  # a neighbour the wide filter explains
-            assert sd > 0.1
-            there += 1
-            continue
-        assert epoch.heirs[slot] == -1
-        assert sd > 0.1 or (epoch.nis[slot], epoch.used[slot]) == (0.0, 0.0)
-        expected = epoch.placed(slot)
+        explained = epoch.heirs[slot] != -1  # a neighbour the wide filter reaches
+        assert sd > 0.1 or not (explained or epoch.nis[slot] or epoch.used[slot])
+        expected = epoch.fixed(slot) if explained else epoch.placed(slot)
         assert math.isfinite(epoch.weights[slot]) is (expected is not None)
         if expected is None:
             continue
@@ -196,27 +200,37 @@ def test_sectors_nobody_knows_of_are_placed_anew(name: str, sd: float, height_m:
     assert there == (5 if height_m > 0.0 else 7)
     assert logsumexp(epoch.weights) == pytest.approx(0.0, abs=1e-2)
     for slot in (0, 10):  # five turns are none of the array's
-        assert (epoch.means[slot] == 7.0).all()
+        assert np.isnan(epoch.means[slot]).all()
         assert epoch.accepted[slot].tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize(("variance", "is_wide"), [(0.995, 0.0), (1.005, 1.0)])
 def test_a_tangent_reaches_as_far_as_a_radian(variance: float, is_wide: float) -> None:
-    """Of the prior alone, without the noise of the phase."""
+    """Of the prior alone, without the noise of the phase; beyond it, the fix is weighed."""
     epoch = Epoch(0.03, 0.0)
-    rows = epoch.turned(epoch.leader)
+    rows, gate = epoch.turned(epoch.leader), epoch.options[GATE:]
 
     def phase_variance() -> float:
-        L = np.linalg.cholesky(epoch.covs[epoch.leader])
+        L = np.linalg.cholesky(epoch.covs[epoch.home])
         _, G, E = regress(epoch.prior, L, rows, 0.0)
         return float(innovation_cov(G, E, np.zeros(4))[1, 1])
 
     for _ in range(9):
-        epoch.covs[epoch.leader][:2, :2] *= variance / phase_variance()
+        epoch.covs[epoch.home][:2, :2] *= variance / phase_variance()
     assert phase_variance() == pytest.approx(variance, abs=1e-6)
     state = (epoch.means, epoch.covs, epoch.weights)
-    _, wide = sector_bank._gains(*state, epoch.turned(MIDDLE), 1, epoch.options)
-    assert wide[epoch.leader] == is_wide
+    gains, wide = sector_bank._gains(*state, epoch.turned(MIDDLE), 1, epoch.options)
+    assert wide[epoch.home] == is_wide
+    L, turns = np.linalg.cholesky(epoch.covs[epoch.home]), epoch.leader - MIDDLE
+    innovation, G, E = regress(epoch.prior, L, rows, 0.0)
+    S = innovation_cov(G, E, rows[:, VARIANCE].copy())
+    by_tangent = sector_bank._evidence(rows, innovation, S, gate, np.zeros(2))
+    by_fix = sector_bank._fix_evidence(
+        epoch.prior, L, epoch.turned(MIDDLE), 1, turns, epoch.options
+    )
+    assert abs(by_fix - by_tangent) > 1e-3
+    expected = by_fix if is_wide else by_tangent
+    assert gains[epoch.home, epoch.leader] == pytest.approx(expected, rel=1e-9)
 
 
 def test_what_the_leader_refuses_places_nobody() -> None:
@@ -226,7 +240,8 @@ def test_what_the_leader_refuses_places_nobody() -> None:
     weights = np.full(SLOTS, -math.inf)
     weights[epoch.leader] = 0.0
     np.testing.assert_array_equal(epoch.weights, weights)
-    assert (np.delete(epoch.means, epoch.leader, axis=0) == 7.0).all()
+    np.testing.assert_array_equal(epoch.means[epoch.home], epoch.prior)
+    assert np.isnan(np.delete(epoch.means, [epoch.leader, epoch.home], axis=0)).all()
     assert epoch.used[epoch.leader] == 2
 
 
@@ -250,8 +265,10 @@ def test_who_is_placed_anew_may_refuse_the_rest(alone: bool) -> None:
 
 @pytest.mark.parametrize("name", ["iekf", "srukf"])
 def test_the_whole_bank_has_the_moments_of_its_filters(name: str) -> None:
+    """Eastings and northings: to the digits of a metre and not of its product with a northing."""
     options, rng = options_of(TrackerConfig(filter=name)), np.random.default_rng(8)
-    means, A = rng.normal(size=(3, 6)), rng.normal(size=(3, 6, 6))
+    away, A = rng.integers(-9, 10, size=(3, 6)) / 8.0, rng.normal(size=(3, 6, 6))
+    means = away + np.array([500_000.0, 6_600_000.0, 0.0, 0.0, 0.0, 0.0])
     covs, share = A @ A.transpose(0, 2, 1) + np.eye(6), np.array([0.3, 0.0, 0.7])
     spreads = np.array([engine.to_spread(P, options) for P in covs])
     means[1], spreads[1] = np.nan, np.nan
@@ -259,5 +276,5 @@ def test_the_whole_bank_has_the_moments_of_its_filters(name: str) -> None:
     mean, cov = sector_bank.combine(means, spreads, weights, options)
     means[1], covs[1] = 0.0, 0.0
     np.testing.assert_allclose(mean, share @ means, rtol=1e-12, atol=1e-14)
-    expected = np.einsum("k,kab->ab", share, covs) + np.cov(means.T, aweights=share, ddof=0)
+    expected = np.einsum("k,kab->ab", share, covs) + np.cov(away.T, aweights=share, ddof=0)
     np.testing.assert_allclose(cov, expected, rtol=1e-9, atol=1e-12)
