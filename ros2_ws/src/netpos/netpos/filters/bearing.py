@@ -57,17 +57,20 @@ def is_plain_bearing(row: Array) -> bool:
 
 @leaf
 def _moments(
-    low: float, high: float, prior: tuple[float, float, float, float, float], variance: float
+    low: float,
+    high: float,
+    prior: tuple[float, float, float, float, float, float],
+    variance: float,
 ) -> tuple[float, float, float, float, float]:
     """Mean of (r, c) and their covariance (rr, rc, cc) over ``low`` < r < ``high``; prior: mean a,
-    variance P_rr, and of c given r mean m(a), its slope, variance v."""
-    a, rr, m_a, slope, v = prior
+    variance P_rr, and of c given r mean m(a), its slope, variance v + w r^2."""
+    a, rr, m_a, slope, v_0, wedge = prior
     top = -math.inf
     for scan in range(2):  # the largest weight first, then the sums
         total = sr = sc = srr = src = scc = 0.0
         for k in range(_NODES):
             r = low + (k + 0.5) * (high - low) / _NODES
-            noise = r * r * variance
+            noise, v = r * r * variance, v_0 + wedge * r * r
             m, s = m_a + slope * (r - a), v + noise
             log_weight = math.log(r) - 0.5 * ((r - a) ** 2 / rr + m * m / s + math.log(s))
             if scan == 0:
@@ -106,7 +109,8 @@ def fuse_bearing(mean: Array, cov: Array, row: Array, variance: float) -> bool:
     reach = _REACH_SD * math.sqrt(rr)
     # Behind the RSU the prior falls off like exp(a r / P_rr).
     low, high = max(a[0] - reach, 0.0), a[0] + reach if a[0] > 0.0 else reach - 0.5 * a[0]
-    prior = (a[0], rr, a[1], slope, v)
+    strip = max(1.0 - P[1, 1] / rr, 0.0)
+    prior = (a[0], rr, a[1], slope, (1.0 - strip) * v, strip * v / (a[0] * a[0] + rr))
     for _ in range(_ZOOMS):
         r, c, c_rr, c_rc, c_cc = _moments(low, high, prior, variance)
         sd = math.sqrt(max(c_rr, 0.0))
@@ -114,7 +118,7 @@ def fuse_bearing(mean: Array, cov: Array, row: Array, variance: float) -> bool:
             break
         width = max(_REACH_SD * sd, (high - low) / _NODES)
         low, high = max(r - width, 0.0), r + width
-    c_rr += max(1.0 - P[1, 1] / rr, 0.0) * (r - a[0]) ** 2
+    c_rr += strip * (r - a[0]) ** 2
     C = np.array([[c_rr, c_rc], [c_rc, c_cc]])
     prior_2d = cov[:2, :2].copy()
     gain = np.linalg.solve(prior_2d, cov[:2].copy()).T.copy()

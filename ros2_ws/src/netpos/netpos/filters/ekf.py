@@ -287,7 +287,7 @@ def update(
             nis = _fuse_used(mean, cov, rows, work)
     if iterations > 1:
         bent, wide = bends(rows, mean, height_m, work), is_wide(rows, work)
-        if bent:
+        if bent or wide:
             iterate_used(mean, cov, rows, height_m, iterations, work)
             if on_top(mean, cov, rows, work):
                 fuse_around(mean, cov, rows, height_m, work)

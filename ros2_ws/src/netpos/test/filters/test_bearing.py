@@ -47,23 +47,29 @@ def _prior(offset: list[float], correlation: float) -> tuple[Array, Array]:
 
 def _integrated(mean: Array, cov: Array, azimuth: float) -> tuple[Array, Array]:
     """Posterior moments: the position on a polar grid, the rest by the blocks of the prior's
-    information matrix. As far as the prior is longer along the bearing than across, its second
-    moment along it, about the prior's mean, is kept."""
+    information matrix. As far as the prior is longer along the bearing than across, it is a wedge,
+    its width across growing with the distance, and its second moment along the bearing, about the
+    prior's mean, is kept."""
     angle = azimuth + SD * np.linspace(-6, 6, 241)
     r = np.linspace(0, 80, 8001)[1:]
     place = RSU + np.stack(
         [np.outer(np.cos(angle), r).ravel(), np.outer(np.sin(angle), r).ravel()], axis=-1
     )
-    off = place - mean[:2]
-    log = -0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.inv(cov[:2, :2]), off)
+    along = np.array([math.cos(azimuth), math.sin(azimuth)])
+    across = np.array([-along[1], along[0]])
+    long, skew = along @ cov[:2, :2] @ along, across @ cov[:2, :2] @ along
+    strip = max(2.0 - np.trace(cov[:2, :2]) / long, 0.0)
+    reach = place @ along - RSU @ along
+    start = (mean[:2] - RSU) @ along
+    variance = across @ cov[:2, :2] @ across - skew**2 / long
+    variance *= 1.0 - strip + strip * reach**2 / (start**2 + long)
+    aside = (place - mean[:2]) @ across - skew / long * (reach - start)
+    log = -0.5 * ((reach - start) ** 2 / long + aside**2 / variance + np.log(variance))
     log -= 0.5 * np.repeat(((angle - azimuth) / SD) ** 2, r.size)
     weight = np.tile(r, angle.size) * np.exp(log - log.max())
     weight /= weight.sum()
     center = weight @ place
     C = (place - center).T @ ((place - center) * weight[:, None])
-    along = np.array([math.cos(azimuth), math.sin(azimuth)])
-    long = along @ cov[:2, :2] @ along
-    strip = max(2.0 - np.trace(cov[:2, :2]) / long, 0.0)
     C += strip * (along @ (center - mean[:2])) ** 2 * np.outer(along, along)
     information = np.linalg.inv(cov)
     rest = np.linalg.inv(information[2:, 2:])
@@ -208,6 +214,19 @@ def test_the_same_bearing_again_tells_the_side_and_no_distance() -> None:
     assert mean[0] - RSU[0] == pytest.approx(6.0 * math.sqrt(2.0 / math.pi), rel=0.03)
     assert cov[0, 0] == pytest.approx(36.0, rel=0.03)
     np.testing.assert_array_equal(cov[2:, 2:], np.eye(4))
+
+
+def test_bearings_of_a_strip_do_not_push_it_away() -> None:
+    """Twenty bearings of a strip that they keep narrow: there is more plane farther away, and each
+    would say so again."""
+    mean, cov = np.zeros(6), np.eye(6)
+    mean[:2] = RSU[0] + 12.0, RSU[1]
+    cov[0, 0] = 4.0**2
+    for _ in range(20):
+        cov[1, 1] = 0.7**2  # the device has moved
+        assert fuse_bearing(mean, cov, _row(0.0), SD**2)
+    assert 12.0 < mean[0] - RSU[0] < 13.5
+    assert 3.0**2 < cov[0, 0] < 4.0**2
 
 
 def test_bearings_cut_at_the_rsu_do_not_make_sure() -> None:

@@ -148,6 +148,21 @@ def test_update_iterates_only_where_the_model_bends(
     assert bent[3:] == plain[3:]  # nis and number are those of the prior
 
 
+@pytest.mark.parametrize(("share", "iterates"), [(1.099, False), (1.101, True)])
+def test_update_iterates_where_the_prior_is_wide(share: float, iterates: bool) -> None:
+    """The curvature adds a tenth to the variance of a bearing that hardly leaves its tangent: it
+    would see a narrow strip from a wrong side."""
+    extra = 2.5e-3 / (share - 1.0)
+    for _ in range(2):  # the curvature does not depend on the variance
+        mean, cov, rows = slightly_bent(Kind.AZIMUTH, 0.01, extra, 1)
+        extra = float(two_variances(mean, cov, rows)[0] - rows[0, VARIANCE]) / (share - 1.0)
+    mean, cov, rows = slightly_bent(Kind.AZIMUTH, 0.01, extra, 1)
+    x, P, *_ = updated(mean, cov, rows, 0.0, NO_GATE, 8)
+    plain, P_plain, *_ = updated(mean, cov, rows, 0.0, NO_GATE, 1)
+    assert np.array_equal(x, plain) is not iterates
+    assert np.array_equal(P, P_plain) is not iterates
+
+
 @pytest.mark.parametrize("iterations", [2, 8])
 def test_only_what_was_accepted_is_iterated_with_the_variances_of_the_update(
     iterations: int,
