@@ -93,9 +93,9 @@ def fuse_bearing(mean: Array, cov: Array, row: Array, variance: float) -> bool:
     """Fuse a plain bearing with ``variance`` [rad^2] into mean (n,) and cov (n, n) in place;
     False, and nothing done, where the prior is degenerate.
 
-    As far as the prior is a strip along the bearing already, by those before, the range keeps its
-    second moment about the prior's mean, as if what lies behind the RSU were folded to its front:
-    the bearing tells the side once more, and no distance.
+    As far as the prior is a strip along the bearing already, by those before, it is taken for the
+    wedge they left, and the range keeps its second moment about the prior's mean, as if what lies
+    behind the RSU were folded to its front: the bearing tells the side once more, and no distance.
     """
     angle = row[VALUE] + math.atan2(row[AXES + 1], row[AXES])
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])

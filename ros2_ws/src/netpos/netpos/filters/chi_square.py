@@ -1,7 +1,7 @@
 """Bounds of chi-square variables with whole degrees of freedom (Abramowitz and Stegun 26.4.4 and
 26.4.5).
 
-SciPy has them; it would cost every node 11 MB and a sixth of its start.
+SciPy has them; it would cost every node 6 MB and a tenth of its start.
 """
 
 from __future__ import annotations

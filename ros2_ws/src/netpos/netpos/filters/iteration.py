@@ -121,7 +121,7 @@ def iterate_used(
 
 @leaf
 def is_wide(rows: Array, work: Array) -> bool:
-    """Whether the curvature under the prior outweighs a row used in the update."""
+    """Whether the curvature under the prior adds much to the variance of a row used."""
     for i in range(rows.shape[0]):
         if work[W_USE, i] == 1.0 and work[W_VARIANCE, i] > _WIDE * rows[i, VARIANCE]:
             return True
