@@ -6,7 +6,12 @@ import math
 
 from netpos.filters.compile import kernel
 from netpos.filters.factor import factor
-from netpos.filters.measurement import VARIANCE, curvature_variance, linearise
+from netpos.filters.measurement import (
+    VARIANCE,
+    curvature_variance,
+    linearise,
+    second_order_variance,
+)
 from netpos.messages.values import Array
 
 
@@ -55,6 +60,24 @@ def surprise(mean: Array, cov: Array, rows: Array, height_m: float) -> tuple[flo
     S = H @ cov @ H.T
     for i in range(innovation.size):
         S[i, i] += rows[i, VARIANCE] + curvature_variance(rows[i], mean, cov, height_m)
+    distance, size = _normal(innovation, S)
+    return distance, size
+
+
+@kernel
+def strangeness(mean: Array, cov: Array, rows: Array, height_m: float) -> tuple[float, float]:
+    """``surprise`` with ``second_order_variance``: to weigh priors of different widths."""
+    innovation, H = linearise(rows, mean, height_m)
+    S = H @ cov @ H.T
+    for i in range(innovation.size):
+        S[i, i] += rows[i, VARIANCE] + second_order_variance(rows[i], mean, cov, height_m)
+    distance, size = _normal(innovation, S)
+    return distance, size
+
+
+@kernel
+def _normal(innovation: Array, S: Array) -> tuple[float, float]:
+    """Squared Mahalanobis distance and ln det(2 pi S)."""
     L = factor(S)
     distance, size = 0.0, 0.0
     for i in range(innovation.size):

@@ -245,6 +245,23 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
 
 
 @leaf
+def second_order_variance(row: Array, mean: Array, cov: Array, height_m: float) -> float:
+    """``curvature_variance`` with what an azimuth's curvature really is: none along itself.
+
+    Too small for an update to rely on near an RSU, where the azimuth bends within the prior; but
+    what weighs a wide prior against a narrow one must not take the wide one for wider than it is.
+    """
+    if int(row[KIND]) != Kind.AZIMUTH or row[HEADING] >= 0.0 or row[AXES + 8] != 1.0:
+        return float(curvature_variance(row, mean, cov, height_m))
+    dx, dy = mean[0] - row[ORIGIN], mean[1] - row[ORIGIN + 1]
+    rho4 = max(dx * dx + dy * dy, 1e-3) ** 2
+    a, b = 2.0 * dx * dy / rho4, (dy * dy - dx * dx) / rho4  # h'' = [[a, b], [b, -a]]
+    xx, xy, yy = cov[0, 0], cov[0, 1], cov[1, 1]
+    first, last = a * xx + b * xy, b * xy - a * yy
+    return float(0.5 * (first**2 + last**2) + (a * xy + b * yy) * (b * xx - a * xy))
+
+
+@leaf
 def innovation_variance(
     row: Array, mean: Array, cov: Array, height_m: float, variance: float, h: Array
 ) -> float:

@@ -2,9 +2,12 @@
 
 With one RSU a turn along the bearing shows in no single measurement: the clock takes the range,
 and the bearing hardly changes. The estimate goes on in the wrong direction and is sure of it. What
-tells is the sum of many measurements. A rival is the second answer of ``protection.level_in``,
-carried on with the same measurements for as long as they fit it better than the estimate (the
-likelihood ratio of Page 1954); the protection level holds it, too.
+tells, if anything, is the sum of many measurements. A rival is the estimate with its velocity
+opened at some time, carried on with the same measurements; its odds are how often devices turn
+times its likelihood ratio to the estimate. The protection level holds every rival as far as its
+odds demand (multiple hypothesis solution separation: Blanch, Walter and Enge 2012), and what is
+reported is the rival that has won where one has (Wald 1945). The estimate itself goes on as it
+is: rivals that are wrong leave nothing behind.
 """
 
 from __future__ import annotations
@@ -13,10 +16,11 @@ import copy
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from netpos.filters import ekf
 from netpos.filters.compile import kernel, leaf
-from netpos.filters.fit import surprise
+from netpos.filters.fit import strangeness
 from netpos.filters.gate import accepted_rows
 from netpos.filters.manoeuvre import add_manoeuvre, unnoticed_s
 from netpos.filters.measurement import GROUP
@@ -26,63 +30,58 @@ from netpos.tracking.config import TrackerConfig
 from netpos.tracking.engine import GATE, GATE_SIZE, Option, is_sound
 from netpos.tracking.estimates import Estimate
 from netpos.tracking.models import motions_of, options_of
-from netpos.tracking.protection import (
-    Scratch,
-    apply_about,
-    gaussian_radius,
-    level_scratch,
-)
+from netpos.tracking.protection import gaussian_radius
+from netpos.tracking.sectors import Sectors
 
-# The turn of each rival lies within so many times the time in which a single epoch would show it:
-# what the filter follows in part is noticed later.
-_WINDOWS = np.array([1.0, 2.0])
-_NONE = -1.0  # evidence of a rival that is not there
+Ints = npt.NDArray[np.int64]
+State = tuple[Array, Array, Array, Ints]
+"""Means (K, n), covariances (K, n, n), log odds to the estimate (K,) (-inf: no rival there), and
+(2,) ``LEADER`` and ``BEGUN``."""
+
+LEADER, BEGUN = 0, 1  # the rival to report, -1: none; stamp [ns] of the last one's beginning
+
+_COUNT = 8
+_PERIOD_NS = 250_000_000  # a rival begins so long after the last, where no misfit asked for one
+_TURNS_HZ = 1.0 / 30.0  # how often a device turns
+_UNUSUAL = 2.0  # NIS per degree of freedom above which a rival begins
 _CERTAIN = 50.0  # log odds; more is remembered for no longer
-_UNUSUAL = 2.0  # NIS per degree of freedom below which no rival is better
-
-State = tuple[Array, Array, Array, Array]
-"""Means (K, n), covariances (K, n, n), evidence (K,): log likelihood ratio to the estimate, and
-(K,) whether the rival reached beyond the level of the last epoch."""
 
 
 @kernel
-def no_rivals(n: int) -> State:
-    """State of ``n`` states without rivals."""
-    count = _WINDOWS.size
-    return (
-        np.zeros((count, n)),
-        np.zeros((count, n, n)),
-        np.full(count, _NONE),
-        np.zeros(count),
-    )
+def no_rivals(n: int, stamp_ns: int) -> State:
+    """State of ``n`` states without rivals at ``stamp_ns``."""
+    marks = np.array([-1, stamp_ns])
+    return np.zeros((_COUNT, n)), np.zeros((_COUNT, n, n)), np.full(_COUNT, -math.inf), marks
 
 
 @leaf
-def _present(evidence: Array) -> bool:
+def _present(odds: Array) -> bool:
     """Whether there is a rival."""
-    most = _NONE
-    for k in range(evidence.size):
-        most = max(most, evidence[k])
-    return most >= 0.0
+    most = -math.inf
+    for k in range(odds.size):
+        most = max(most, odds[k])
+    return most > -math.inf
 
 
 @leaf
-def _begins(rows: Array, nis: float, dof: int) -> bool:
-    """Whether a rival may begin: an epoch of a single measurement (two tell where the device is)
-    that fits badly."""
+def _begins(stamp_ns: int, rows: Array, nis: float, dof: int, begun_ns: int) -> bool:
+    """Whether a rival begins: in an epoch of a single measurement (two tell where the device is)
+    that fits badly, and from time to time, for a turn that shows in none."""
     alone = rows[0, GROUP] == rows[rows.shape[0] - 1, GROUP]
-    return bool(alone and nis > _UNUSUAL * dof)
+    wanted = nis > _UNUSUAL * dof or stamp_ns - begun_ns >= _PERIOD_NS
+    return bool(alone and dof > 0 and wanted)
 
 
 @leaf
-def matter(rows: Array, nis: float, dof: int, evidence: Array) -> bool:
+def matter(stamp_ns: int, rows: Array, nis: float, dof: int, odds: Array, marks: Ints) -> bool:
     """Whether ``rival_level`` has anything to do."""
-    return bool(_present(evidence) or _begins(rows, nis, dof))
+    return bool(_present(odds) or _begins(stamp_ns, rows, nis, dof, marks[BEGUN]))
 
 
 @kernel
 def rival_level(
     level: float,
+    stamp_ns: int,
     dt: float,
     prior_mean: Array,
     prior_cov: Array,
@@ -97,93 +96,173 @@ def rival_level(
     options: Array,
     risk: float,
     rivals: State,
-    scratch: Scratch,
 ) -> float:
-    """Radius [m] round ``mean`` (n,) that holds ``level`` and the rivals, which are moved by
-    ``dt`` seconds, weighed and updated in place; arguments as for ``manoeuvre_level``.
+    """Radius [m] that holds ``level``, a radius round ``mean`` (n,), and the rivals, which are
+    moved by ``dt`` seconds to ``stamp_ns``, weighed and updated in place: round the rival
+    ``LEADER`` where there is one, else round ``mean``. Other arguments as for ``manoeuvre_level``.
 
-    nis, dof : of the accepted rows. A rival begins in an epoch of a single measurement. An
-    inertial model has no rivals: only the estimate gets its increments.
+    nis, dof : of the accepted rows. An inertial model has no rivals: only the estimate gets its
+    increments.
     """
-    means, covs, evidence, beyond = rivals
-    present, unusual = _present(evidence), _begins(rows, nis, dof)
-    if not (present or unusual) or int(motion[Parameter.MODEL]) == Model.INERTIAL:
+    odds, marks = rivals[2], rivals[3]
+    present, begins = _present(odds), _begins(stamp_ns, rows, nis, dof, marks[BEGUN])
+    if not (present or begins) or int(motion[Parameter.MODEL]) == Model.INERTIAL:
         return level
     if present:
         _move(dt, motion, bias, rivals)
-    kept = rows[accepted_rows(rows, accepted)]
     if dof > 0:
-        _weigh(prior_mean, prior_cov, kept, unheard_s, unusual, options, rivals)
-    radius, height_m = level, options[Option.HEIGHT]
-    for k in range(evidence.size):
-        if evidence[k] < 0.0:
-            continue
-        x, P = means[k].copy(), covs[k].copy()
-        if dof > 0:
-            apply_about(x, P, means[k], covs[k], rows, accepted, height_m, scratch)
-            means[k], covs[k] = x, P
-        if not is_sound(x, P):
-            evidence[k] = _NONE
-            continue
-        apart = math.hypot(x[0] - mean[0], x[1] - mean[1])
-        reached = apart + gaussian_radius(P[0, 0], P[0, 1], P[1, 1], risk)
-        beyond[k] = 1.0 if reached > level else 0.0
-        radius = max(radius, reached)
-    return radius
+        kept = rows[accepted_rows(rows, accepted)]
+        surprised = _weigh(prior_mean, prior_cov, kept, options, risk, rivals)
+        if begins:
+            unusual = nis > _UNUSUAL * dof
+            since_s = min(stamp_ns - marks[BEGUN], _PERIOD_NS) * 1e-9
+            within_s = max(unheard_s, since_s)
+            window_s = _window_s(prior_mean, prior_cov, kept, within_s, unusual, options)
+            if _begin(prior_mean, prior_cov, kept, window_s, surprised, options, risk, rivals):
+                marks[BEGUN] = stamp_ns
+        _update(kept, options, rivals)
+    if rows[0, GROUP] != rows[rows.shape[0] - 1, GROUP]:
+        _dismiss(level, mean, risk, rivals)
+    _lead(risk, odds, marks)
+    return float(_reach(level, mean, risk, rivals))
 
 
 @kernel
 def _move(dt: float, motion: Array, bias: Array, rivals: State) -> None:
     """Predict every rival; the velocity step noted in ``motion`` is the estimate's."""
-    means, covs, evidence, _ = rivals
+    means, covs, odds, _ = rivals
     own = motion.copy()
     own[Parameter.JUMP_SPEED] = 0.0
-    for k in range(evidence.size):
-        if evidence[k] >= 0.0:
+    for k in range(odds.size):
+        if odds[k] > -math.inf:
             ekf.predict(means[k], covs[k], dt, own, bias)
 
 
 @kernel
+def _surprised(mean: Array, cov: Array, rows: Array, options: Array) -> float:
+    """Minus twice the log density of ``rows``. A misfit counts as far as the gate lets it: what
+    is beyond is an outlier to any."""
+    distance, size = strangeness(mean, cov, rows, options[Option.HEIGHT])
+    return float(min(distance, options[GATE + min(rows.shape[0], GATE_SIZE - 1)]) + size)
+
+
+@kernel
 def _weigh(
+    prior_mean: Array, prior_cov: Array, rows: Array, options: Array, risk: float, rivals: State
+) -> float:
+    """Add what ``rows`` say to the odds of each rival and drop those the risk no longer counts;
+    returns how surprised the estimate is."""
+    means, covs, odds, _ = rivals
+    estimate = _surprised(prior_mean, prior_cov, rows, options)
+    for k in range(odds.size):
+        if odds[k] > -math.inf:
+            ratio = (estimate - _surprised(means[k], covs[k], rows, options)) / 2.0
+            odds[k] = min(odds[k] + ratio, _CERTAIN)
+            if not odds[k] >= math.log(risk):
+                odds[k] = -math.inf
+    return float(estimate)
+
+
+@kernel
+def _window_s(
     prior_mean: Array,
     prior_cov: Array,
     rows: Array,
-    unheard_s: float,
+    within_s: float,
     unusual: bool,
     options: Array,
+) -> float:
+    """Time [s] in which the turn of a new rival lies: ``within_s``, or in an unusual epoch the
+    time in which one in the worst direction would show in it."""
+    if not unusual:
+        return within_s
+    h, speed = np.empty(prior_mean.size), options[Option.MANOEUVRE_SPEED]
+    height_m, gate = options[Option.HEIGHT], options[GATE + 2]
+    _, longest_s = unnoticed_s(prior_mean, prior_cov, rows, height_m, gate, speed, h)
+    return max(within_s, longest_s if math.isfinite(longest_s) else 0.0)
+
+
+@kernel
+def _begin(
+    prior_mean: Array,
+    prior_cov: Array,
+    rows: Array,
+    window_s: float,
+    surprised: float,
+    options: Array,
+    risk: float,
     rivals: State,
-) -> None:
-    """Add what ``rows`` say to the evidence of each rival, drop those that lose to the estimate,
-    and take up one anew where it is better. A misfit counts as far as the gate lets it: what is
-    beyond is an outlier to either."""
-    means, covs, evidence, beyond = rivals
-    height_m, speed = options[Option.HEIGHT], options[Option.MANOEUVRE_SPEED]
-    m, gate = rows.shape[0], options[GATE:]
-    most = gate[min(m, GATE_SIZE - 1)]
-    distance, size = surprise(prior_mean, prior_cov, rows, height_m)
-    estimate = min(distance, most) + size
-    longest_s = math.inf
-    if unusual:
-        h = np.empty(prior_mean.size)
-        _, longest_s = unnoticed_s(prior_mean, prior_cov, rows, height_m, gate[2], speed, h)
-    for k in range(evidence.size):
-        rival = math.inf
-        if evidence[k] >= 0.0:
-            distance, size = surprise(means[k], covs[k], rows, height_m)
-            rival = min(distance, most) + size
-            evidence[k] = min(evidence[k] + (estimate - rival) / 2.0, _CERTAIN)
-        if evidence[k] < 0.0:
-            evidence[k], rival = _NONE, math.inf
-        if math.isinf(longest_s):
-            continue
-        wide = prior_cov.copy()
-        add_manoeuvre(speed, _WINDOWS[k] * max(unheard_s, longest_s), wide)
-        distance, size = surprise(prior_mean, wide, rows, height_m)
-        fresh = min(distance, most) + size
-        gained = (estimate - fresh) / 2.0
-        better = gained > evidence[k] if beyond[k] > 0.0 else fresh < rival
-        if gained > 0.0 and (evidence[k] < 0.0 or better):
-            means[k], covs[k], evidence[k] = prior_mean, wide, gained
+) -> bool:
+    """Begin a rival that turned in the last ``window_s``, in the place of the least likely one
+    unless it is less likely still; whether it did."""
+    means, covs, odds, marks = rivals
+    wide = prior_cov.copy()
+    add_manoeuvre(options[Option.MANOEUVRE_SPEED], window_s, wide)
+    ratio = (surprised - _surprised(prior_mean, wide, rows, options)) / 2.0
+    fresh = math.log(_TURNS_HZ * window_s) + ratio
+    least = int(np.argmin(odds))
+    if not fresh > max(odds[least], math.log(risk)):
+        return False
+    means[least], covs[least], odds[least] = prior_mean, wide, fresh
+    if marks[LEADER] == least:
+        marks[LEADER] = -1
+    return True
+
+
+@kernel
+def _update(rows: Array, options: Array, rivals: State) -> None:
+    """Fuse ``rows``, linearised once: what iterates on a wide prior is soon sure of a range no
+    bearing tells."""
+    means, covs, odds, _ = rivals
+    m, height_m = rows.shape[0], options[Option.HEIGHT]
+    work, accepted = ekf.workspace(means.shape[1], m), np.empty(int(rows[m - 1, GROUP]) + 1)
+    no_gate = np.full(GATE_SIZE, np.inf)
+    for k in range(odds.size):
+        if odds[k] > -math.inf:
+            ekf.update(means[k], covs[k], rows, height_m, no_gate, 1, accepted, work)
+            if not is_sound(means[k], covs[k]):
+                odds[k] = -math.inf
+
+
+@kernel
+def _dismiss(level: float, mean: Array, risk: float, rivals: State) -> None:
+    """Drop the rivals within ``level`` of ``mean``: for an epoch of several measurements, which
+    let them go nowhere else."""
+    means, covs, odds, _ = rivals
+    for k in range(odds.size):
+        x, P = means[k], covs[k]
+        apart = math.hypot(x[0] - mean[0], x[1] - mean[1])
+        if apart + gaussian_radius(P[0, 0], P[0, 1], P[1, 1], risk) <= level:
+            odds[k] = -math.inf
+
+
+@leaf
+def _lead(risk: float, odds: Array, marks: Ints) -> None:
+    """A rival leads from where its odds are 1 to ``risk`` to where they are even again."""
+    if marks[LEADER] >= 0 and odds[marks[LEADER]] > 0.0:
+        return
+    most = -math.log(risk)
+    marks[LEADER] = -1
+    for k in range(odds.size):
+        if odds[k] > most:
+            most = odds[k]
+            marks[LEADER] = k
+
+
+@kernel
+def _reach(level: float, mean: Array, risk: float, rivals: State) -> float:
+    """Radius [m] round the leader, or ``mean``, that holds ``level`` round ``mean`` and every
+    rival but the share that its odds leave of ``risk``."""
+    means, covs, odds, marks = rivals
+    middle = mean if marks[LEADER] < 0 else means[marks[LEADER]]
+    radius = level + math.hypot(mean[0] - middle[0], mean[1] - middle[1])
+    for k in range(odds.size):
+        share = risk / math.exp(min(odds[k], 0.0))
+        if share < 0.5:
+            P, x = covs[k], means[k]
+            apart = math.hypot(x[0] - middle[0], x[1] - middle[1])
+            radius = max(radius, apart + gaussian_radius(P[0, 0], P[0, 1], P[1, 1], share))
+    return float(radius)
 
 
 class Rivals:
@@ -194,7 +273,7 @@ class Rivals:
         interacting = config.motion_model == "interacting"
         self._straight = motions_of(config)[1] if interacting else None
         self._able = config.manoeuvre_speed_sd_mps > 0.0
-        self._stamp_ns = 0
+        self._stamp_ns, self._begun_ns = 0, -1
         self._state: State | None = None
 
     @property
@@ -215,26 +294,50 @@ class Rivals:
     ) -> float:
         """``rival_level`` after an epoch; ``fit``: NIS and number of the accepted rows."""
         dt, self._stamp_ns = (stamp_ns - self._stamp_ns) * 1e-9, stamp_ns
-        usual = accepted.size > 1 or fit[0] <= _UNUSUAL * fit[1]
+        if self._begun_ns < 0:
+            self._begun_ns = stamp_ns
+        early = stamp_ns - self._begun_ns < _PERIOD_NS
+        usual = accepted.size > 1 or (early and fit[0] <= _UNUSUAL * fit[1])
         if not self._able or (usual and self._state is None):
             return level
-        epoch = (*estimate.prior, rows, accepted, unheard_s)
         mean, options, risk = estimate.mean, self._options, self._risk
         if self._state is None or self._state[0].shape[1] != mean.size:
-            self._state = no_rivals(mean.size)  # anew where a bias has joined the states
-        motion = estimate.motion if self._straight is None else self._straight
-        scratch = level_scratch(mean.size, len(rows))
-        reached: float = rival_level(
-            level, dt, *epoch, *fit, mean, motion, bias, options, risk, self._state, scratch
-        )
-        if self._state[2].max() < 0.0:
+            # anew where a bias has joined the states
+            self._state = no_rivals(mean.size, self._begun_ns)
+        epoch = (*estimate.prior, rows, accepted, unheard_s, *fit, mean, self._motion(estimate))
+        state = self._state
+        reached: float = rival_level(level, stamp_ns, dt, *epoch, bias, options, risk, state)
+        self._begun_ns = int(state[3][BEGUN])
+        if math.isinf(state[2].max()):
             self._state = None
         return reached
+
+    def reported(self, stamp_ns: int, estimate: Estimate, bias: Array) -> tuple[Array, Array]:
+        """Mean (n,) and covariance (n, n) to report at ``stamp_ns``: of the rival that has won,
+        moved there, or of ``estimate``. A bank of sectors speaks for itself."""
+        told = estimate.mean, estimate.cov
+        if self._state is None or isinstance(estimate, Sectors):
+            return told
+        means, covs, _, marks = self._state
+        leader = marks[LEADER]
+        if leader < 0 or means.shape[1] != told[0].size:
+            return told
+        mean, cov, motion = (
+            means[leader].copy(),
+            covs[leader].copy(),
+            self._motion(estimate).copy(),
+        )
+        motion[Parameter.JUMP_SPEED] = 0.0
+        ekf.predict(mean, cov, (stamp_ns - self._stamp_ns) * 1e-9, motion, bias)
+        return mean, cov
+
+    def _motion(self, estimate: Estimate) -> Array:
+        return estimate.motion if self._straight is None else self._straight
 
     def copy(self) -> Rivals:
         """An independent copy: a track that goes back in time goes back to it."""
         twin = copy.copy(self)
         if self._state is not None:
-            means, covs, evidence, beyond = self._state
-            twin._state = (means.copy(), covs.copy(), evidence.copy(), beyond.copy())
+            means, covs, odds, marks = self._state
+            twin._state = (means.copy(), covs.copy(), odds.copy(), marks.copy())
         return twin

@@ -356,7 +356,7 @@ class Track:
         if estimate is None:
             status = track_status(config, self._vue_id, epoch, *counts)
             return TrackOutput(None, None, status, network=config.network)
-        mean, cov = estimate.mean, estimate.cov
+        mean, cov = state.rivals.reported(epoch.stamp_ns, estimate, state.bias)
         odometry, clock, state.yaw, sd_m, radius_m = output.describe(
             epoch.stamp_ns,
             self._vue_id,

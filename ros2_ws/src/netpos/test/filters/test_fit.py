@@ -9,7 +9,19 @@ import pytest
 from curved_rows import log_posterior_cost, range_problem
 from filter_rows import random_spd
 from netpos.filters import fit
-from netpos.filters.measurement import VARIANCE, curvature_variance, linearise
+from netpos.filters.measurement import (
+    AXES,
+    BIAS,
+    COMMON,
+    GATE_VARIANCE,
+    HEADING,
+    ORIGIN,
+    ROW_WIDTH,
+    VALUE,
+    VARIANCE,
+    curvature_variance,
+    linearise,
+)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -57,3 +69,35 @@ def test_surprise_is_what_scipy_makes_of_it() -> None:
     distance, size = fit.surprise(mean, cov, rows, 0.0)
     assert distance == pytest.approx(innovation @ np.linalg.solve(S, innovation), rel=1e-9)
     assert size == pytest.approx(np.linalg.slogdet(2.0 * np.pi * S)[1], rel=1e-9)
+
+
+def test_strangeness_knows_that_a_bearing_does_not_bend_along_itself() -> None:
+    """The Hessian by central differences; ranges and tilted arrays as ``surprise`` has them."""
+    mean, cov = np.array([4.0, -3.0, 0.0, 0.0, 0.0, 0.0]), random_spd(np.random.default_rng(4), 6)
+    row = np.zeros((1, ROW_WIDTH))
+    row[0, VALUE], row[0, VARIANCE], row[0, GATE_VARIANCE] = -0.6, 1e-4, 1e-4
+    row[0, BIAS] = row[0, COMMON] = row[0, HEADING] = -1.0
+    row[0, ORIGIN : ORIGIN + 2] = 1.0, 0.5
+    row[0, AXES : AXES + 9] = np.eye(3).ravel()
+
+    def azimuth(x: float, y: float) -> float:
+        return math.atan2(y - 0.5, x - 1.0)
+
+    e, hessian = 1e-4 * np.eye(2), np.empty((2, 2))
+    for i, j in np.ndindex(2, 2):
+        corners = [
+            a * b * azimuth(*(mean[:2] + a * e[i] + b * e[j])) for a in (1, -1) for b in (1, -1)
+        ]
+        hessian[i, j] = sum(corners) / 4e-8
+    bent = hessian @ cov[:2, :2]
+    _, gradient = linearise(row, mean, 0.0)
+    S = gradient[0] @ cov @ gradient[0] + 1e-4 + 0.5 * np.trace(bent @ bent)
+    innovation = -0.6 - azimuth(4.0, -3.0)
+    distance, size = fit.strangeness(mean, cov, row, 0.0)
+    assert distance == pytest.approx(innovation**2 / S, rel=1e-5)
+    assert size == pytest.approx(math.log(2.0 * math.pi * S), rel=1e-5)
+    assert size < fit.surprise(mean, cov, row, 0.0)[1]
+    row[0, AXES + 8] = 0.9
+    assert fit.strangeness(mean, cov, row, 0.0) == fit.surprise(mean, cov, row, 0.0)
+    mean, cov, ranges = range_problem(3)
+    assert fit.strangeness(mean, cov, ranges, 0.0) == fit.surprise(mean, cov, ranges, 0.0)

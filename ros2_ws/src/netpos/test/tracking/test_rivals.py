@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pytest
+from netpos.evaluation.reproduce import experiment
 from netpos.evaluation.reproduce.experiment import Experiment, Setup
+from netpos.evaluation.reproduce.integrity import reported
 from netpos.filters import ekf
 from netpos.filters.manoeuvre import unnoticed_s
 from netpos.filters.measurement import GROUP
@@ -16,11 +19,11 @@ from netpos.filters.rows import linear_rows
 from netpos.messages.values import Array
 from netpos.tracking import TrackerConfig, warm_up
 from netpos.tracking import rivals as rivals_module
-from netpos.tracking.engine import GATE, GATE_SIZE
+from netpos.tracking.engine import GATE
 from netpos.tracking.estimates import Single
 from netpos.tracking.models import motions_of, options_of
-from netpos.tracking.protection import gaussian_radius, level_scratch
-from netpos.tracking.rivals import Rivals, State, matter, no_rivals, rival_level
+from netpos.tracking.protection import gaussian_radius
+from netpos.tracking.rivals import BEGUN, LEADER, Rivals, matter, no_rivals, rival_level
 from scipy.stats import multivariate_normal
 
 CONFIG = TrackerConfig(manoeuvre_speed_sd_mps=5.0, accel_density_mps2_sqrthz=0.1)
@@ -58,84 +61,116 @@ def opened(cov: Array, within_s: float) -> Array:
 
 @dataclass
 class Plain:
-    """A rival by the rules."""
+    """The rivals by the rules: means, covariances and log odds in eight places."""
 
-    window: float
-    mean: Array = field(default_factory=lambda: np.zeros(6))
-    cov: Array = field(default_factory=lambda: np.eye(6))
-    evidence: float = -1.0
-    beyond: bool = False
+    rivals: list[tuple[Array, Array, float] | None] = field(default_factory=lambda: [None] * 8)
+    begun_ns: int = 0
+    leader: int | None = None
 
-    def step(self, level: float, z: Array, rows: Array, prior: tuple[Array, Array]) -> None:
+    def step(self, stamp_ns: int, z: Array, rows: Array, prior: tuple[Array, Array]) -> None:
         mean, cov = prior
-        own, mine = surprise(z, mean, cov), math.inf
-        if self.evidence >= 0.0:
-            ekf.predict(self.mean, self.cov, DT, MOTION.copy(), NO_BIAS)
-            mine = surprise(z, self.mean, self.cov)
-            self.evidence = min(self.evidence + (own - mine) / 2.0, 50.0)
-        if self.evidence < 0.0:
-            self.evidence, mine = -1.0, math.inf
-        S = H @ cov @ H.T + R
-        if (z - H @ mean) @ np.linalg.solve(S, z - H @ mean) > 4.0:
-            _, longest_s = unnoticed_s(mean, cov, rows, 0.0, OPTIONS[GATE + 2], 5.0, np.empty(6))
-            wide = opened(cov, self.window * max(DT, longest_s))
-            gained = (own - surprise(z, mean, wide)) / 2.0
-            better = gained > self.evidence if self.beyond else surprise(z, mean, wide) < mine
-            if gained > 0.0 and (self.evidence < 0.0 or better):
-                self.mean, self.cov, self.evidence = mean.copy(), wide, gained
-        if self.evidence >= 0.0:
-            self.mean, self.cov = updated(z, self.mean, self.cov)
+        own = surprise(z, mean, cov)
+        for i, rival in enumerate(self.rivals):
+            if rival is None:
+                continue
+            x, P, odds = rival
+            ekf.predict(x, P, DT, MOTION.copy(), NO_BIAS)
+            odds = min(odds + (own - surprise(z, x, P)) / 2.0, 50.0)
+            self.rivals[i] = (x, P, odds) if odds >= math.log(RISK) else None
+        self._begin(stamp_ns, z, rows, prior)
+        for i, rival in enumerate(self.rivals):
+            if rival is not None:
+                self.rivals[i] = (*updated(z, *rival[:2]), rival[2])
+        odds = [-math.inf if rival is None else rival[2] for rival in self.rivals]
+        if self.leader is None or odds[self.leader] <= 0.0:
+            best = int(np.argmax(odds))
+            self.leader = best if odds[best] > -math.log(RISK) else None
 
-    def reach(self, mean: Array) -> float:
-        if self.evidence < 0.0:
-            return 0.0
-        P = self.cov
-        apart = math.hypot(*(self.mean - mean)[:2])
-        return float(apart + gaussian_radius(P[0, 0], P[0, 1], P[1, 1], RISK))
+    def _begin(self, stamp_ns: int, z: Array, rows: Array, prior: tuple[Array, Array]) -> None:
+        mean, cov = prior
+        S = H @ cov @ H.T + R
+        unusual = (z - H @ mean) @ np.linalg.solve(S, z - H @ mean) > 4.0
+        since_s = (stamp_ns - self.begun_ns) * 1e-9
+        if not unusual and since_s < 0.25:
+            return
+        window_s = max(DT, min(since_s, 0.25))
+        if unusual:
+            args = (rows, 0.0, OPTIONS[GATE + 2], 5.0, np.empty(6))
+            window_s = max(window_s, unnoticed_s(mean, cov, *args)[1])
+        wide = opened(cov, window_s)
+        own, fresh = surprise(z, mean, cov), surprise(z, mean, wide)
+        odds = math.log(window_s / 30.0) + (own - fresh) / 2.0
+        known = [-math.inf if rival is None else rival[2] for rival in self.rivals]
+        least = int(np.argmin(known))
+        if odds > max(known[least], math.log(RISK)):
+            self.rivals[least], self.begun_ns = (mean.copy(), wide, odds), stamp_ns
+            self.leader = None if self.leader == least else self.leader
+
+    def reach(self, level: float, mean: Array) -> float:
+        """Radius round what is reported, ``level`` being one round ``mean``."""
+        leader = None if self.leader is None else self.rivals[self.leader]
+        middle = mean if leader is None else leader[0]
+        radius = level + math.hypot(*(middle - mean)[:2])
+        for rival in self.rivals:
+            if rival is None:
+                continue
+            x, P, odds = rival
+            share = RISK / min(math.exp(odds), 1.0)
+            if share < 0.5:
+                own = gaussian_radius(P[0, 0], P[0, 1], P[1, 1], share)
+                radius = max(radius, math.hypot(*(x - middle)[:2]) + own)
+        return float(radius)
+
+
+def drifting(k: int) -> float:
+    """A device that drifts away, jumps back and forth, and is then where the estimate says."""
+    return 0.02 * max(k - 20, 0) ** 1.5 if k < 45 else 3.0 * (50 <= k < 53)
 
 
 def test_rivals_follow_the_rules() -> None:
-    """A device that drifts away, jumps back and forth, and is then where the estimate says; the
-    estimate goes straight on, sure of it."""
+    """The estimate goes straight on, sure of it."""
     rng = np.random.default_rng(11)
-    rivals, plain = no_rivals(6), [Plain(1.0), Plain(2.0)]
+    rivals, plain = no_rivals(6, 0), Plain()
     mean, cov = np.zeros(6), np.diag([0.1, 0.1, 0.05, 0.05, 0.3, 0.1]) ** 2
-    scratch, seen = level_scratch(6, 2), []
+    seen = []
     for k in range(120):
         ekf.predict(mean, cov, DT, MOTION.copy(), NO_BIAS)
-        prior = mean.copy(), cov.copy()
-        away = 0.02 * max(k - 20, 0) ** 1.5 if k < 45 else 3.0 * (50 <= k < 53)
+        prior, stamp_ns = (mean.copy(), cov.copy()), 100_000_000 * (k + 1)
+        away = drifting(k)
         z = H @ mean + [away, -0.3 * away] + rng.multivariate_normal(np.zeros(2), R)
         rows = linear_rows(z, R, H, 0)
         S = H @ cov @ H.T + R
         nis = float((z - H @ mean) @ np.linalg.solve(S, z - H @ mean))
         cov = updated(z, mean, cov)[1]  # the estimate learns nothing of where it is
-        level = 1.0
-        args = (MOTION, NO_BIAS, OPTIONS, RISK, rivals, scratch)
-        got = rival_level(level, DT, *prior, rows, np.ones(1), DT, nis, 2, mean, *args)
-        for rival in plain:
-            rival.step(level, z, rows, prior)
-        reaches = [rival.reach(mean) for rival in plain]
-        assert got == pytest.approx(max(level, *reaches), rel=1e-6)
-        for i, rival in enumerate(plain):
-            rival.beyond = reaches[i] > level if rival.evidence >= 0.0 else rival.beyond
-            assert rivals[2][i] == pytest.approx(rival.evidence, rel=1e-6, abs=1e-6)
-        seen.append((rivals[2][0], got))
-    evidence, levels = np.array(seen).T
-    assert evidence[:20].max() < 5.0
-    assert evidence[44] == 50.0
+        epoch = (stamp_ns, DT, *prior, rows, np.ones(1), DT, nis, 2, mean)
+        got = rival_level(1.0, *epoch, MOTION, NO_BIAS, OPTIONS, RISK, rivals)
+        plain.step(stamp_ns, z, rows, prior)
+        assert got == pytest.approx(plain.reach(1.0, mean), rel=1e-6)
+        assert rivals[3][LEADER] == (-1 if plain.leader is None else plain.leader)
+        assert rivals[3][BEGUN] == plain.begun_ns
+        for i, rival in enumerate(plain.rivals):
+            odds = -math.inf if rival is None else rival[2]
+            assert rivals[2][i] == pytest.approx(odds, rel=1e-6, abs=1e-6)
+        led = rivals[3][LEADER]
+        apart = 0.0 if led < 0 else math.hypot(*(rivals[0][led] - mean)[:2])
+        seen.append((rivals[2].max(), got, led, apart))
+    odds, levels, leaders, apart = np.array(seen).T
+    assert odds[:20].max() < 0.0
+    assert odds[44] == 50.0
     assert levels[44] > 3.0
-    assert evidence[-1] < 0.0
+    assert leaders[:20].max() == -1.0
+    assert apart[44] == pytest.approx(math.hypot(1.0, 0.3) * drifting(44), abs=0.5)
+    assert leaders[-1] == -1.0
 
 
 def test_an_inertial_model_has_no_rivals() -> None:
-    motion, rivals = MOTION.copy(), no_rivals(6)
+    motion, rivals = MOTION.copy(), no_rivals(6, 0)
     motion[Parameter.MODEL] = Model.INERTIAL
     rows, wrong = linear_rows(np.array([3.0, 3.0]), R, H, 0), 200.0
-    args = (np.zeros(6), np.eye(6) * 0.01, rows, np.ones(1), DT, wrong, 2, np.zeros(6))
-    rest = (NO_BIAS, OPTIONS, RISK, rivals, level_scratch(6, 2))
-    assert rival_level(1.0, DT, *args, motion, *rest) == 1.0
-    assert rival_level(1.0, DT, *args, MOTION, *rest) > 1.0
+    epoch = (100_000_000, DT, np.zeros(6), np.eye(6) * 0.01, rows, np.ones(1), DT)
+    args, rest = (*epoch, wrong, 2, np.zeros(6)), (NO_BIAS, OPTIONS, RISK, rivals)
+    assert rival_level(1.0, *args, motion, *rest) == 1.0
+    assert rival_level(1.0, *args, MOTION, *rest) > 1.0
 
 
 def test_no_rival_begins_where_two_measurements_tell_the_place() -> None:
@@ -143,82 +178,94 @@ def test_no_rival_begins_where_two_measurements_tell_the_place() -> None:
     rows, twice = linear_rows(np.array([3.0, 3.0]), R, H, 0), linear_rows(np.full(2, 3.0), R, H, 0)
     twice[1, GROUP] = 1
     before = (np.zeros(6), np.eye(6) * 0.01)
-    rivals = no_rivals(6)
+    rivals = no_rivals(6, 0)
     fit, rest = (200.0, 2, np.zeros(6), MOTION), (NO_BIAS, OPTIONS, RISK, rivals)
-    scratch = level_scratch(6, 2)
-    for own, begins in ((twice, False), (rows, True), (twice, True)):
-        assert matter(own, 200.0, 2, rivals[2]) is begins
-        level = rival_level(1.0, DT, *before, own, np.ones(2), DT, *fit, *rest, scratch)
+    for k, (own, begins) in enumerate(((twice, False), (rows, True), (twice, True))):
+        stamp_ns = 100_000_000 * (k + 1)
+        assert matter(stamp_ns, own, 200.0, 2, rivals[2], rivals[3]) is begins
+        level = rival_level(1.0, stamp_ns, DT, *before, own, np.ones(2), DT, *fit, *rest)
         assert (level > 1.0) is begins
 
 
-@pytest.mark.parametrize(("nis", "begins"), [(5.99, False), (6.01, True)])
-def test_a_rival_begins_where_twice_the_usual_is_exceeded(nis: float, begins: bool) -> None:
-    rows, none = linear_rows(np.zeros(2), R, H, 0), np.full(2, -1.0)
-    assert matter(rows, nis, 3, none) is begins
-    assert matter(rows, nis, 3, np.array([-1.0, 0.0]))
+def test_two_measurements_end_a_rival_within_the_level() -> None:
+    rows, twice = linear_rows(np.array([3.0, 3.0]), R, H, 0), linear_rows(np.full(2, 3.0), R, H, 0)
+    twice[1, GROUP] = 1
+    before, rivals = (np.zeros(6), np.eye(6) * 0.01), no_rivals(6, 0)
+    fit, rest = (200.0, 2, np.zeros(6), MOTION), (NO_BIAS, OPTIONS, RISK, rivals)
+    for k, (level, own) in enumerate(((1.0, rows), (99.0, rows), (1.0, twice), (99.0, twice))):
+        epoch = (100_000_000 * (k + 1), DT, *before, own, np.ones(2), DT)
+        reached = rival_level(level, *epoch, *fit, *rest)
+        gone = level == 99.0 and own is twice
+        assert math.isinf(rivals[2].max()) is gone
+    assert rivals[3][LEADER] == -1
+    assert reached == 99.0
 
 
-def present(mean: Array) -> State:
-    """The second rival, at ``mean``."""
-    rivals = no_rivals(6)
-    rivals[0][1], rivals[1][1], rivals[2][1] = mean, 0.01 * np.eye(6), 3.0
-    return rivals
+@pytest.mark.parametrize(("stamp_ns", "begins"), [(249_999_999, False), (250_000_000, True)])
+def test_a_rival_begins_from_time_to_time(stamp_ns: int, begins: bool) -> None:
+    """Of single measurements that fit, and of none where nothing was accepted."""
+    rows, (_, _, odds, marks) = linear_rows(np.zeros(2), R, H, 0), no_rivals(6, 0)
+    assert matter(stamp_ns, rows, 1.0, 2, odds, marks) is begins
+    assert not matter(stamp_ns, rows, 0.0, 0, odds, marks)
 
 
-def carried_on(rivals: State, mean: Array, motion: Array) -> float:
-    """Level of an epoch with nothing accepted, an own one of half a metre."""
-    rows = linear_rows(np.zeros(2), R, H, 0)
-    before = (mean, 0.01 * np.eye(6), rows, np.zeros(1), DT, 0.0, 0, mean)
-    rest = (motion, NO_BIAS, OPTIONS, RISK, rivals, level_scratch(6, 2))
-    return float(rival_level(0.5, DT, *before, *rest))
+def test_rivals_are_held_while_nothing_is_accepted() -> None:
+    """They move on, and the level with them."""
+    rivals, rows = no_rivals(6, 0), linear_rows(np.array([3.0, 3.0]), R, H, 0)
+    before, rest = (np.zeros(6), np.eye(6) * 0.01), (MOTION, NO_BIAS, OPTIONS, RISK, rivals)
+    levels = []
+    for k, taken in enumerate((1.0, 0.0, 0.0)):
+        epoch = (100_000_000 * (k + 1), DT, *before, rows, np.full(1, taken), DT)
+        fit = (200.0, 2) if taken else (0.0, 0)
+        levels.append(rival_level(1.0, *epoch, *fit, np.zeros(6), *rest))
+    assert 1.0 < levels[0] < levels[1] < levels[2]
 
 
-def test_the_level_reaches_from_the_estimate_to_the_far_side_of_a_rival() -> None:
-    """Anywhere; the velocity step of the estimate's own second look is none of the rival's."""
-    mean = np.array([700.0, -300.0, 4.0, 1.0, 2.0, 0.1])
-    rivals, motion = present(mean), MOTION.copy()
-    rivals[0][1, :4] += 30.0, 40.0, 1.0, -2.0
-    expected, cov = rivals[0][1].copy(), 0.01 * np.eye(6)
-    ekf.predict(expected, cov, DT, MOTION.copy(), NO_BIAS)
-    motion[Parameter.JUMP_SPEED] = 50.0
-    kept = motion.copy()
-    level = carried_on(rivals, mean, motion)
-    apart = math.hypot(30.0 + 5.0 * DT, 40.0 - 1.0 * DT)
-    assert level == pytest.approx(apart + gaussian_radius(*cov[[0, 0, 1], [0, 1, 1]], RISK))
-    np.testing.assert_allclose(rivals[0][1], expected, rtol=1e-12)
-    np.testing.assert_allclose(rivals[1][1], cov, rtol=1e-12)
-    assert rivals[2].tolist() == [-1.0, 3.0]
-    assert rivals[3].tolist() == [0.0, 1.0]
-    np.testing.assert_array_equal(motion, kept)
+def _turned(estimate: Single, rivals: Rivals, away: float, stamps: range) -> None:
+    """Measurements ``away`` of an estimate that does not move."""
+    for k in stamps:
+        rows, stamp_ns = linear_rows(np.array([away, 0.0]), R, H, 0), 100_000_000 * k
+        before = estimate.mean.copy(), estimate.cov.copy()
+        nis, dof, taken = estimate.step(stamp_ns, DT, 0, rows, NO_BIAS)
+        epoch = (stamp_ns, estimate, rows, taken.copy(), DT, (nis, dof), NO_BIAS)
+        rivals.level(1.0, *epoch)
+        estimate.mean[:], estimate.cov[:] = before
 
 
-def test_a_rival_that_cannot_be_a_device_is_given_up() -> None:
-    rivals = present(np.array([0.0, 0.0, 3.1e8, 0.0, 0.0, 0.0]))
-    assert carried_on(rivals, np.zeros(6), MOTION) == 0.5
-    assert rivals[2].tolist() == [-1.0, -1.0]
-    assert rivals[3].tolist() == [0.0, 0.0]
+def test_the_rival_that_has_won_is_reported() -> None:
+    estimate, rivals = Single(CONFIG, 0, np.zeros(6), 0.01 * np.eye(6)), Rivals(CONFIG)
+    _turned(estimate, rivals, 0.0, range(1, 3))
+    mean, cov = rivals.reported(200_000_000, estimate, NO_BIAS)
+    assert mean is estimate.mean
+    assert cov is estimate.cov
+    _turned(estimate, rivals, 0.8, range(3, 60))
+    mean, cov = rivals.reported(5_900_000_000, estimate, NO_BIAS)
+    assert mean[0] == pytest.approx(0.8 - 0.3 * mean[4], abs=0.05)
+    later, wider = rivals.reported(6_900_000_000, estimate, NO_BIAS)
+    ekf.predict(mean, cov, 1.0, MOTION.copy(), NO_BIAS)
+    np.testing.assert_allclose(later, mean)
+    np.testing.assert_allclose(wider, cov)
+    estimate.grow(np.array([1.0]))
+    assert rivals.reported(5_900_000_000, estimate, NO_BIAS)[0] is estimate.mean
 
 
-def test_an_array_of_many_antennas_is_weighed_by_the_last_bound() -> None:
-    """Seventy rows of one measurement of a device that has turned: more than the gate has bounds
-    for."""
-    rng, m = np.random.default_rng(3), 70
-    wide_H = rng.normal(size=(m, 6))
-    z, rivals = wide_H @ np.array([0.0, 0.0, 3.0, -2.0, 0.0, 0.0]), no_rivals(6)
-    rows, cov, prior = linear_rows(z, np.eye(m), wide_H, 0), 0.01 * np.eye(6), np.zeros(6)
-    before = (prior, cov, rows, np.ones(1), DT, 1e4, m, prior)
-    rest = (MOTION, NO_BIAS, OPTIONS, RISK, rivals, level_scratch(6, m))
-    rival_level(1.0, DT, *before, *rest)
-    _, longest_s = unnoticed_s(prior, cov, rows, 0.0, OPTIONS[GATE + 2], 5.0, np.empty(6))
-    sizes = []
-    for P in (cov, opened(cov, max(DT, longest_s)), opened(cov, 2.0 * max(DT, longest_s))):
-        S = wide_H @ P @ wide_H.T + np.eye(m)
-        distance = min(z @ np.linalg.solve(S, z), OPTIONS[GATE + GATE_SIZE - 1])
-        sizes.append(distance + np.linalg.slogdet(2.0 * math.pi * S)[1])
-    gained = (sizes[0] - np.array(sizes[1:])) / 2.0
-    assert gained.min() > 0.0
-    np.testing.assert_allclose(rivals[2], gained, rtol=1e-9)
+@pytest.mark.parametrize(
+    ("odds", "before", "after"),
+    [
+        ([9.2, -math.inf], -1, -1),
+        ([9.22, -math.inf], -1, 0),
+        ([9.22, 9.3], -1, 1),
+        ([0.01, 9.3], 0, 0),
+        ([0.0, 9.3], 0, 1),
+        ([0.0, 9.2], 0, -1),
+        ([-math.inf, -math.inf], 1, -1),
+    ],
+)
+def test_a_rival_leads_from_certain_to_even(odds: list[float], before: int, after: int) -> None:
+    """-ln(1e-4) is 9.21."""
+    marks = np.array([before, 0])
+    rivals_module._lead(RISK, np.array(odds), marks)
+    assert marks.tolist() == [after, 0]
 
 
 def test_a_copy_goes_its_own_way_and_a_new_state_starts_anew() -> None:
@@ -238,16 +285,28 @@ def test_a_copy_goes_its_own_way_and_a_new_state_starts_anew() -> None:
     assert epoch(Rivals(CONFIG), estimate.copy(), 3, 1.2) != kept
     estimate.grow(np.array([1.0]))
     new = epoch(Rivals(CONFIG), estimate.copy(), 3, 1.2)
-    assert epoch(rivals, estimate.copy(), 3, 1.2) == new
+    assert epoch(rivals, estimate, 3, 1.2) == new
 
 
 @pytest.mark.parametrize("seed", [5132, 5511])
-def test_a_turn_along_the_bearing_is_held_by_the_level(seed: int) -> None:
-    """Without rivals 238 and 597 errors are above it: the track drifts off by 23 m, sure of it to
-    less than one."""
+def test_a_turn_along_the_bearing_is_held_and_ended(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without rivals 238 and 597 errors are above the level: the estimate drifts off by 23 m,
+    sure of it to less than one."""
     changes = (("devices.0.beacon_interval_s", 100 * 167.3e-6), ("measurement.nearest", 1))
+    alone: list[Array] = []
+
+    def spy(*args: Any) -> Any:
+        alone.append(args[3].copy())
+        return reported(*args)
+
+    monkeypatch.setattr(experiment, "reported", spy)
     track = Setup(Experiment(name="x", scenario="metis_madrid", changes=changes)).run(seed)
-    assert track.error_m[20:].max() > 15.0
+    drifted = np.hypot(*(alone[0] - track.truth)[20:, :2].T)
+    assert drifted.max() > 15.0
+    assert track.error_m[20:].max() < 0.7 * drifted.max()
+    assert np.mean(track.error_m[20:] ** 2) < 0.7 * np.mean(drifted**2)
     assert (track.error_m > track.level)[20:].sum() < 20
     assert np.median(track.level[20:]) < 5.0
 

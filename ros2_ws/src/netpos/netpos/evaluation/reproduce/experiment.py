@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from netpos.evaluation.bounds import bound_covariances
 from netpos.evaluation.metrics import NS
-from netpos.evaluation.reproduce.integrity import protection_levels
+from netpos.evaluation.reproduce.integrity import reported
 from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
 from netpos.filters.motion import N_CORE, SPEED_OF_LIGHT_MPS
 from netpos.messages.values import Array, ImuSample
@@ -123,7 +123,7 @@ class Setup:
         height_m, risk = self.config.device_height_m, self.config.integrity_risk
         bound = bound_covariances(*epochs[:3], truth, prior, height_m, motions, epochs.bias)
         means, covs, nis, dof, taken = (array[:done] for array in filled)
-        level = protection_levels(
+        means, covs, level = reported(
             *epochs[:3], means, covs, nis, dof, taken, motions, epochs.bias, self._options, risk
         )
         return Track(

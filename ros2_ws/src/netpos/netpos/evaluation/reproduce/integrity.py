@@ -1,4 +1,5 @@
-"""Protection levels of a whole run at once, as ``tracking.track`` reports them."""
+"""What ``tracking.track`` reports of a whole run, at once: estimates or their rivals, and
+protection levels."""
 
 from __future__ import annotations
 
@@ -14,14 +15,14 @@ from netpos.filters.motion import Parameter
 from netpos.messages.values import Array
 from netpos.tracking.engine import GATE, GATE_SIZE, Option
 from netpos.tracking.protection import gaussian_radius, level_in, level_scratch, radius_limit
-from netpos.tracking.rivals import matter, no_rivals, rival_level
+from netpos.tracking.rivals import LEADER, matter, no_rivals, rival_level
 
 _WINDOW, _TAIL = 50, 1e-3  # of ``NisWindow``
 _BOUND = np.append(0.0, chdtri(np.arange(1.0, 64.0 * _WINDOW), _TAIL))
 
 
 @kernel
-def protection_levels(
+def reported(
     stamps_ns: Array,
     row_start: Array,
     rows: Array,
@@ -34,9 +35,10 @@ def protection_levels(
     bias: Array,
     options: Array,
     risk: float,
-) -> Array:
-    """Levels [m] of the epochs of ``engine.run_epochs``, (N,), inputs and results of which these
-    are; every epoch has rows, its groups equally many.
+) -> tuple[Array, Array, Array]:
+    """Means (N, n), covariances (N, n, n) and levels [m] (N,) reported of the epochs of
+    ``engine.run_epochs``, inputs and results of which these are; every epoch has rows, its groups
+    equally many.
 
     motions : (N, Parameter) of each epoch, or (1, Parameter) of all. Where part of the groups was
     refused, which ones is not known here, and the level of a manoeuvre takes them all.
@@ -44,13 +46,13 @@ def protection_levels(
     level = np.zeros(means.shape[0])
     if options[Option.MANOEUVRE_SPEED] > 0.0:
         epochs = (stamps_ns, row_start, rows, means, covs, nis, dof, taken)
-        _allow_for_manoeuvres(*epochs, motions, bias, options, risk, level)
+        means, covs = _allow_for_manoeuvres(*epochs, motions, bias, options, risk, level)
     optimism = _optimism(row_start, rows, nis, taken, options)
     for k in range(level.size):
         xx, xy, yy = covs[k, 0, 0], covs[k, 0, 1], covs[k, 1, 1]
         if level[k] < optimism[k] * radius_limit(xx, xy, yy, risk):
             level[k] = max(level[k], optimism[k] * gaussian_radius(xx, xy, yy, risk))
-    return level
+    return means, covs, level
 
 
 @kernel
@@ -68,12 +70,13 @@ def _allow_for_manoeuvres(
     options: Array,
     risk: float,
     level: Array,
-) -> None:
+) -> tuple[Array, Array]:
     """Fill ``level`` (N,) with those of a manoeuvre nobody has noticed, rivals of the estimate
-    included."""
+    included; means and covariances reported."""
+    told_means, told_covs, led = means, covs, False
     x, P, motion = means[0].copy(), covs[0].copy(), motions[0].copy()
     scratch = level_scratch(x.size, np.diff(row_start).max())
-    heard_ns, accepted, rivals = stamps_ns[0], np.ones(GATE_SIZE), no_rivals(x.size)
+    heard_ns, accepted, rivals = stamps_ns[0], np.ones(GATE_SIZE), no_rivals(x.size, stamps_ns[0])
     for k in range(level.size):
         if k > 0:
             dt = (stamps_ns[k] - stamps_ns[k - 1]) * 1e-9
@@ -85,13 +88,20 @@ def _allow_for_manoeuvres(
             own, fit = rows[row_start[k] : row_start[k + 1]], (nis[k], int(dof[k]))
             epoch = (x, P, own, accepted, unheard_s)
             level[k] = level_in(*epoch, means[k], options, risk, scratch)
-            if matter(own, *fit, rivals[2]):
-                rest = (motion, bias, options, risk, rivals, scratch)
-                level[k] = rival_level(level[k], dt, *epoch, *fit, means[k], *rest)
+            if matter(stamps_ns[k], own, *fit, rivals[2], rivals[3]):
+                rest = (motion, bias, options, risk, rivals)
+                at = stamps_ns[k], dt
+                level[k] = rival_level(level[k], *at, *epoch, *fit, means[k], *rest)
+                leader = rivals[3][LEADER]
+                if leader >= 0:
+                    if not led:
+                        told_means, told_covs, led = means.copy(), covs.copy(), True
+                    told_means[k], told_covs[k] = rivals[0][leader], rivals[1][leader]
             if taken[k] == 0:
                 level[k] += options[Option.MANOEUVRE_SPEED] * unheard_s
         if taken[k] > 0:
             heard_ns = stamps_ns[k]
+    return told_means, told_covs
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""The levels of a compiled run are those its tracker reports."""
+"""The estimates and levels of a compiled run are those its tracker reports."""
 
 from __future__ import annotations
 
@@ -42,10 +42,14 @@ def test_levels_are_those_of_the_tracker(
             assert tracker.add(item) is None
         outputs += tracker.process()
     outputs += tracker.flush()
-    told = {o.status.stamp_ns: o.status.protection_level_m for o in outputs}
-    reported = np.array([told[stamp] for stamp in track.stamps_ns.tolist()])
+    levels = {o.status.stamp_ns: o.status.protection_level_m for o in outputs}
+    reported = np.array([levels[stamp] for stamp in track.stamps_ns.tolist()])
     assert len(track.level) > 200
     # the first epoch has no prediction; a group refused alone is not known to the run
     apart = np.abs(track.level - reported) > 1e-9 * reported
     assert apart[1:].sum() <= 2
     assert (track.level[1:] > 0.0).all()
+    positions = {o.status.stamp_ns: o.odometry.position for o in outputs if o.odometry}
+    told = np.array([positions[stamp][:2] for stamp in track.stamps_ns.tolist()])
+    astray = np.hypot(*(track.mean[:, :2] - told).T) > 1e-6
+    assert astray[1:].sum() <= 2
