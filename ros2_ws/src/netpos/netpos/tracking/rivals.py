@@ -5,7 +5,7 @@ and the bearing hardly changes. The estimate goes on in the wrong direction and 
 tells, if anything, is the sum of many measurements. A rival is the estimate with its velocity
 opened at some time, carried on with the same measurements; its odds are how often devices turn
 times its likelihood ratio to the estimate. The protection level holds every rival as far as its
-odds demand (multiple hypothesis solution separation: Blanch, Walter and Enge 2012), and what is
+odds demand (multiple hypotheses: Pervan, Pullen and Christie 1998), and what is
 reported is the rival that has won where one has (Wald 1945). The estimate itself goes on as it
 is: rivals that are wrong leave nothing behind.
 """
@@ -30,7 +30,7 @@ from netpos.tracking.config import TrackerConfig
 from netpos.tracking.engine import GATE, GATE_SIZE, Option, is_sound
 from netpos.tracking.estimates import Estimate
 from netpos.tracking.models import motions_of, options_of
-from netpos.tracking.protection import gaussian_radius
+from netpos.tracking.protection import gaussian_radius, radius_limit
 from netpos.tracking.sectors import Sectors
 
 Ints = npt.NDArray[np.int64]
@@ -261,7 +261,8 @@ def _reach(level: float, mean: Array, risk: float, rivals: State) -> float:
         if share < 0.5:
             P, x = covs[k], means[k]
             apart = math.hypot(x[0] - middle[0], x[1] - middle[1])
-            radius = max(radius, apart + gaussian_radius(P[0, 0], P[0, 1], P[1, 1], share))
+            if apart + radius_limit(P[0, 0], P[0, 1], P[1, 1], share) > radius:
+                radius = max(radius, apart + gaussian_radius(P[0, 0], P[0, 1], P[1, 1], share))
     return float(radius)
 
 

@@ -15,10 +15,12 @@ from netpos.filters.measurement import (
     COMMON,
     GATE_VARIANCE,
     HEADING,
+    KIND,
     ORIGIN,
     ROW_WIDTH,
     VALUE,
     VARIANCE,
+    Kind,
     curvature_variance,
     linearise,
 )
@@ -99,5 +101,7 @@ def test_strangeness_knows_that_a_bearing_does_not_bend_along_itself() -> None:
     assert size < fit.surprise(mean, cov, row, 0.0)[1]
     row[0, AXES + 8] = 0.9
     assert fit.strangeness(mean, cov, row, 0.0) == fit.surprise(mean, cov, row, 0.0)
-    mean, cov, ranges = range_problem(3)
+    mean, cov, rows = range_problem(3)
+    ranges = rows[rows[:, KIND] == Kind.RANGE]
+    assert len(ranges) > 0
     assert fit.strangeness(mean, cov, ranges, 0.0) == fit.surprise(mean, cov, ranges, 0.0)
