@@ -104,8 +104,6 @@ EQUIVALENT = {
     ("tracking/protection", "gaussian_radius", "operator swapped: 1e-06 * u"),
     ("tracking/protection", "gaussian_radius", "operator swapped: u + 2.0 * _NEGLIGIBLE"),
     ("tracking/protection", "radius_of", "operator swapped: xx + yy"),  # finite where both are
-    ("tracking/rivals", "_weigh", "left out: rival = math.inf"),  # set by what follows
-    ("tracking/rivals", "_weigh", "left out: continue"),  # no evidence is no number, not taken
     ("tracking/sector_bank", "_gains", "operator swapped: _WIDE_RAD * _WIDE_RAD"),  # is 1
     *(  # memory for more rows than there are
         ("tracking/engine", "run_epochs", f"operator swapped: {size}")

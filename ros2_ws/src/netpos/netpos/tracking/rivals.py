@@ -257,7 +257,7 @@ def _reach(level: float, mean: Array, risk: float, rivals: State) -> float:
     middle = mean if marks[LEADER] < 0 else means[marks[LEADER]]
     radius = level + math.hypot(mean[0] - middle[0], mean[1] - middle[1])
     for k in range(odds.size):
-        share = risk / math.exp(min(odds[k], 0.0))
+        share = risk * math.exp(-min(odds[k], 0.0))
         if share < 0.5:
             P, x = covs[k], means[k]
             apart = math.hypot(x[0] - middle[0], x[1] - middle[1])

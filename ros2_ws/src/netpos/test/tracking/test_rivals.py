@@ -19,11 +19,11 @@ from netpos.filters.rows import linear_rows
 from netpos.messages.values import Array
 from netpos.tracking import TrackerConfig, warm_up
 from netpos.tracking import rivals as rivals_module
-from netpos.tracking.engine import GATE
+from netpos.tracking.engine import GATE, GATE_SIZE
 from netpos.tracking.estimates import Single
 from netpos.tracking.models import motions_of, options_of
 from netpos.tracking.protection import gaussian_radius
-from netpos.tracking.rivals import BEGUN, LEADER, Rivals, matter, no_rivals, rival_level
+from netpos.tracking.rivals import BEGUN, LEADER, Rivals, State, matter, no_rivals, rival_level
 from scipy.stats import multivariate_normal
 
 CONFIG = TrackerConfig(manoeuvre_speed_sd_mps=5.0, accel_density_mps2_sqrthz=0.1)
@@ -266,6 +266,76 @@ def test_a_rival_leads_from_certain_to_even(odds: list[float], before: int, afte
     marks = np.array([before, 0])
     rivals_module._lead(RISK, np.array(odds), marks)
     assert marks.tolist() == [after, 0]
+
+
+@pytest.mark.parametrize(("nis", "begins"), [(5.99, False), (6.01, True)])
+def test_a_rival_begins_where_twice_the_usual_is_exceeded(nis: float, begins: bool) -> None:
+    rows, (_, _, odds, marks) = linear_rows(np.zeros(2), R, H, 0), no_rivals(6, 0)
+    assert matter(1, rows, nis, 3, odds, marks) is begins
+    odds[1] = 0.0
+    assert matter(1, rows, nis, 3, odds, marks)
+
+
+def present(mean: Array) -> State:
+    """The second rival, at ``mean``."""
+    rivals = no_rivals(6, 0)
+    rivals[0][1], rivals[1][1], rivals[2][1] = mean, 0.01 * np.eye(6), 3.0
+    return rivals
+
+
+def carried_on(rivals: State, mean: Array, motion: Array, dof: int = 0) -> float:
+    """Level of an epoch with all or nothing accepted, an own one of half a metre."""
+    rows = linear_rows(np.zeros(2), R, H, 0)
+    accepted = np.full(1, 1.0 if dof else 0.0)
+    before = (mean, 0.01 * np.eye(6), rows, accepted, DT, 0.0, dof, mean)
+    return float(
+        rival_level(0.5, 100_000_000, DT, *before, motion, NO_BIAS, OPTIONS, RISK, rivals)
+    )
+
+
+def test_the_level_reaches_from_the_estimate_to_the_far_side_of_a_rival() -> None:
+    """Anywhere; the velocity step of the estimate's own second look is none of the rival's."""
+    mean = np.array([700.0, -300.0, 4.0, 1.0, 2.0, 0.1])
+    rivals, motion = present(mean), MOTION.copy()
+    rivals[0][1, :4] += 30.0, 40.0, 1.0, -2.0
+    expected, cov = rivals[0][1].copy(), 0.01 * np.eye(6)
+    ekf.predict(expected, cov, DT, MOTION.copy(), NO_BIAS)
+    motion[Parameter.JUMP_SPEED] = 50.0
+    kept = motion.copy()
+    level = carried_on(rivals, mean, motion)
+    apart = math.hypot(30.0 + 5.0 * DT, 40.0 - 1.0 * DT)
+    assert level == pytest.approx(apart + gaussian_radius(*cov[[0, 0, 1], [0, 1, 1]], RISK))
+    np.testing.assert_allclose(rivals[0][1], expected, rtol=1e-12)
+    np.testing.assert_allclose(rivals[1][1], cov, rtol=1e-12)
+    assert rivals[2][:3].tolist() == [-math.inf, 3.0, -math.inf]
+    assert rivals[3].tolist() == [-1, 0]
+    np.testing.assert_array_equal(motion, kept)
+
+
+def test_a_rival_that_cannot_be_a_device_is_given_up() -> None:
+    rivals = present(np.array([0.0, 0.0, 3.1e8, 0.0, 0.0, 0.0]))
+    assert carried_on(rivals, np.zeros(6), MOTION, dof=2) == 0.5
+    assert rivals[2].max() == -math.inf
+
+
+def test_an_array_of_many_antennas_is_weighed_by_the_last_bound() -> None:
+    """Seventy rows of one measurement of a device that has turned: more than the gate has bounds
+    for."""
+    rng, m = np.random.default_rng(3), 70
+    wide_H = rng.normal(size=(m, 6))
+    z, rivals = wide_H @ np.array([0.0, 0.0, 3.0, -2.0, 0.0, 0.0]), no_rivals(6, 0)
+    rows, cov, prior = linear_rows(z, np.eye(m), wide_H, 0), 0.01 * np.eye(6), np.zeros(6)
+    before = (prior, cov, rows, np.ones(1), DT, 1e4, m, prior)
+    rival_level(1.0, 100_000_000, DT, *before, MOTION, NO_BIAS, OPTIONS, RISK, rivals)
+    _, longest_s = unnoticed_s(prior, cov, rows, 0.0, OPTIONS[GATE + 2], 5.0, np.empty(6))
+    window_s, sizes = max(DT, longest_s), []
+    for P in (cov, opened(cov, window_s)):
+        S = wide_H @ P @ wide_H.T + np.eye(m)
+        distance = min(z @ np.linalg.solve(S, z), OPTIONS[GATE + GATE_SIZE - 1])
+        sizes.append(distance + np.linalg.slogdet(2.0 * math.pi * S)[1])
+    gained = (sizes[0] - sizes[1]) / 2.0
+    assert gained > 0.0
+    assert rivals[2][0] == pytest.approx(gained + math.log(window_s / 30.0), rel=1e-9)
 
 
 def test_a_copy_goes_its_own_way_and_a_new_state_starts_anew() -> None:
