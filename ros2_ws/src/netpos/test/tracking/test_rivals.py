@@ -255,6 +255,7 @@ def test_the_rival_that_has_won_is_reported() -> None:
         ([9.2, -math.inf], -1, -1),
         ([9.22, -math.inf], -1, 0),
         ([9.22, 9.3], -1, 1),
+        ([9.3, 9.22], -1, 0),
         ([0.01, 9.3], 0, 0),
         ([0.0, 9.3], 0, 1),
         ([0.0, 9.2], 0, -1),
@@ -281,6 +282,33 @@ def present(mean: Array) -> State:
     rivals = no_rivals(6, 0)
     rivals[0][1], rivals[1][1], rivals[2][1] = mean, 0.01 * np.eye(6), 3.0
     return rivals
+
+
+@pytest.mark.parametrize(("margin", "ends"), [(-1e-9, False), (1e-9, True)])
+def test_a_rival_ends_within_the_level(margin: float, ends: bool) -> None:
+    mean = np.array([700.0, -300.0, 4.0, 1.0, 2.0, 0.1])
+    rivals = present(mean + np.array([3.0, -4.0, 0.0, 0.0, 0.0, 0.0]))
+    level = 5.0 + gaussian_radius(0.01, 0.0, 0.01, RISK) + margin
+    rivals_module._dismiss(level, mean, RISK, rivals)
+    assert math.isinf(rivals[2][1]) is ends
+
+
+def test_the_level_about_a_leader_holds_that_about_the_estimate() -> None:
+    mean = np.array([700.0, -300.0, 4.0, 1.0, 2.0, 0.1])
+    rivals = present(mean + np.array([3.0, -4.0, 0.0, 0.0, 0.0, 0.0]))
+    rivals[3][LEADER] = 1
+    assert rivals_module._reach(2.0, mean, RISK, rivals) == pytest.approx(7.0)
+
+
+def test_a_leader_whose_place_is_taken_leads_no_more() -> None:
+    rows, cov = linear_rows(np.array([3.0, 3.0]), R, H, 0), np.eye(6) * 0.01
+    rivals = no_rivals(6, 0)
+    rivals[2][:] = [0.3, 0.1, *([0.4] * 6)]
+    for leader, after in ((0, 0), (1, -1)):
+        rivals[2][1], rivals[3][LEADER] = 0.1, leader
+        args = (np.zeros(6), cov, rows, 30.0, 100.0, OPTIONS, RISK, rivals)
+        assert rivals_module._begin(*args)
+        assert rivals[3][LEADER] == after
 
 
 def carried_on(rivals: State, mean: Array, motion: Array, dof: int = 0) -> float:
