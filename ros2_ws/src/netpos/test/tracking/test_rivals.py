@@ -13,9 +13,9 @@ from netpos.filters.measurement import GROUP
 from netpos.filters.motion import Model, Parameter
 from netpos.filters.rows import linear_rows
 from netpos.messages.values import Array
-from netpos.tracking import TrackerConfig, warm_up
+from netpos.tracking import TrackerConfig
 from netpos.tracking import rivals as rivals_module
-from netpos.tracking.engine import GATE, GATE_SIZE
+from netpos.tracking.engine import GATE, GATE_SIZE, Option
 from netpos.tracking.estimates import Single
 from netpos.tracking.models import motions_of, options_of
 from netpos.tracking.protection import gaussian_radius
@@ -273,6 +273,18 @@ def test_a_rival_begins_where_twice_the_usual_is_exceeded(nis: float, begins: bo
     assert matter(1, rows, nis, 3, odds, marks)
 
 
+def test_a_turn_that_shows_at_once_may_lie_since_the_last_beginning() -> None:
+    """0.1 s, where 5 ms are enough to show one of 500 m/s and 20 ms have passed unheard."""
+    rivals, z, mean, cov = no_rivals(6, 900_000_000), np.full(2, 3.0), np.zeros(6), np.eye(6) / 100
+    options, rows = OPTIONS.copy(), linear_rows(z, R, H, 0)
+    options[Option.MANOEUVRE_SPEED] = 500.0
+    epoch = (1_000_000_000, DT, mean, cov, rows, np.ones(1), 0.02, 200.0, 2, mean)
+    rival_level(0.0, *epoch, MOTION, NO_BIAS, options, RISK, rivals)
+    wide = cov + 100.0**2 * (opened(cov, 0.1) - cov)
+    odds = math.log(0.1 / 30.0) + (surprise(z, mean, cov) - surprise(z, mean, wide)) / 2.0
+    assert rivals[2].max() == pytest.approx(odds)
+
+
 def present(mean: Array) -> State:
     """The second rival, at ``mean``."""
     rivals = no_rivals(6, 0)
@@ -380,11 +392,3 @@ def test_a_copy_goes_its_own_way_and_a_new_state_starts_anew() -> None:
     estimate.grow(np.array([1.0]))
     new = epoch(Rivals(CONFIG), estimate.copy(), 3, 1.2)
     assert epoch(rivals, estimate, 3, 1.2) == new
-
-
-def test_the_warm_up_looks_for_rivals(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A kernel first needed afterwards would bring the compiler back."""
-    asked = []
-    monkeypatch.setattr(rivals_module, "rival_level", lambda *args: asked.append(args) or 1.0)
-    warm_up._rivals()
-    assert len(asked) == 1

@@ -1,4 +1,4 @@
-"""Drives with turns that only rivals of the estimate tell of."""
+"""Drives with turns that only rivals of the estimate tell of, and their kernels in a node."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from netpos.evaluation.reproduce import experiment
 from netpos.evaluation.reproduce.experiment import Experiment, Setup
 from netpos.evaluation.reproduce.integrity import reported
 from netpos.messages.values import Array
+from netpos.tracking import rivals as rivals_module
+from netpos.tracking import warm_up
 
 
 @pytest.mark.parametrize("seed", [5132, 5511])
@@ -33,3 +35,11 @@ def test_a_turn_along_the_bearing_is_held_and_ended(
     assert np.mean(track.error_m[20:] ** 2) < 0.7 * np.mean(drifted**2)
     assert (track.error_m > track.level)[20:].sum() < 20
     assert np.median(track.level[20:]) < 5.0
+
+
+def test_the_warm_up_looks_for_rivals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A kernel first needed afterwards would bring the compiler back."""
+    asked = []
+    monkeypatch.setattr(rivals_module, "rival_level", lambda *args: asked.append(args) or 1.0)
+    warm_up._rivals()
+    assert len(asked) == 1
