@@ -52,32 +52,23 @@ def misfit(
 
 
 @kernel
-def surprise(mean: Array, cov: Array, rows: Array, height_m: float) -> tuple[float, float]:
+def surprise(
+    mean: Array, cov: Array, rows: Array, height_m: float, at_its_largest: bool
+) -> tuple[float, float]:
     """Squared Mahalanobis distance of ``rows`` (m, ROW_WIDTH) from what mean (n,), cov (n, n)
-    predict of them as the extended Kalman filter sees it, and ln det(2 pi S): minus twice their
-    log density is the sum of the two. What is known exactly is left out."""
+    predict of them, and ln det(2 pi S): minus twice their log density is the sum of the two. What
+    is known exactly is left out.
+
+    at_its_largest : S has the curvature as the extended Kalman filter takes it; else
+        ``second_order_variance``, to weigh priors of different widths
+    """
     innovation, H = linearise(rows, mean, height_m)
     S = H @ cov @ H.T
     for i in range(innovation.size):
-        S[i, i] += rows[i, VARIANCE] + curvature_variance(rows[i], mean, cov, height_m)
-    distance, size = _normal(innovation, S)
-    return distance, size
-
-
-@kernel
-def strangeness(mean: Array, cov: Array, rows: Array, height_m: float) -> tuple[float, float]:
-    """``surprise`` with ``second_order_variance``: to weigh priors of different widths."""
-    innovation, H = linearise(rows, mean, height_m)
-    S = H @ cov @ H.T
-    for i in range(innovation.size):
-        S[i, i] += rows[i, VARIANCE] + second_order_variance(rows[i], mean, cov, height_m)
-    distance, size = _normal(innovation, S)
-    return distance, size
-
-
-@kernel
-def _normal(innovation: Array, S: Array) -> tuple[float, float]:
-    """Squared Mahalanobis distance and ln det(2 pi S)."""
+        if at_its_largest:
+            S[i, i] += rows[i, VARIANCE] + curvature_variance(rows[i], mean, cov, height_m)
+        else:
+            S[i, i] += rows[i, VARIANCE] + second_order_variance(rows[i], mean, cov, height_m)
     L = factor(S)
     distance, size = 0.0, 0.0
     for i in range(innovation.size):

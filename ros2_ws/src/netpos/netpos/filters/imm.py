@@ -109,7 +109,7 @@ def _keep_alive(weights: Array) -> None:
 def log_likelihood(mean: Array, cov: Array, rows: Array, height_m: float) -> float:
     """Log density of ``rows`` (m, ROW_WIDTH) as the extended Kalman filter at mean, cov sees
     them."""
-    distance, size = surprise(mean, cov, rows, height_m)
+    distance, size = surprise(mean, cov, rows, height_m, True)
     return float(-0.5 * (distance + size))
 
 

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from netpos.filters import ekf
 from netpos.filters.compile import kernel, leaf
-from netpos.filters.fit import strangeness
+from netpos.filters.fit import surprise
 from netpos.filters.gate import accepted_rows
 from netpos.filters.manoeuvre import add_manoeuvre, unnoticed_s
 from netpos.filters.measurement import GROUP
@@ -142,7 +142,7 @@ def _move(dt: float, motion: Array, bias: Array, rivals: State) -> None:
 def _surprised(mean: Array, cov: Array, rows: Array, options: Array) -> float:
     """Minus twice the log density of ``rows``. A misfit counts as far as the gate lets it: what
     is beyond is an outlier to any."""
-    distance, size = strangeness(mean, cov, rows, options[Option.HEIGHT])
+    distance, size = surprise(mean, cov, rows, options[Option.HEIGHT], False)
     return float(min(distance, options[GATE + min(rows.shape[0], GATE_SIZE - 1)]) + size)
 
 
