@@ -17,6 +17,7 @@ from netpos.tracking.engine import GATE, GATE_SIZE, Option
 from netpos.tracking.protection import gaussian_radius, level_in, level_scratch, radius_limit
 from netpos.tracking.rivals import LEADER, matter, no_rivals, rival_level
 
+_Epochs = tuple[Array, Array, Array, Array, Array, Array, Array, Array]  # as ``reported`` has them
 _WINDOW, _TAIL = 50, 1e-3  # of ``NisWindow``
 _BOUND = np.append(0.0, chdtri(np.arange(1.0, 64.0 * _WINDOW), _TAIL))
 
@@ -46,7 +47,7 @@ def reported(
     level = np.zeros(means.shape[0])
     if options[Option.MANOEUVRE_SPEED] > 0.0:
         epochs = (stamps_ns, row_start, rows, means, covs, nis, dof, taken)
-        means, covs = _allow_for_manoeuvres(*epochs, motions, bias, options, risk, level)
+        means, covs = _allow_for_manoeuvres(epochs, motions, bias, options, risk, level)
     optimism = _optimism(row_start, rows, nis, taken, options)
     for k in range(level.size):
         xx, xy, yy = covs[k, 0, 0], covs[k, 0, 1], covs[k, 1, 1]
@@ -57,14 +58,7 @@ def reported(
 
 @kernel
 def _allow_for_manoeuvres(
-    stamps_ns: Array,
-    row_start: Array,
-    rows: Array,
-    means: Array,
-    covs: Array,
-    nis: Array,
-    dof: Array,
-    taken: Array,
+    epochs: _Epochs,
     motions: Array,
     bias: Array,
     options: Array,
@@ -73,6 +67,7 @@ def _allow_for_manoeuvres(
 ) -> tuple[Array, Array]:
     """Fill ``level`` (N,) with those of a manoeuvre nobody has noticed, rivals of the estimate
     included; means and covariances reported."""
+    stamps_ns, row_start, rows, means, covs, nis, dof, taken = epochs
     told_means, told_covs, led = means, covs, False
     x, P, motion = means[0].copy(), covs[0].copy(), motions[0].copy()
     scratch = level_scratch(x.size, np.diff(row_start).max())
