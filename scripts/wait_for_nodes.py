@@ -7,6 +7,7 @@ import sys
 import time
 
 import rclpy
+from netpos_node import init
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
@@ -17,7 +18,7 @@ def main() -> int:
     parser.add_argument("names", nargs="+")
     parser.add_argument("--timeout", type=float, default=90.0, help="seconds")
     arguments = parser.parse_args()
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C is a KeyboardInterrupt
+    init(signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C is a KeyboardInterrupt
     node = Node("wait_for_nodes", start_parameter_services=False)
     end = time.monotonic() + arguments.timeout
     try:

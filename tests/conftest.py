@@ -18,8 +18,11 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 try:
     from graph import Graph, claim_domain
+    from netpos_node import choose_profiles
 except ImportError as error:
     pytest.exit(f"{error}: run the tests by `make test`, or `source env.sh` first", returncode=4)
+
+choose_profiles(os.environ)  # of the observers; what nodes do is the same
 
 ROOT = Path(__file__).resolve().parents[1]
 

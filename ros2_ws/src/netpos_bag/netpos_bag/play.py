@@ -10,7 +10,7 @@ from typing import Any
 import rclpy
 from netpos.bags import BagEntry, BagReader
 from netpos.messages.topics import CLOCK
-from netpos_node import message_class, wait_until_heard
+from netpos_node import init, message_class, wait_until_heard
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -125,7 +125,7 @@ class PlayNode(Node):
 def main() -> None:
     """Play to the end (or until SIGINT, SIGTERM); exit 0, or 2 where options or bag are wrong."""
     flags = play_flags(remove_ros_args(sys.argv)[1:])
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    init(signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = PlayNode(flags)
     except (ValueError, OSError) as error:

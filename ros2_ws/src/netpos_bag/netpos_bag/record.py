@@ -14,7 +14,7 @@ import rclpy
 from netpos import __version__
 from netpos.bags import BagError, BagWriter
 from netpos.messages.topics import CLOCK
-from netpos_node import message_class
+from netpos_node import init, message_class
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
@@ -141,7 +141,7 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: stopping.append(number))
     flags = record_flags(remove_ros_args(sys.argv)[1:])
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    init(signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = RecordNode(flags)
     except (ValueError, OSError) as error:

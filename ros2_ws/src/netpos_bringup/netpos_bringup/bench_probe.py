@@ -27,7 +27,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from netpos.messages import topics
 from netpos_msgs.msg import RsuInfo, RsuMeasurement
-from netpos_node import BACKLOG, CODEC, LATCHED
+from netpos_node import BACKLOG, CODEC, LATCHED, init
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -379,7 +379,7 @@ def main() -> int:
     commands.add_parser("ready").add_argument("--starts", type=int, default=3)
     given = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # ends what it has started
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    init(signal_handler_options=SignalHandlerOptions.NO)
     try:
         match given.command:
             case "latency":

@@ -47,10 +47,16 @@ _PROFILES = {
 
 
 def choose_profiles(environment: MutableMapping[str, str]) -> None:
-    """Let Fast DDS take the endpoints' memory policy from ``fastdds.xml``, unless the user has
-    chosen profiles; before a context is initialised."""
+    """Let Fast DDS take the endpoints' memory policy and the rate of announcements from
+    ``fastdds.xml``, unless the user has chosen profiles; before a context is initialised."""
     if not {*_PROFILES, "FASTDDS_DEFAULT_PROFILES_FILE"} & environment.keys():
         environment.update(_PROFILES)
+
+
+def init(**options: Any) -> None:
+    """``rclpy.init`` with these ``options``, of a process with our profiles."""
+    choose_profiles(os.environ)
+    rclpy.init(**options)
 
 
 def message_class(type_name: str) -> Any:
@@ -72,8 +78,7 @@ def spin_and_finish(node: Any) -> None:
 def run(factory: Callable[[], Any], spin: Callable[[Any], None] = spin_and_finish) -> None:
     """Start a node, spin it, shut down; a bad parameter ends the process with one sentence and
     code 2."""
-    choose_profiles(os.environ)
-    rclpy.init()
+    init()
     try:
         node = factory()
     except (
