@@ -159,6 +159,7 @@ def _common(summary: Summary) -> Iterator[Row]:
     share, risk = summary.exceeded, setup_of(summary.experiment).config.integrity_risk
     label = f"{name}: errors above the protection level (promised {risk:g})"
     yield required(label, "1", share, share <= risk)
+    yield shown(f"{name}: routes with such an error", "1", summary.exceeded_runs / summary.runs)
     yield shown(f"{name}: protection level, mean", "m", summary.level_m)
     yield shown(f"{name}: posterior Cramér-Rao bound of the RMSE", "m", summary.bound_rmse_m)
 

@@ -153,11 +153,11 @@ class Summary:
 
     rmse_m over all scored estimates, mean_error_m what fokin2020:eq.34 calls RMSE; clock_sd_ns
     about the mean; nees of the position (2 degrees of freedom); exceeded: share of estimates whose
-    error is above their protection level, the mean of which is level_m; bound_rmse_m the posterior
-    Cramér-Rao bound of rmse_m; lost: runs that ended with a lost track; diverged: these, and runs
-    with an error above 5 m; rate_hz and ready_s of the worst run, ready_s None where a run never
-    got ready; error2 (runs, N) m^2 of all estimates for experiments with one route, NaN after a
-    loss.
+    error is above their protection level, the mean of which is level_m, and exceeded_runs the runs
+    that have such; bound_rmse_m the posterior Cramér-Rao bound of rmse_m; lost: runs that ended
+    with a lost track; diverged: these, and runs with an error above 5 m; rate_hz and ready_s of
+    the worst run, ready_s None where a run never got ready; error2 (runs, N) m^2 of all estimates
+    for experiments with one route, NaN after a loss.
     """
 
     experiment: Experiment
@@ -172,6 +172,7 @@ class Summary:
     nees: MeanTest
     nis_over_dof: float | None
     exceeded: float
+    exceeded_runs: int
     level_m: float
     bound_rmse_m: float
     diverged: int
@@ -237,6 +238,7 @@ class Summary:
                 n_eff=n_eff,
             ),
             exceeded=sum(t.exceeded for t in tallies) / n,
+            exceeded_runs=sum(t.exceeded > 0 for t in tallies),
             level_m=sum(t.level for t in tallies) / n,
             nis_over_dof=sum(t.nis for t in tallies) / dof if dof else None,
             bound_rmse_m=float(np.sqrt(sum(t.bound2 for t in tallies) / n)),

@@ -72,6 +72,7 @@ def test_figures_of_two_runs() -> None:
     )
     assert 0.0 < ours.exceeded < 1.0
     assert ours.exceeded == pytest.approx(np.mean(distance > 0.8))
+    assert ours.exceeded_runs == 2
     assert ours.level_m == pytest.approx(0.8)
     assert ours.rate_hz == pytest.approx(4.0)
     assert (ours.diverged, ours.lost) == (0, 0)
@@ -107,6 +108,15 @@ def test_a_run_diverges_above_5_m_or_when_lost(error_m: float, lost: int, diverg
     tracks[1] = replace(tracks[1], lost=bool(lost))
     ours = _summary(tracks)
     assert (ours.diverged, ours.lost) == (diverged, lost)
+
+
+@pytest.mark.parametrize(("error_m", "runs"), [(0.79, 0), (0.81, 1)])
+def test_runs_with_an_error_above_their_level(error_m: float, runs: int) -> None:
+    tracks = [_track(1, 60), _track(2, 60)]
+    for track in tracks:
+        track.mean[SKIP:, :2] = track.truth[SKIP:, :2]
+    tracks[1].mean[-3:, 1] += error_m
+    assert _summary(tracks).exceeded_runs == runs
 
 
 def test_errors_beyond_the_histogram_have_no_percentile() -> None:
