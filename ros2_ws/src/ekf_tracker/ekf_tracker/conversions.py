@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -33,20 +33,29 @@ def diagnostics_to_msg(
     rsu_count: int,
     reports: Iterable[RsuReport] = (),
     network: str = "",
+    *,
+    silent_s: Mapping[str, float] | None = None,
+    warning: str = "",
 ) -> Any:
     """diagnostic_msgs/DiagnosticArray with one entry per device and per RSU heard, stamped with
-    the newest epoch; ``network``: the one this tracker is of."""
+    the newest epoch.
+
+    network : the one this tracker is of; silent_s : seconds since what was last told of devices
+    that have fallen silent; warning : what is wrong with the tracker's input as a whole
+    """
     tracker = f"ekf_tracker {network}".rstrip()
     array = DiagnosticArray()
     newest = 0
     for status in statuses:
         newest = max(newest, status.stamp_ns)
-        array.status.append(_device(tracker, status))
+        array.status.append(_device(tracker, status, (silent_s or {}).get(status.vue_id, 0.0)))
     array.status.append(
         DiagnosticStatus(
-            level=DiagnosticStatus.OK if rsu_count else DiagnosticStatus.WARN,
+            level=DiagnosticStatus.OK if rsu_count and not warning else DiagnosticStatus.WARN,
             name=f"{tracker}: rsus",
-            message=f"{rsu_count} RSUs known" if rsu_count else "no /rsu/info received yet",
+            message=f"{rsu_count} RSUs known{warning and '; '}{warning}"
+            if rsu_count
+            else "no /rsu/info received yet",
         )
     )
     array.status.extend(_rsu(tracker, report) for report in reports)
@@ -83,7 +92,7 @@ def _steps(steps: StepCalibration) -> dict[str, str]:
     return said
 
 
-def _device(tracker: str, status: TrackStatus) -> Any:
+def _device(tracker: str, status: TrackStatus, silent_s: float) -> Any:
     values = {
         "position_sd_m": f"{status.position_sd_m:.3f}",
         "protection_level_m": f"{status.protection_level_m:.3f}",
@@ -93,10 +102,11 @@ def _device(tracker: str, status: TrackStatus) -> Any:
         **_steps(status.steps),
         **{f"rejected: {reason}": str(n) for reason, n in sorted(status.rejected.items())},
     }
+    state = status.state.name.lower()
     return DiagnosticStatus(
-        level=_LEVELS[status.state],
+        level=DiagnosticStatus.STALE if silent_s else _LEVELS[status.state],
         name=f"{tracker}: {status.vue_id}",
-        message=status.state.name.lower(),
+        message=f"silent for {silent_s:.0f} s; was {state}" if silent_s else state,
         hardware_id=status.vue_id,
         values=[KeyValue(key=key, value=value) for key, value in values.items()],
     )

@@ -7,12 +7,12 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from netpos.messages import topics
+from netpos.messages.values import RsuMeasurement as Measurement
 from netpos.tracking import Tracker, TrackOutput
 from netpos.tracking.warm_up import warm_up, warm_up_anchors
 from netpos_msgs.msg import NetworkTrack, RsuInfo, RsuMeasurement
-from netpos_node import CDR, CODEC, LATCHED, STREAM, run, take_waiting
+from netpos_node import CDR, CODEC, LATCHED, STREAM, patience, run, take_waiting
 from netpos_node.estimating import EstimatingNode
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu
 
 from ekf_tracker.conversions import diagnostics_to_msg, network_track_to_msg
@@ -23,7 +23,8 @@ class EkfTrackerNode(EstimatingNode):
     """Feeds a ``Tracker``. Measurements and estimates come and go as bytes."""
 
     def __init__(self, **node_options: Any) -> None:
-        warm_up("")  # before the node is seen: whoever sees it may count on it
+        with patience("compiling the kernels, some minutes, once after a change of the sources"):
+            warm_up("")  # before the node is seen: whoever sees it may count on it
         super().__init__("ekf_tracker", **node_options)
         parameters = declare_parameters(self)
         if parameters.config.network:
@@ -60,7 +61,10 @@ class EkfTrackerNode(EstimatingNode):
         take_waiting(*self._inputs[0])  # descriptions of RSUs come first
         measurement = CDR.measurement(cdr)
         if measurement is None:
-            measurement = CODEC.measurement_from_msg(deserialize_message(cdr, RsuMeasurement))
+            message = self._read(cdr, RsuMeasurement)
+            if message is None:
+                return
+            measurement = CODEC.measurement_from_msg(message)
         if not self._tracker.concerns(measurement):
             return
         if measurement.vue_id not in self._outputs and topics.is_vue_id(measurement.vue_id):
@@ -70,8 +74,9 @@ class EkfTrackerNode(EstimatingNode):
     def _add(self, item: Any) -> None:
         reason = self._tracker.add(item)
         if reason is not None:
+            source = f" of {item.rsu_id}" if isinstance(item, Measurement) else ""
             self.get_logger().warning(
-                f"{item.vue_id}: refused a {type(item).__name__}: {reason}",
+                f"{item.vue_id}: refused a {type(item).__name__}{source}: {reason}",
                 throttle_duration_sec=2.0,
             )
 
@@ -103,7 +108,10 @@ class EkfTrackerNode(EstimatingNode):
     def _on_imu(self, cdr: bytes, vue_id: str) -> None:
         sample = CDR.imu(cdr, vue_id)
         if sample is None:
-            sample = CODEC.imu_from_msg(deserialize_message(cdr, Imu), vue_id)
+            message = self._read(cdr, Imu)
+            if message is None:
+                return
+            sample = CODEC.imu_from_msg(message, vue_id)
         self._add(sample)
 
     def _publish_one(self, output: TrackOutput) -> None:
@@ -116,10 +124,19 @@ class EkfTrackerNode(EstimatingNode):
             diagnostics_to_msg(
                 self._statuses.values(),
                 self._tracker.rsu_count,
-                self._tracker.rsu_reports(),
+                self._tracker.rsu_reports(self._unheard_s()),
                 self._network,
+                silent_s=self._silent_s(),
+                warning=self._warning(),
             )
         )
+
+    def _warning(self) -> str:
+        """What keeps the tracker from hearing anything."""
+        if not self._tracker.enabled:
+            return "disabled: measurements are refused"
+        unheard_s = self._unheard_s()
+        return f"nothing heard for {unheard_s:.0f} s" if unheard_s and self._statuses else ""
 
 
 def main() -> None:

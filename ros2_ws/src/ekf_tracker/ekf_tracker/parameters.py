@@ -28,7 +28,7 @@ def declare_parameters(node: Node) -> TrackerParameters:
     defaults = TrackerConfig.from_mapping(settings.parameters)
     config = declare_config(node, TrackerConfig, asdict(defaults))
     text = "devices whose topics exist from the start; others appear when first heard"
-    vue_ids = tuple(declare(node, "vues", list(settings.names_by(config.network)), text))
+    vue_ids = tuple(declare(node, "vues", list(settings.names_by(config.network)), text) or ())
     for vue_id in vue_ids:
         if not is_vue_id(vue_id):
             raise ValueError(f"vues: {vue_id!r} is no device name; use letters, digits and _")
@@ -46,6 +46,7 @@ def declare_parameters(node: Node) -> TrackerParameters:
             0,
             "listen to measurements once the estimates have so many subscribers (or after 30 s);"
             " tracks of a network need one more, the fusion",
+            low=0,
         ),
         config=config,
     )

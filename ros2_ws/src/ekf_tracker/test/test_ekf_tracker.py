@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,80 +10,28 @@ from typing import Any
 import numpy as np
 import pytest
 from ekf_tracker.node import EkfTrackerNode
-from nav_msgs.msg import Odometry
+from feed import DOMAIN, PLACES, T0, arrive, drive, keep, know_rsus, measurement
 from netpos.bags import BagWriter, codec, typestore
 from netpos.messages.values import (
     Field,
     ImuSample,
     InitialPose,
-    RsuInfo,
-    RsuMeasurement,
     TrackState,
     Velocity,
 )
-from netpos_msgs.msg import ClockState
-from netpos_msgs.msg import TrackStatus as TrackStatusMsg
 from netpos_node import CODEC
 from nodes import Kept, nodes_of
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from rclpy.serialization import serialize_message
 from rclpy.time import Time
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
-
-DOMAIN = 36
-T0 = 1_000_000_000
-PLACES = {"a": (0.0, 10.0), "b": (60.0, -10.0), "c": (120.0, 10.0)}
 
 
 @pytest.fixture
 def make() -> Iterator[Any]:
     with nodes_of(EkfTrackerNode, DOMAIN) as node:
         yield node
-
-
-def arrive(node: EkfTrackerNode, topic: str, msg: Any) -> None:
-    """As the executor does when a message has arrived."""
-    (subscription,) = (s for s, _ in node._inputs if s.topic_name == topic)
-    subscription.callback(serialize_message(msg) if subscription.raw else msg)
-
-
-def know_rsus(node: EkfTrackerNode) -> None:
-    for name, (x, y) in PLACES.items():
-        info = RsuInfo(rsu_id=name, position=np.array([x, y, 0.0]))
-        arrive(node, "/rsu/info", CODEC.rsu_info_to_msg(info))
-
-
-def measurement(name: str, t_s: float, vue_id: str = "vue_1", **change: Any) -> Any:
-    """What an RSU measures of a device that drives east along y = 0 at 8 m/s."""
-    d = np.array([8.0 * t_s, 0.0]) - PLACES[name]
-    values = {
-        "stamp_ns": T0 + round(t_s * 1e9),
-        "rsu_id": name,
-        "vue_id": vue_id,
-        "expected": 3,
-        "fields": Field.AZIMUTH | Field.TOA,
-        "azimuth_rad": math.atan2(d[1], d[0]),
-        "azimuth_var": 3e-4,
-        "toa_s": float(np.linalg.norm(d)) / 299_792_458.0,
-        "toa_var": 1e-18,
-    }
-    return CODEC.measurement_to_msg(RsuMeasurement(**(values | change)))
-
-
-def drive(node: EkfTrackerNode, epochs: range, vue_id: str = "vue_1") -> None:
-    for k in epochs:
-        for name in PLACES:
-            arrive(node, "/rsu/measurements", measurement(name, 0.1 * k, vue_id))
-
-
-def keep(node: EkfTrackerNode, vue_id: str = "vue_1") -> tuple[Kept, Kept, Kept]:
-    if vue_id not in node._outputs:
-        node._add_device(vue_id)
-    kept = Kept(Odometry), Kept(ClockState), Kept(TrackStatusMsg)
-    node._outputs[vue_id] = kept  # type: ignore[assignment]
-    return kept
 
 
 # the graph
@@ -139,18 +86,6 @@ def test_unknown_device_gets_its_topics_when_first_heard(make: Any) -> None:
     assert node._statuses["vue_9"].state is TrackState.TRACKING
 
 
-@pytest.mark.parametrize("vue_id", ["", "no spaces", "1st", "a//b", "ü", "a/b", "{x}"])
-def test_a_name_that_is_no_topic_is_refused_and_the_node_lives_on(make: Any, vue_id: str) -> None:
-    node = make()
-    know_rsus(node)
-    arrive(node, "/rsu/measurements", measurement("a", 0.0, vue_id))
-    assert set(node._outputs) == {"vue_1"}
-    assert node._tracker.rejected() == {vue_id: {"vue_id": 1}}
-    odometry, _, _ = keep(node)
-    drive(node, range(3))
-    assert len(odometry.messages) == 3
-
-
 def test_the_imu_is_heard_where_the_motion_model_needs_it(make: Any) -> None:
     """Its topic names the device, whatever its frame is called."""
     node = make(motion_model="inertial")
@@ -189,6 +124,7 @@ def test_parameters_reach_the_tracker(make: Any) -> None:
         ({"hold_s": 11.0}, InvalidParameterValueException, "hold_s"),
         ({"hold_s": 1}, InvalidParameterTypeException, "hold_s"),
         ({"max_rejected_epochs": 0}, InvalidParameterValueException, "max_rejected_epochs"),
+        ({"subscribers": -1}, InvalidParameterValueException, "subscribers"),
         ({"vues": ["vue_1", "a b"]}, ValueError, "vues: 'a b' is no device name"),
         ({"filter": "ukff"}, ValueError, "filter must be one of"),
         ({"process_noise": "none"}, ValueError, "process_noise must be one of"),
@@ -278,32 +214,7 @@ def test_measurements_in_the_other_byte_order_count_too(make: Any) -> None:
     assert status.messages[-1].rejected == 0
 
 
-def test_refusals_are_counted_not_raised(make: Any) -> None:
-    node = make()
-    know_rsus(node)
-    arrive(node, "/rsu/measurements", measurement("a", 0.0, rsu_id="nobody"))
-    arrive(node, "/rsu/measurements", measurement("a", 0.0, azimuth_rad=math.nan))
-    broken = CODEC.rsu_info_to_msg(RsuInfo(rsu_id="x", position=np.full(3, math.nan)))
-    arrive(node, "/rsu/info", broken)
-    broken = CODEC.rsu_info_to_msg(RsuInfo(rsu_id="x", position=np.zeros(3)))
-    broken.angle_convention = 9
-    arrive(node, "/rsu/info", broken)
-    assert node._tracker.rejected() == {"vue_1": {"unknown_rsu": 1, "not_finite": 1}}
-    assert node._tracker.rsu_count == 3
-
-
 # time and services
-
-
-def test_silence_flushes_what_waits(make: Any) -> None:
-    node = make(hold_s=1.0)
-    _, _, status = keep(node)
-    know_rsus(node)
-    arrive(node, "/rsu/measurements", measurement("a", 0.0))
-    node._on_silence_tick()  # something was heard since the last tick
-    assert status.messages == []
-    node._on_silence_tick()
-    assert len(status.messages) == 1
 
 
 def test_reset_service(make: Any) -> None:
@@ -354,20 +265,3 @@ def test_simulated_clock_that_jumps_back_resets(make: Any) -> None:
 
 
 # diagnostics
-
-
-def test_diagnostics_are_published(make: Any) -> None:
-    node = make()
-    node._diagnostics_pub = Kept()
-    node._publish_diagnostics()
-    know_rsus(node)
-    drive(node, range(3))
-    node._publish_diagnostics()
-    first, second = node._diagnostics_pub.messages
-    assert [s.name for s in first.status] == ["ekf_tracker: rsus"]
-    assert [s.message for s in second.status[:2]] == ["tracking", "3 RSUs known"]
-    assert [(s.hardware_id, s.message) for s in second.status[2:]] == [
-        ("a", "ok"),
-        ("b", "ok"),
-        ("c", "ok"),
-    ]

@@ -8,19 +8,26 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from contextlib import contextmanager, suppress
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, TypeVar
+from threading import Timer
+from typing import Any, NoReturn, TypeVar
 
 import rclpy
 from netpos.bags import cdr_codec
 from netpos.messages.codec import Codec
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.duration import Duration
-from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.exceptions import (
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+    NotInitializedException,
+)
 from rclpy.executors import ExternalShutdownException
 from rclpy.experimental import EventsExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -39,6 +46,8 @@ LATCHED = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 
+_COUNT_MAX = 2**31 - 1
+_DELIVERY_S = 4.0  # whoever starts nodes kills one that takes much longer to end
 
 _PROFILES = {
     "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).with_name("fastdds.xml")),
@@ -78,24 +87,61 @@ def spin_and_finish(node: Any) -> None:
 def run(factory: Callable[[], Any], spin: Callable[[Any], None] = spin_and_finish) -> None:
     """Start a node, spin it, shut down; a bad parameter ends the process with one sentence and
     code 2."""
-    init()
+    with _ends_when_stopped():
+        spin(_made(factory))
+
+
+def _made(factory: Callable[[], Any]) -> Any:
     try:
-        node = factory()
+        init()
+    except rclpy_implementation.RCLError as error:  # of the arguments after --ros-args
+        _refuse(str(error).partition(", at ")[0])
+    try:
+        return factory()
     except (
         ValueError,
         FileNotFoundError,
         InvalidParameterTypeException,
         InvalidParameterValueException,
     ) as error:
-        rclpy.try_shutdown()
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+        _refuse(str(error))
+
+
+def _refuse(why: str) -> NoReturn:
+    print(f"error: {why}", file=sys.stderr)
+    sys.exit(2)
+
+
+@contextmanager
+def patience(doing: str, after_s: float = 5.0) -> Iterator[None]:
+    """Say on the error output what is being done, if the block takes longer."""
+    timer = Timer(after_s, print, [f"netpos: {doing}"], {"file": sys.stderr, "flush": True})
+    timer.daemon = True
+    timer.start()
     try:
-        spin(node)
+        yield
+    finally:
+        timer.cancel()
+
+
+@contextmanager
+def _ends_when_stopped() -> Iterator[None]:
+    """SIGINT or SIGTERM ends the block quietly, also while a node starts: rclpy then shuts its
+    context down, and all that needs one fails."""
+    try:
+        yield
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except (
+        NotInitializedException,
+        rclpy_implementation.RCLError,
+        rclpy_implementation.InvalidHandle,
+    ):
+        if rclpy.ok():
+            raise
     finally:
-        rclpy.try_shutdown()
+        with suppress(rclpy_implementation.RCLError):  # that of a signal is under way
+            rclpy.try_shutdown()
 
 
 def wait_until_heard(
@@ -152,14 +198,19 @@ def take_waiting(subscription: Subscription, on_message: Callable[[Any], None]) 
 
 
 def see_delivered(node: Node) -> None:
-    """Wait until what a node has published is acknowledged, a second per topic at most."""
+    """Wait until what a node has published is acknowledged: a second per topic at most, and
+    ``_DELIVERY_S`` for all, whoever has stopped listening without a word."""
+    end_s = time.monotonic() + _DELIVERY_S
     for publisher in node.publishers:
-        publisher.wait_for_all_acked(Duration(seconds=1))
+        left_s = max(end_s - time.monotonic(), 0.0)
+        publisher.wait_for_all_acked(Duration(nanoseconds=round(1e9 * min(left_s, 1.0))))
 
 
-def declare(node: Node, name: str, default: Any, text: str) -> Any:
-    """Declare one read-only parameter and return its value."""
+def declare(node: Node, name: str, default: Any, text: str, *, low: int | None = None) -> Any:
+    """Declare one read-only parameter and return its value; ``low``: the least of a number."""
     spec = ParameterDescriptor(description=text, read_only=True)
+    if low is not None:
+        spec.integer_range = [IntegerRange(from_value=low, to_value=_COUNT_MAX)]
     return node.declare_parameter(name, default, spec).value
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import time
 from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 
@@ -13,10 +14,12 @@ from netpos.messages.values import TrackStatus
 from netpos.tracking import TrackOutput
 from netpos_msgs.msg import ClockState
 from netpos_msgs.msg import TrackStatus as TrackStatusMsg
-from rclpy.clock import JumpThreshold, TimeJump
+from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
@@ -32,6 +35,7 @@ from netpos_node import (
 
 _SILENCE_S = 2.0  # long: a stalled machine must not look like the end of the measurements
 _PATIENCE_S = 30.0
+_STALE_S = 3.0  # a device, or all of them, unheard for so long shows in the diagnostics
 
 
 class Core(Protocol):
@@ -62,15 +66,19 @@ class EstimatingNode(Node):
         self._inputs: list[tuple[Subscription, Callable[[Any], None]]] = []
         self._outputs: dict[str, tuple[Publisher, ...]] = {}
         self._statuses: dict[str, TrackStatus] = {}
+        self._told_s: dict[str, float] = {}
         self._heard_since_tick = False
+        self._heard_s = time.monotonic()
+        self._tick_ns = self._quiet_ns = 0
         self._tf_pub = self.create_publisher(TFMessage, topics.TF, STREAM) if publish_tf else None
 
     def _be_ready(self) -> None:
         """Services, timers and the watch over the clock; last of all."""
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/enable", self._on_enable)
-        self.create_timer(_SILENCE_S, self._on_silence_tick)
-        self.create_timer(1.0, self._publish_diagnostics)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # /clock may stand still
+        self.create_timer(_SILENCE_S, self._on_silence_tick, clock=steady)
+        self.create_timer(1.0, self._publish_diagnostics, clock=steady)
         threshold = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
         )
@@ -107,11 +115,24 @@ class EstimatingNode(Node):
     ) -> None:
         def on_message(msg: Any) -> None:
             self._heard_since_tick = True
+            self._heard_s = time.monotonic()
             handler(msg)
             self._publish(self._core.process())
 
         subscription = self.create_subscription(msg_type, topic, on_message, qos, raw=raw)
         self._inputs.append((subscription, on_message))
+
+    def _read(self, cdr: bytes, kind: Any) -> Any | None:
+        """The message in these bytes; None, and a word, where it is none of this kind."""
+        try:
+            return deserialize_message(cdr, kind)
+        except rclpy_implementation.RMWError:
+            self.get_logger().error(
+                f"refused {len(cdr)} bytes that are no {kind.__name__}; is its sender built with"
+                " other message definitions?",
+                throttle_duration_sec=2.0,
+            )
+            return None
 
     # outputs
 
@@ -136,7 +157,7 @@ class EstimatingNode(Node):
         vue_id = output.status.vue_id
         if vue_id not in self._outputs:
             self._add_outputs(vue_id, output.network)
-        self._statuses[vue_id] = output.status
+        self._statuses[vue_id], self._told_s[vue_id] = output.status, time.monotonic()
         odometry_pub, clock_pub, status_pub, *smoothed_pub = self._outputs[vue_id]
         if output.odometry is not None:
             odometry_pub.publish(CDR.odometry(output.odometry))
@@ -151,6 +172,16 @@ class EstimatingNode(Node):
     def _publish_diagnostics(self) -> None:
         raise NotImplementedError
 
+    def _unheard_s(self) -> float:
+        """Seconds since anything was heard, 0 while it is not long."""
+        unheard_s = time.monotonic() - self._heard_s
+        return unheard_s if unheard_s >= _STALE_S else 0.0
+
+    def _silent_s(self) -> dict[str, float]:
+        """Devices nothing was told of for long, and how long [s]."""
+        now_s = time.monotonic()
+        return {v: now_s - at_s for v, at_s in self._told_s.items() if now_s - at_s >= _STALE_S}
+
     def finish(self) -> None:
         """Give out what still follows from all that has arrived, and see it delivered."""
         for waiting in self._inputs:
@@ -161,9 +192,18 @@ class EstimatingNode(Node):
     # time and services
 
     def _on_silence_tick(self) -> None:
-        if not self._heard_since_tick:
+        now_ns = self.get_clock().now().nanoseconds
+        if self._heard_since_tick:
+            self._quiet_ns = now_ns
+        elif not self._is_played_slowly(now_ns):
             self._publish(self._core.flush())
-        self._heard_since_tick = False
+        self._tick_ns, self._heard_since_tick = now_ns, False
+
+    def _is_played_slowly(self, now_ns: int) -> bool:
+        """Whether what is silent by the wall clock is not by a simulated one, which goes on."""
+        quiet = now_ns - self._quiet_ns >= 1e9 * _SILENCE_S
+        goes_on = self.get_clock().ros_time_is_active and now_ns != self._tick_ns
+        return bool(goes_on and not quiet)
 
     def _on_clock_jump(self, jump: TimeJump) -> None:
         self.get_logger().warning("the clock jumped back: all tracks start anew")

@@ -31,9 +31,9 @@ def declare_parameters(node: Node) -> FusionParameters:
     settings = settings_from(declare(node, "scenario", "", text))
     config = declare_config(node, FusionConfig, asdict(FusionConfig.from_mapping(settings.fusion)))
     text = "networks whose tracks are fused; the first one's names of devices are kept"
-    networks = tuple(declare(node, "networks", list(settings.networks or [""]), text))
+    networks = tuple(declare(node, "networks", list(settings.networks or [""]), text) or [""])
     text = "devices whose topics exist from the start; others appear when first heard"
-    vue_ids = tuple(declare(node, "vues", list(settings.names_by(networks[0])), text))
+    vue_ids = tuple(declare(node, "vues", list(settings.names_by(networks[0])), text) or ())
     for kind, names in (("networks", networks), ("vues", vue_ids)):
         for name in names:
             if not is_vue_id(name):
@@ -50,5 +50,6 @@ def declare_parameters(node: Node) -> FusionParameters:
             "subscribers",
             0,
             "listen to tracks once the estimates have so many subscribers (or after 30 s)",
+            low=0,
         ),
     )

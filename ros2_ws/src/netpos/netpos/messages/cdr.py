@@ -206,9 +206,10 @@ class CdrCodec:
         parts = self._measurement.parts(cdr)
         if parts is None:
             return None
-        (sec, nanosec), (_, rsu_id, vue_id), scalars = parts
+        (sec, nanosec), (frame_id, rsu_id, vue_id), scalars = parts
         value = RsuMeasurement.__new__(RsuMeasurement)  # the defaults would cost most
         value.stamp_ns, value.rsu_id, value.vue_id = sec * NS + nanosec, rsu_id, vue_id
+        value.frame_id = frame_id
         (
             value.sequence,
             value.expected,

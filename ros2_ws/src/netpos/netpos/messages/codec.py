@@ -82,6 +82,7 @@ class Codec(CommonCodec):
             stamp_ns=stamp_ns(msg.header.stamp),
             rsu_id=msg.rsu_id,
             network=msg.network,
+            frame_id=msg.header.frame_id,
             position=xyz(msg.pose.position),
             quaternion=np.array([q.x, q.y, q.z, q.w], dtype=np.float64),
             azimuth_bias_sd_rad=float(msg.azimuth_bias_sd),
@@ -127,6 +128,7 @@ class Codec(CommonCodec):
         """RsuMeasurement value of a netpos_msgs/RsuMeasurement; values are not judged here."""
         return RsuMeasurement(
             stamp_ns=stamp_ns(msg.header.stamp),
+            frame_id=msg.header.frame_id,
             rsu_id=msg.rsu_id,
             vue_id=msg.vue_id,
             sequence=int(msg.sequence),

@@ -206,6 +206,7 @@ class CommonCodec:
         return InitialPose(
             stamp_ns=stamp_ns(msg.header.stamp),
             vue_id=vue_id,
+            frame_id=msg.header.frame_id,
             position=xyz(msg.pose.pose.position),
             cov=square(msg.pose.covariance, 6)[:3, :3].copy(),
         )

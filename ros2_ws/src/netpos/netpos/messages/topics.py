@@ -30,9 +30,13 @@ TRACKS = "tracks"
 TRACKER_OUTPUTS = (ODOMETRY, ODOMETRY_SMOOTHED, CLOCK_STATE, TRACK_STATUS)
 
 
+_NAME_MAX = 100  # that of a device and of its network fit into a topic, of 247 characters in ROS
+
+
 def is_vue_id(text: str) -> bool:
-    """Whether a text can name a device: letters, digits and underscores, no digit first."""
-    return text.isascii() and text.isidentifier()
+    """Whether a text can name a device: at most a hundred letters, digits and underscores, no
+    digit first."""
+    return len(text) <= _NAME_MAX and text.isascii() and text.isidentifier()
 
 
 def of_vue(vue_id: str, name: str, network: str = "") -> str:

@@ -47,8 +47,8 @@ class TrackState(IntEnum):
 class RsuInfo:
     """A roadside unit: where it is, which way it looks, which slow errors it has.
 
-    position : (3,) m in map; quaternion : (4,) x y z w, RSU axes (x boresight, y left, z up) to
-        map.
+    position : (3,) m in ``frame_id``; quaternion : (4,) x y z w, RSU axes (x boresight, y left, z
+        up) to it.
     Biases are first-order Gauss-Markov with ``bias_correlation_time_s``, the common one is shared
     by a network; 0 means none.
     ``noise_correlation_time_s``: power spectral density at 0 of the remaining noise over its
@@ -56,6 +56,7 @@ class RsuInfo:
     """
 
     rsu_id: str
+    frame_id: str = "map"
     position: Array
     quaternion: Array = field(default_factory=lambda: np.array([0.0, 0.0, 0.0, 1.0]))
     network: str = ""
@@ -75,7 +76,8 @@ class RsuInfo:
 @dataclass(slots=True, kw_only=True)
 class RsuMeasurement:
     """What one RSU measured of one device at one instant; ``fields`` names the quantities that
-    count. ``lever_arm`` [m]: antenna that was measured, in the device's base_link."""
+    count. ``lever_arm`` [m]: antenna that was measured, in the device's base_link; ``position`` is
+    one in ``frame_id``."""
 
     stamp_ns: int
     rsu_id: str
@@ -96,6 +98,7 @@ class RsuMeasurement:
     phase_difference_rad: float = 0.0
     phase_difference_var: float = 0.0
     lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    frame_id: str = "map"
     position: Array = field(default_factory=lambda: np.zeros(3))
     position_cov: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
@@ -126,10 +129,12 @@ class GroundSpeed:
 
 @dataclass(slots=True, kw_only=True)
 class InitialPose:
-    """A position handed to the tracker from outside. position (3,) m, cov (3, 3) m^2."""
+    """A position handed to the tracker from outside. position (3,) m, cov (3, 3) m^2, both in
+    ``frame_id``."""
 
     stamp_ns: int
     vue_id: str
+    frame_id: str = "map"
     position: Array
     cov: Array
 

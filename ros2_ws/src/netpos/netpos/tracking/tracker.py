@@ -147,10 +147,10 @@ class Tracker:
         posteriors."""
         return {vue: track.smoothed() for vue, track in self._tracks.items()}
 
-    def rsu_reports(self) -> list[RsuReport]:
-        """Health of the RSUs as of the newest measurement."""
+    def rsu_reports(self, since_s: float = 0.0) -> list[RsuReport]:
+        """Health of the RSUs as of ``since_s`` seconds after the newest measurement."""
         newest = max((s.newest_ns for s in self._sequencers.values()), default=0)
-        return self._health.reports(newest)
+        return self._health.reports(newest + round(1e9 * since_s))
 
     def _apply(
         self, take: Callable[[Sequencer], list[Epoch]], vue_ids: Iterable[str]

@@ -76,7 +76,7 @@ def measurement_fault(m: RsuMeasurement) -> str | None:
     if fields & _PHASE and abs(m.phase_difference_rad) > math.pi:
         return "phase_not_wrapped"
     if fields & _POSITION:
-        return _gaussian_fault(m.position, m.position_cov)
+        return _frame_fault(m.frame_id) or _gaussian_fault(m.position, m.position_cov)
     return None
 
 
@@ -108,13 +108,20 @@ def imu_fault(sample: ImuSample) -> str | None:
 
 def pose_fault(p: InitialPose) -> str | None:
     """Reason to refuse an initial pose; its stamp may be 0 (tools send it so)."""
-    return _gaussian_fault(p.position, p.cov)
+    return _frame_fault(p.frame_id) or _gaussian_fault(p.position, p.cov)
+
+
+def _frame_fault(frame_id: str) -> str | None:
+    """A place is one in the map, or says nothing of where it is."""
+    return None if frame_id in ("", MAP_FRAME) else "frame"
 
 
 def rsu_fault(info: RsuInfo) -> str | None:
     """Reason to refuse the description of an RSU."""
     if not info.rsu_id:
         return "rsu_id is empty"
+    if _frame_fault(info.frame_id):
+        return f"pose of {info.rsu_id} is in {info.frame_id!r}; give it in {MAP_FRAME!r}"
     if not (np.isfinite(info.position).all() and np.isfinite(info.quaternion).all()):
         return f"pose of {info.rsu_id} is not finite"
     if abs(float(np.linalg.norm(info.quaternion)) - 1.0) > 1e-3:

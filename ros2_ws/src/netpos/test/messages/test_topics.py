@@ -73,11 +73,16 @@ def test_what_the_tracker_publishes(topic: str, ours: bool) -> None:
     assert topics.is_tracker_output(topic) is ours
 
 
-@pytest.mark.parametrize("good", ["vue_1", "V", "_x", "a1b2"])
+@pytest.mark.parametrize("good", ["vue_1", "V", "_x", "a1b2", 100 * "x"])
 def test_device_names(good: str) -> None:
     assert topics.is_vue_id(good)
 
 
-@pytest.mark.parametrize("bad", ["", "1st", "a b", "a/b", "a-b", "ü", "a.b", "{x}"])
+@pytest.mark.parametrize("bad", ["", "1st", "a b", "a/b", "a-b", "ü", "a.b", "{x}", 101 * "x"])
 def test_what_names_no_device(bad: str) -> None:
     assert not topics.is_vue_id(bad)
+
+
+def test_topics_of_the_longest_names_are_topics() -> None:
+    longest = topics.of_vue(100 * "x", topics.ODOMETRY_SMOOTHED, 100 * "n")
+    assert len(longest) <= 247

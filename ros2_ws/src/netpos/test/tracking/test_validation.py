@@ -170,6 +170,17 @@ def test_gaussians(value: list[float], cov: np.ndarray, reason: str | None) -> N
     assert pose_fault(InitialPose(stamp_ns=1, vue_id="v", position=xyz, cov=cov3)) == reason
 
 
+@pytest.mark.parametrize(("frame", "fault"), [("", None), ("map", None), ("odom", "frame")])
+def test_a_place_is_one_in_the_map(frame: str, fault: str | None) -> None:
+    pose = InitialPose(stamp_ns=1, vue_id="v", frame_id=frame, position=np.ones(3), cov=np.eye(3))
+    assert pose_fault(pose) == fault
+    assert measurement_fault(replace(GOOD, frame_id=frame)) == fault
+    bearing = replace(GOOD, frame_id=frame, fields=Field.AZIMUTH)
+    assert measurement_fault(bearing) is None  # has no place in it
+    wanted = fault and "pose of a is in 'odom'; give it in 'map'"
+    assert rsu_fault(replace(INFO, frame_id=frame)) == wanted
+
+
 @pytest.mark.parametrize("frame", ["", "odom", "vue_1/pdr_start"])
 def test_velocity_frame(frame: str) -> None:
     v = Velocity(stamp_ns=1, vue_id="v", frame_id=frame, velocity=np.ones(2), cov=np.eye(2))
