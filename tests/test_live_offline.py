@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from netpos.bags import BagReader
 from netpos.bags.qos import is_latched, is_reliable
 from runs import (
@@ -95,11 +96,19 @@ def test_a_seed_of_its_own_gives_other_noise(pairs: dict[str, Pair], tmp_path: P
 def test_a_live_recording_replays_to_its_own_estimates(
     pairs: dict[str, Pair], tmp_path: Path
 ) -> None:
-    """It names its scenario, so `netpos replay` needs nothing else."""
+    """It carries its parameters, so `netpos replay` needs nothing else."""
     for pair in pairs.values():
         again = tmp_path / pair.live.name
         netpos("replay", pair.live, "--out", again)
         assert_same(again, pair.live, ESTIMATES)
+
+
+def test_a_live_recording_carries_the_parameters_of_its_tracker(pairs: dict[str, Pair]) -> None:
+    """The same as an offline one: replaying it does not depend on a scenario that may change."""
+    for pair in pairs.values():
+        with BagReader(pair.live) as live, BagReader(pair.offline) as offline:
+            assert yaml.safe_load(live.metadata["tracker"])["device_height_m"] is not None
+            assert live.metadata["tracker"] == offline.metadata["tracker"]
 
 
 def test_a_live_recording_notes_run_and_qos(pairs: dict[str, Pair]) -> None:

@@ -7,7 +7,7 @@ killed recorder left, ``netpos.bags.importers`` turn other people's recordings i
 from netpos.bags.errors import BagError
 from netpos.bags.reader import BagEntry, BagReader, TopicInfo
 from netpos.bags.types import cdr_codec, codec, has_common_definition, typestore
-from netpos.bags.writer import BagWriter
+from netpos.bags.writer import BagWriter, whole_bag
 
 __all__ = [
     "BagEntry",
@@ -19,4 +19,5 @@ __all__ = [
     "codec",
     "has_common_definition",
     "typestore",
+    "whole_bag",
 ]

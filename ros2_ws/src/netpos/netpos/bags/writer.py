@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -192,3 +194,19 @@ class BagWriter:
         finally:
             self._file.close()
         layout.write_metadata(self.path, information)
+
+
+@contextmanager
+def whole_bag(path: Path, *, metadata: Mapping[str, str] | None = None) -> Iterator[BagWriter]:
+    """A ``BagWriter`` of what is made from another recording: where the block does not end well,
+    Ctrl-C included, no bag is left that looks finished.
+
+    Raises ``FileExistsError`` where the path exists, which then stays as it is.
+    """
+    writer = BagWriter(path, metadata=metadata)
+    try:
+        with writer:
+            yield writer
+    except BaseException:
+        shutil.rmtree(writer.path)
+        raise

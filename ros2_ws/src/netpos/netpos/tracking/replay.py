@@ -8,8 +8,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from netpos.bags import (
     BagEntry,
     BagError,
@@ -19,6 +17,7 @@ from netpos.bags import (
     cdr_codec,
     codec,
     has_common_definition,
+    whole_bag,
 )
 from netpos.messages import topics
 from netpos.messages.network_tracks import network_track_to_msg
@@ -29,9 +28,8 @@ from netpos.tracking.networks.config import FusionConfig
 from netpos.tracking.report import TrackOutput
 from netpos.tracking.sequencer import Item
 from netpos.tracking.settings import (
-    FUSION_METADATA,
-    TRACKER_METADATA,
     TrackerSettings,
+    as_metadata,
     bag_settings,
 )
 from netpos.tracking.tracker import Tracker
@@ -42,10 +40,11 @@ _FUSION = "fusion."
 
 @dataclass(frozen=True, slots=True)
 class ReplaySummary:
-    """What a replay did: epochs written and measurements refused or rejected, by device and
-    reason."""
+    """What a replay did: epochs written, estimates in them, and measurements refused or rejected,
+    by device and reason."""
 
     epochs: int
+    estimates: int
     rejected: Mapping[str, Mapping[str, int]]
 
 
@@ -72,26 +71,25 @@ def replay_bag(
             raise BagError(
                 f"{bag_in} has no {topics.RSU_MEASUREMENTS}: record that topic to replay"
             )
-        metadata = {**source.metadata, TRACKER_METADATA: yaml.safe_dump(asdict(config))}
-        if settings.networks:
-            metadata[FUSION_METADATA] = yaml.safe_dump(
-                {"networks": list(settings.networks), **settings.fusion}
-            )
+        metadata = {**source.metadata, **as_metadata(asdict(config), settings)}
         tracker = _tracker(config, settings, smooth=smooth)
-        epochs = 0
-        with BagWriter(bag_out, metadata=metadata) as out:
+        epochs = estimates = 0
+        with whole_bag(bag_out, metadata=metadata) as out:
             for name, info in source.topics.items():
                 if not topics.is_tracker_output(name):
                     out.add_topic(name, info.type_name, info.qos)
             for done, batch in enumerate(_through(tracker, source, out)):
                 epochs += len(batch)
+                estimates += sum(output.odometry is not None for output in batch)
                 for output in batch:
                     write_output(out, output)
                 if progress is not None:
                     progress(done)
             for vue_id, odometry in tracker.smoothed().items() if smooth else ():
                 _write_smoothed(out, vue_id, odometry)
-        return ReplaySummary(epochs, {v: dict(c) for v, c in tracker.rejected().items()})
+        return ReplaySummary(
+            epochs, estimates, {v: dict(c) for v, c in tracker.rejected().items()}
+        )
 
 
 def _changed(settings: TrackerSettings, overrides: Mapping[str, Any]) -> TrackerSettings:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from netpos.bags import BagReader
 from netpos.bags.single_file import load_yaml
 from netpos.messages import topics
@@ -51,6 +53,16 @@ def bag_settings(metadata: Mapping[str, str]) -> TrackerSettings:
     fusion = _mapping(metadata, FUSION_METADATA)
     networks = tuple(map(str, fusion.pop("networks", ())))
     return TrackerSettings(loaded, networks=networks, fusion=fusion)
+
+
+def as_metadata(parameters: Mapping[str, Any], settings: TrackerSettings) -> dict[str, str]:
+    """What a bag says of the ``parameters`` of its tracker, every one of them, and of the networks
+    of ``settings``; ``bag_settings`` reads it."""
+    metadata = {TRACKER_METADATA: yaml.safe_dump(dict(parameters))}
+    if settings.networks:
+        fusion = {"networks": list(settings.networks), **settings.fusion}
+        metadata[FUSION_METADATA] = yaml.safe_dump(fusion)
+    return metadata
 
 
 def _mapping(metadata: Mapping[str, str], name: str) -> dict[str, Any]:

@@ -161,3 +161,28 @@ def test_what_there_is_of_an_output_is_written_at_its_stamp(tmp_path: Path) -> N
         "TFMessage",
         "ClockState",
     ]
+
+
+def test_a_replay_that_does_not_end_well_leaves_no_bag(tmp_path: Path) -> None:
+    """Not even one that looks finished."""
+    with BagWriter(tmp_path / "in") as bag:
+        known = RsuInfo(rsu_id="b", position=np.zeros(3), stamp_ns=NS)
+        bag.write("/rsu/info", codec().rsu_info_to_msg(known), NS)
+        for k in range(3):
+            stamp = (5 + k) * NS
+            moved = replace(MEASURED, stamp_ns=stamp)
+            bag.write("/rsu/measurements", codec().measurement_to_msg(moved), stamp)
+    for error in (KeyboardInterrupt, RuntimeError):
+
+        def stop(done: int, error: type[BaseException] = error) -> None:
+            if done == 1:
+                raise error
+
+        with pytest.raises(error):
+            replay_bag(tmp_path / "in", tmp_path / "out", progress=stop)
+        assert not (tmp_path / "out").exists()
+    summary = replay_bag(tmp_path / "in", tmp_path / "out")
+    assert summary.estimates == 0  # nobody has said where RSU a is
+    with pytest.raises(FileExistsError):
+        replay_bag(tmp_path / "in", tmp_path / "out")
+    assert (tmp_path / "out/metadata.yaml").is_file()

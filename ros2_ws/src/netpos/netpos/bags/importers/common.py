@@ -15,7 +15,7 @@ import numpy as np
 import netpos
 from netpos.bags.errors import BagError
 from netpos.bags.types import codec
-from netpos.bags.writer import BagWriter
+from netpos.bags.writer import whole_bag
 from netpos.messages.topics import GROUND_TRUTH, IMU, RSU_INFO, RSU_MEASUREMENTS, of_vue
 from netpos.messages.values import Array, ImuSample, Odometry, RsuInfo, RsuMeasurement
 
@@ -193,7 +193,7 @@ def write_recording(
     ]
     merged += [(s.stamp_ns, of_vue(s.vue_id, IMU), messages.imu_to_msg(s)) for s in imu]
     merged.sort(key=lambda item: item[0])
-    with BagWriter(bag, metadata={**metadata, "netpos_version": netpos.__version__}) as writer:
+    with whole_bag(bag, metadata={**metadata, "netpos_version": netpos.__version__}) as writer:
         for info in infos:
             message = messages.rsu_info_to_msg(replace(info, stamp_ns=start_ns))
             writer.write(RSU_INFO, message, start_ns)

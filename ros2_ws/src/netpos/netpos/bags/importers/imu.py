@@ -12,7 +12,7 @@ from pathlib import Path
 
 import netpos
 from netpos.bags.types import codec
-from netpos.bags.writer import BagWriter
+from netpos.bags.writer import whole_bag
 from netpos.inertial import loaders
 from netpos.messages import topics
 from netpos.messages.values import ImuSample, MagneticSample
@@ -45,7 +45,7 @@ def import_imu(
     }
     make = codec()
     rates = record.angular_velocity
-    with BagWriter(bag, metadata=metadata) as writer:
+    with whole_bag(bag, metadata=metadata) as writer:
         for i, stamp in enumerate(record.stamp_ns):
             stamp_ns = int(stamp) + offset_ns
             if record.magnetic_field is not None:
