@@ -36,6 +36,9 @@ class Commands(TyperGroup):
         """Run the chosen command."""
         try:
             return super().invoke(ctx)
+        except KeyboardInterrupt:
+            typer.echo("netpos: interrupted", err=True)
+            raise typer.Exit(130) from None
         except BrokenPipeError:  # the reader of our output has gone, as in `netpos ... | head`
             raise
         except _BAD_INPUT as error:

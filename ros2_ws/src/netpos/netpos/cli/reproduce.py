@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from netpos.cli.errors import WorkFailedError
-from netpos.cli.results import write_json
+from netpos.cli.results import check_json, write_json
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -42,6 +42,8 @@ def reproduce(
 
     if out is not None and out.exists() and not out.is_dir():
         raise NotADirectoryError(f"--out {out} is a file; give a folder")
+    if json_file is not None:
+        check_json(json_file)
     bar = _Bar()
     try:
         result = run(paper, runs=runs, seed=seed, workers=workers, progress=bar.show)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -39,6 +40,8 @@ def evaluate(
 
     from netpos.evaluation import evaluate_bag  # noqa: PLC0415
 
+    if json_file is not None:
+        check_json(json_file)
     evaluation = evaluate_bag(bag, skip=skip, vue=vue)
     if json_file is not None:
         write_json(json_file, evaluation.to_json())
@@ -62,6 +65,7 @@ def report(
     """Write one HTML file with figures, verdicts, maps and errors; it needs no network."""
     from netpos.evaluation.report import bags_in, write_report  # noqa: PLC0415
 
+    refuse_recording(out)
     bags = bags_in(source)
     left_out = write_report(bags, out, skip=skip)
     for reason in left_out:
@@ -69,9 +73,35 @@ def report(
     typer.echo(f"wrote {out}: {len(bags) - len(left_out)} of {len(bags)} bags")
 
 
-def write_json(path: Path, figures: dict[str, Any]) -> None:
-    """Write figures; a value that is not finite is an error, not a word JSON does not know."""
+def refuse_recording(path: Path) -> None:
+    """``ValueError`` for a file inside a bag, which nothing but its writer changes."""
+    folder = path.absolute().parent
+    if (folder / "metadata.yaml").exists():
+        raise ValueError(f"{path} would lie in a recording, which is never changed; name another")
+
+
+def check_json(path: Path) -> None:
+    """Make sure, before the work starts, that figures can be written to ``path``: its folder is
+    made, and neither a recording nor a file of another kind is overwritten.
+
+    Raises ``ValueError``, or ``OSError`` where there is no writing there.
+    """
+    refuse_recording(path)
+    if path.is_file() and path.suffix.lower() != ".json":
+        raise ValueError(f"{path} exists and is no .json file; name another")
+    if path.is_dir():
+        raise IsADirectoryError(f"--json {path} is a folder; give a file")
     path.parent.mkdir(parents=True, exist_ok=True)
+    if not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise PermissionError(f"{path} cannot be written")
+
+
+def write_json(path: Path, figures: dict[str, Any]) -> None:
+    """Write figures; a value that is not finite is an error, not a word JSON does not know.
+
+    Raises what ``check_json`` does.
+    """
+    check_json(path)
     path.write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
@@ -114,6 +144,8 @@ def bench(
     from netpos.evaluation.bench import as_json, chosen, surroundings  # noqa: PLC0415
     from netpos.evaluation.bench import bench as run_bench  # noqa: PLC0415
 
+    if json_file is not None:
+        check_json(json_file)
     console = Console()
     around = surroundings(quick)
     results = []

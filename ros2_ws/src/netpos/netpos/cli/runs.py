@@ -143,6 +143,12 @@ def _track(bag: Path, out: Path, overrides: Mapping[str, object], *, smooth: boo
     for vue, counts in sorted(summary.rejected.items()):
         reasons = ", ".join(f"{reason} {n}" for reason, n in sorted(counts.items()) if n)
         typer.echo(f"{vue}: rejected {reasons or 'nothing'}")
+    if not summary.estimates:
+        typer.echo(
+            f"netpos: {out} has no estimate: its measurements gave no first fix with these "
+            "parameters of the tracker",
+            err=True,
+        )
 
 
 def _run_offline(scenario: Scenario, target: Path) -> None:

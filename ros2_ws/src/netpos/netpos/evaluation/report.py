@@ -64,7 +64,8 @@ def bags_in(source: Path) -> list[Path]:
         raise ValueError(f"{source} does not exist; check the path")
     if source.is_file() or (source / "metadata.yaml").exists() or any(source.glob("*.mcap")):
         return [source]
-    bags = sorted(path.parent for path in source.glob("*/metadata.yaml"))
+    found = (*source.glob("*/metadata.yaml"), *source.glob("*/*.mcap"))
+    bags = sorted({path.parent for path in found})
     if not bags:
         raise ValueError(f"{source} is neither a bag nor a folder of bags")
     return bags
