@@ -17,7 +17,16 @@ from netpos.radio.noise import generator
 from netpos.radio.propagation import UMA_HIGHEST_DEVICE_M
 from netpos.scenario.measured import Measurement
 from netpos.scenario.places import Rsus, World
-from netpos.scenario.section import Finite, Name, NotNegative, Place, Positive, Section
+from netpos.scenario.section import (
+    FileName,
+    Finite,
+    Name,
+    NotNegative,
+    Place,
+    Positive,
+    Section,
+    Start,
+)
 from netpos.world.body import BodyMotion
 from netpos.world.hills import Hills
 from netpos.world.maps import METIS_MADRID
@@ -245,10 +254,10 @@ class Scenario(Section):
     tracks of several ``networks``; they are not interpreted here.
     """
 
-    name: str
+    name: FileName
     description: str = ""
     seed: int = Field(default=1, ge=0)
-    start_s: Positive = 1.0
+    start_s: Start = 1.0
     max_duration_s: Positive | None = None
     world: World = World()
     rsus: Rsus

@@ -72,6 +72,8 @@ def test_a_good_file(tmp_path: Path) -> None:
             "line 2: rsus: layout 'list'",
         ),
         ("0.1\n", "0.1\n    imu: {rate_hz: 30}\n", "line 9: devices.0: .*whole nanoseconds"),
+        ("seed: 3", "seed: 3\nstart_s: 3.0e9", "line 2: start_s: .*2000000000"),
+        ("seed: 3", 'seed: 3\nname: "a/b"', "line 2: name: "),
         ("azimuth, toa", "azimuth, azimuth", "line 5: measurement: quantities must name"),
     ],
 )
