@@ -118,7 +118,8 @@ def observation_rows(
     (M, ROW_WIDTH) and biases (2, k): the rows of ``rsu_rows`` of every measurement, RSUs in the
     order of their names.
 
-    The slow errors of what is heard are the states ``first_bias``, ``first_bias`` + 1, ...
+    The slow errors of what is heard are the states ``first_bias``, ``first_bias`` + 1, ... in the
+    order in which they are first heard, as a tracker numbers them.
     """
     heard = np.flatnonzero(seen.heard_by)
     rows = np.empty((int(seen.heard_by.sum()) * templates.column.size, ROW_WIDTH))
@@ -138,7 +139,9 @@ def observation_rows(
         row_start,
     )
     bias = templates.bias.reshape(-1, 2)
-    biased = np.intersect1d(np.flatnonzero(bias[:, 0] > 0.0), source)
+    known, first = np.unique(source, return_index=True)
+    known = known[np.argsort(first)]
+    biased = known[bias[known, 0] > 0.0]
     state = np.full(len(bias), -1)
     state[biased] = first_bias + np.arange(biased.size)
     rows[:, BIAS] = state[source]
