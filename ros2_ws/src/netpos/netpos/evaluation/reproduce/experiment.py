@@ -13,6 +13,7 @@ from netpos.evaluation.bounds import bound_covariances
 from netpos.evaluation.metrics import NS
 from netpos.evaluation.reproduce.integrity import reported
 from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
+from netpos.filters.measurement import BIAS
 from netpos.filters.motion import N_CORE, SPEED_OF_LIGHT_MPS
 from netpos.messages.values import Array, ImuSample
 from netpos.scenario import Simulation, load_scenario
@@ -176,26 +177,31 @@ class Setup:
         self, epochs: Epochs, mean: Array, cov: Array, samples: list[ImuSample] | None
     ) -> tuple[int, Array, Array, Array, Array, Array, Array]:
         """As ``_compiled``, epoch by epoch; also the motions (N, Parameter). The IMU's samples
-        drive the filter between them (None: no IMU)."""
+        drive the filter between them (None: no IMU). A slow error becomes a state when it is first
+        heard of, as in a tracker: until then it is in the results only."""
         imu = ImuBuffer()
         for sample in samples or ():
             imu.add(sample)
         count, config = epochs.stamps_ns.size, self.config
-        mean, cov = self._grown(mean, cov, epochs)
-        filled = _room(count, mean.size)
+        sd, first = np.append(self._extra_sd, epochs.bias[0]), N_CORE + self._extra_sd.size
+        mean, cov = grown(mean, cov, self._extra_sd)
+        filled = _room(count, N_CORE + sd.size)
         means, covs, nis, dof, groups = filled
         motions = np.tile(self._motions[0], (count, 1))
         heard_ns = int(epochs.stamps_ns[0])
         estimate = estimates.start(config, heard_ns, mean, cov)
-        rejected = 0
+        rejected, known = 0, first
         for k, stamp in enumerate(epochs.stamps_ns.tolist()):
+            rows = epochs.rows[epochs.row_start[k] : epochs.row_start[k + 1]].copy()
+            known = max(known, int(rows[:, BIAS].max()) + 1)
+            estimate.grow(sd[: known - N_CORE])
             if samples is not None:
                 yaw, speed, _ = imu.increments(estimate.stamp_ns, stamp)
                 estimate.drive(yaw, speed, config.gyro_noise_density)
-            rows = epochs.rows[epochs.row_start[k] : epochs.row_start[k + 1]].copy()
-            unheard_s = (stamp - heard_ns) / NS
-            nis[k], dof[k], taken = estimate.step(stamp, unheard_s, rejected, rows, epochs.bias)
-            means[k], covs[k], groups[k] = estimate.mean, estimate.cov, taken.sum()
+            unheard_s, bias = (stamp - heard_ns) / NS, epochs.bias[:, : known - first].copy()
+            nis[k], dof[k], taken = estimate.step(stamp, unheard_s, rejected, rows, bias)
+            means[k], covs[k] = grown(estimate.mean, estimate.cov, sd)
+            groups[k] = taken.sum()
             if samples is not None:
                 motions[k] = estimate.motion
             rejected = 0 if 2 * taken.sum() >= taken.size else rejected + 1
