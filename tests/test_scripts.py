@@ -120,6 +120,7 @@ def test_play_order_and_arguments(
     assert stubs.stopped() == ["ekf_tracker", "netpos_record"]
     (said,) = [line for line in stubs.notes if line.startswith("netpos_play started")]
     assert f"started {recorded} --rate 5 --input-only" in said
+    (said,) = [line for line in stubs.notes if line.startswith("netpos_record started")]
     assert "--metadata tracker=" in said
 
 

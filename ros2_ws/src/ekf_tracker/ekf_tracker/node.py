@@ -74,9 +74,9 @@ class EkfTrackerNode(EstimatingNode):
     def _add(self, item: Any) -> None:
         reason = self._tracker.add(item)
         if reason is not None:
-            source = f" of {item.rsu_id}" if isinstance(item, Measurement) else ""
+            source = f", from {item.rsu_id}" if isinstance(item, Measurement) else ""
             self.get_logger().warning(
-                f"{item.vue_id}: refused a {type(item).__name__}{source}: {reason}",
+                f"{item.vue_id}: refused a {type(item).__name__}: {reason}{source}",
                 throttle_duration_sec=2.0,
             )
 
