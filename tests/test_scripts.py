@@ -114,7 +114,7 @@ def test_play_order_and_arguments(
 ) -> None:
     recorded = repository / "bags" / "fast_pass"
     script = str(repository / "scripts" / "play_bag.sh")
-    command = [script, str(recorded), str(tmp_path / "out"), "5"]
+    command = [script, str(recorded), str(tmp_path / "out"), "5", "--", "-p", "hold_s:=0.25"]
     process = graph.start("play_bag", command)
     assert process.wait() == 0, process.describe()
     assert stubs.stopped() == ["ekf_tracker", "netpos_record"]
@@ -122,6 +122,7 @@ def test_play_order_and_arguments(
     assert f"started {recorded} --rate 5 --input-only" in said
     (said,) = [line for line in stubs.notes if line.startswith("netpos_record started")]
     assert "--metadata tracker=" in said
+    assert "hold_s: 0.25" in stubs.notes  # the rest of the recorder's arguments
 
 
 @pytest.mark.parametrize("victim", ["netpos_record", "rsu_sensor", "vue_sim"])
