@@ -35,7 +35,11 @@ def reproduce(
         Path | None, typer.Option(metavar="FOLDER", help="Draw the paper's pictures there.")
     ] = None,
 ) -> None:
-    """Reproduce a paper's figures; every row says whether its target is kept."""
+    """Reproduce a paper's figures; every row says whether its target is kept.
+
+    Columns: what the paper says; the paper's own filter on our simulation; netpos with the
+    settings of the scenario; netpos with the default motion, clock and start parameters.
+    """
     from rich.console import Console  # noqa: PLC0415
 
     from netpos.evaluation.reproduce import reproduce as run  # noqa: PLC0415
@@ -95,11 +99,12 @@ def _table(result: Reproduction) -> Table:
 
     title = f"{result.paper}: {result.runs} runs from seed {result.seed}, {result.wall_s:.1f} s"
     table = Table("figure", "unit", title=title)
-    for column in ("paper", "ours"):
+    for column in ("paper", "paper's filter", "ours", "defaults"):
         table.add_column(column, justify="right")
     table.add_column("ok")
     verdicts = {True: "yes", False: "NO", None: ""}
     for row in result.rows:
-        values = ["–" if v is None else f"{v:.3g}" for v in (row.paper, row.ours)]
+        figures = (row.paper, row.baseline, row.ours, row.defaults)
+        values = ["–" if v is None else f"{v:.3g}" for v in figures]
         table.add_row(escape(row.name), escape(row.unit), *values, verdicts[row.ok])
     return table

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import correlate
 from scipy.stats import chi2
+from scipy.stats import t as student_t
 
 from netpos.evaluation.pairing import Mask
 from netpos.messages.values import Array
@@ -110,3 +111,35 @@ def nis_test(values: Array, dof: Array) -> MeanTest | None:
     return MeanTest(
         mean=float(values.mean()), bounds=chi2_mean_bounds(float(dof.mean()), n), n_eff=n
     )
+
+
+def nees_over_runs(sums: Array, counts: Array, dof: int) -> MeanTest:
+    """Test of the mean NEES of many runs by the spread between them.
+
+    Parameters
+    ----------
+    sums : (R,) sum of the NEES of each run
+    counts : (R,) estimates in each; runs without any count for nothing
+    dof : degrees of freedom, the expected mean
+
+    The bounds are those of Student's t around ``dof``, with the standard error of a ratio of means
+    (Cochran, *Sampling Techniques*, 3rd ed., eq. 6.9): whatever correlation errors have within a
+    run, runs are independent. One run alone counts as one chi-square value.
+
+    Raises
+    ------
+    ValueError  no run has an estimate
+    """
+    kept = counts > 0
+    sums, counts = sums[kept], counts[kept]
+    runs = sums.size
+    if runs == 0:
+        raise ValueError("a test over runs needs a run with at least one estimate, got none")
+    mean = float(sums.sum() / counts.sum())
+    if runs == 1:
+        return MeanTest(mean=mean, bounds=chi2_mean_bounds(dof, 1.0), n_eff=1.0)
+    residuals = sums - mean * counts
+    error = float(np.sqrt(runs / (runs - 1) * (residuals**2).sum()) / counts.sum())
+    reach = float(student_t.ppf((1.0 + CONFIDENCE) / 2.0, runs - 1)) * error
+    n_eff = 2.0 * dof / error**2 if error > 0.0 else np.inf
+    return MeanTest(mean=mean, bounds=(dof - reach, dof + reach), n_eff=float(n_eff))

@@ -210,13 +210,36 @@ def innovation_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
 
 
 @inlined
+def range_second_order_variance(dx: float, dy: float, dz: float, cov: Array, axes: int) -> float:
+    """Variance of the second-order term of the distance |d|, d = (dx, dy, dz), whose first
+    ``axes`` components (2 or 3) have the covariance in the first entries of ``cov``.
+
+    Half the trace of (h'' P)^2 (Bar-Shalom, Li and Kirubarajan 2001, eq. 10.3.3-12) with
+    h'' = (I - u u') / |d|, u = d / |d|: exact for a Gaussian prior, wherever the RSU stands.
+    """
+    r2 = max(dx * dx + dy * dy + dz * dz, 1e-6)
+    d = (dx, dy, dz)
+    square, along, turned = 0.0, 0.0, 0.0  # trace P^2, u'Pu and |Pu|^2, without u's length
+    for i in range(axes):
+        Pd = 0.0
+        for j in range(axes):
+            Pd += cov[i, j] * d[j]
+            square += cov[i, j] * cov[i, j]
+        along += d[i] * Pd
+        turned += Pd * Pd
+    total = square - 2.0 * turned / r2 + (along / r2) ** 2
+    return float(0.5 * max(total, 0.0) / r2)
+
+
+@inlined
 def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> float:
     """Variance of what linearising ``row`` at ``mean`` (n,) leaves out, for a prior ``cov`` (n,
     n).
 
     Half the trace of (h'' P)^2 of the second-order extended Kalman filter (Bar-Shalom, Li and
-    Kirubarajan 2001, eq. 10.3.3-12), with the largest curvature of the quantity. It keeps a device
-    that may be anywhere around an RSU from being placed on top of it.
+    Kirubarajan 2001, eq. 10.3.3-12): exact for ranges and times, with the largest curvature of the
+    quantity for angles and phases. It keeps a device that may be anywhere around an RSU from being
+    placed on top of it.
     """
     kind = int(row[KIND])
     if kind == Kind.LINEAR or kind == Kind.SPEED:
@@ -231,11 +254,10 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
         dx += lx
         dy += ly
     dz = height_m + row[LEVER + 2] - row[ORIGIN + 2]
+    if kind == Kind.TOA or kind == Kind.RANGE:
+        return float(range_second_order_variance(dx, dy, dz, cov, 2))
     rho2 = dx * dx + dy * dy
     r2 = max(rho2 + dz * dz, 1e-6)
-    if kind == Kind.TOA or kind == Kind.RANGE:
-        across = dy * dy * cov[0, 0] - 2.0 * dx * dy * cov[0, 1] + dx * dx * cov[1, 1]
-        return float(0.5 * (across / max(rho2, 1e-6)) ** 2 / r2)
     square = cov[0, 0] ** 2 + 2.0 * cov[0, 1] ** 2 + cov[1, 1] ** 2
     d2 = max(rho2, 1e-6) if kind == Kind.AZIMUTH else r2
     if kind >= Kind.PHASE:

@@ -37,6 +37,7 @@ from netpos.filters.measurement import (
     Kind,
     direction,
     is_angle,
+    range_second_order_variance,
     wrap,
 )
 from netpos.inertial.strapdown import (
@@ -134,19 +135,14 @@ def bend_variance(row: Array, nav: Array, cov: Array) -> float:
     d0 = nav[0] - row[ORIGIN]
     d1 = nav[1] - row[ORIGIN + 1]
     d2 = nav[2] - row[ORIGIN + 2]
+    if kind == Kind.RANGE or kind == Kind.TOA:
+        return float(range_second_order_variance(d0, d1, d2, cov, 3))
     rho2 = max(d0 * d0 + d1 * d1, 1e-6)
     r2 = rho2 + d2 * d2
     square = 0.0
     for i in range(3):
         for j in range(3):
             square += cov[i, j] * cov[i, j]
-    if kind == Kind.RANGE or kind == Kind.TOA:
-        along = (
-            d0 * d0 * cov[0, 0] + d1 * d1 * cov[1, 1] + d2 * d2 * cov[2, 2]
-            + 2.0 * (d0 * d1 * cov[0, 1] + d0 * d2 * cov[0, 2] + d1 * d2 * cov[1, 2])
-        ) / r2  # fmt: skip
-        across = max(cov[0, 0] + cov[1, 1] + cov[2, 2] - along, 0.0)
-        return float(0.5 * across * across / r2)
     if kind == Kind.AZIMUTH:
         plane = cov[0, 0] ** 2 + 2.0 * cov[0, 1] ** 2 + cov[1, 1] ** 2
         return float(0.5 * plane / (rho2 * rho2))

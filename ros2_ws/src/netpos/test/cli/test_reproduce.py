@@ -56,12 +56,13 @@ def test_rows_json_and_pictures(
     content = json.loads(file.read_text())
     assert content.keys() == {"paper", "runs", "seed", "wall_s", "rows"}
     assert (content["paper"], content["runs"], content["seed"]) == ("some2026", 4, 2)
+    beside = {"baseline": None, "defaults": None}
     assert content["rows"] == [
-        {"name": "sum [of seeds]", "unit": "1", "paper": 10.0, "ours": 14, "ok": False},
-        {"name": "untold", "unit": "m", "paper": None, "ours": None, "ok": None},
+        {"name": "sum [of seeds]", "unit": "1", "paper": 10.0, "ours": 14, "ok": False} | beside,
+        {"name": "untold", "unit": "m", "paper": None, "ours": None, "ok": None} | beside,
     ]
     row = next(line for line in result.stdout.splitlines() if "sum [of seeds]" in line)
-    assert [cell.strip() for cell in row.split("│")[2:6]] == ["1", "10", "14", "NO"]
+    assert [cell.strip() for cell in row.split("│")[2:8]] == [*("1", "10", "–", "14", "–", "NO")]
     assert f"wrote {folder / 'fig1.png'}" in result.stdout.replace("\n", "")
     assert "all seeds" in result.stderr
 

@@ -8,12 +8,14 @@ from netpos.evaluation.consistency import (
     chi2_mean_bounds,
     effective_size,
     nees,
+    nees_over_runs,
     nees_test,
     nis_test,
 )
 from netpos.messages.values import Array
 from scipy.special import gammainc
 from scipy.stats import chi2
+from scipy.stats import t as student_t
 
 
 def autoregressive(rng: np.random.Generator, n: int, phi: float) -> Array:
@@ -117,3 +119,45 @@ def test_nis_of_epochs_with_different_sizes() -> None:
 def test_nothing_evaluated_is_no_verdict() -> None:
     assert nees_test(np.zeros(0), dof=2) is None
     assert nis_test(np.zeros(0), np.zeros(0)) is None
+
+
+def test_many_runs_are_tested_by_the_spread_between_them() -> None:
+    """Closed form for runs of equal length: a t-test of the runs' means."""
+    sums, counts = np.array([10.0, 30.0, 20.0, 60.0]), np.full(4, 10.0)
+    test = nees_over_runs(sums, counts, 2)
+    means = sums / counts
+    assert test.mean == pytest.approx(means.mean())
+    reach = student_t.ppf(0.975, 3) * means.std(ddof=1) / 2.0
+    np.testing.assert_allclose(test.bounds, (2.0 - reach, 2.0 + reach))
+    assert test.n_eff == pytest.approx(4.0 / (means.std(ddof=1) / 2.0) ** 2)
+
+
+def test_runs_without_estimates_count_for_nothing() -> None:
+    some = nees_over_runs(np.array([10.0, 30.0]), np.array([10.0, 10.0]), 2)
+    more = nees_over_runs(np.array([10.0, 0.0, 30.0]), np.array([10.0, 0.0, 10.0]), 2)
+    assert more == some
+    with pytest.raises(ValueError, match="at least one estimate"):
+        nees_over_runs(np.zeros(2), np.zeros(2), 2)
+
+
+def test_one_run_counts_as_one_value() -> None:
+    test = nees_over_runs(np.array([30.0]), np.array([10.0]), 2)
+    assert (test.mean, test.n_eff) == (3.0, 1.0)
+    np.testing.assert_allclose(test.bounds, chi2.ppf([0.025, 0.975], 2))
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.9, 0.99])
+def test_bounds_over_runs_hold_95_percent_of_consistent_filters(phi: float) -> None:
+    """Runs of 50 to 300 errors with correlation within each; 100 runs a trial, 1500 trials."""
+    rng = np.random.default_rng(1)
+    runs, trials, longest = 100, 1500, 300
+    x = rng.normal(size=(2, 4000))
+    paths = [x]
+    for _ in range(longest - 1):
+        paths.append(phi * paths[-1] + np.sqrt(1 - phi**2) * rng.normal(size=x.shape))
+    cumulated = np.cumsum([(p**2).sum(axis=0) for p in paths], axis=0)
+    kept = 0
+    for _ in range(trials):
+        chosen, counts = rng.integers(4000, size=runs), rng.integers(50, longest + 1, runs)
+        kept += nees_over_runs(cumulated[counts - 1, chosen], counts.astype(float), 2).consistent
+    assert 0.93 <= kept / trials <= 0.97

@@ -95,24 +95,30 @@ def test_an_innovation_scatters_by_noise_curvature_and_prior(kind: Kind) -> None
 
 
 @pytest.mark.parametrize("kind", [Kind.RANGE, Kind.TOA])
+@pytest.mark.parametrize("height_m", [3.0, 3.5, -5.5, 40.0])
 @pytest.mark.parametrize("seed", range(5))
-def test_curvature_of_a_level_range_is_exact(kind: Kind, seed: int) -> None:
+def test_curvature_of_a_range_is_exact(kind: Kind, height_m: float, seed: int) -> None:
+    """Level with the RSU and well below or above it, against finite differences."""
     rng = np.random.default_rng(seed)
     row, x = level_row(kind, np.array([1.0, -2.0, 3.0])), random_state(rng)
     A = rng.normal(size=(9, 9))
-    expected = half_trace(row, x, A @ A.T, 3.0)
-    assert curvature_variance(row, x, A @ A.T, 3.0) == pytest.approx(expected, rel=1e-4)
+    expected = half_trace(row, x, A @ A.T, height_m)
+    assert curvature_variance(row, x, A @ A.T, height_m) == pytest.approx(expected, rel=1e-4)
 
 
-def test_curvature_of_a_range_from_above_is_that_across_the_line_of_sight() -> None:
-    """rho 3, height 4: sideways the range bends with 1/5."""
-    row, x = level_row(Kind.RANGE, np.zeros(3)), np.zeros(9)
-    x[:2] = 0.0, 3.0
-    cov = np.diag([2.0, 1e-9, *np.ones(7)])
-    assert curvature_variance(row, x, cov, -4.0) == pytest.approx(
-        half_trace(row, x, cov, -4.0), rel=1e-4
-    )
-    assert curvature_variance(row, x, cov, -4.0) == pytest.approx(0.5 * (2.0 / 5.0) ** 2, rel=1e-6)
+@pytest.mark.parametrize(
+    ("aside_m", "expected"), [(0.0, 16.0 / 8.5**2), (1.0, None), (8.5, None), (85.0, None)]
+)
+def test_a_range_from_above_bends_along_the_ground_too(
+    aside_m: float, expected: float | None
+) -> None:
+    """An RSU 8.5 m above. Straight below it h'' is 1/8.5 in both directions."""
+    row, x = level_row(Kind.RANGE, np.array([0.0, 0.0, 8.5])), np.zeros(9)
+    x[0] = aside_m
+    cov = np.diag([4.0, 4.0, *np.ones(7)])
+    if expected is None:
+        expected = half_trace(row, x, cov, 0.0)
+    assert curvature_variance(row, x, cov, 0.0) == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -155,9 +161,7 @@ def test_curvature_at_the_rsu_is_finite_and_linear_rows_have_none() -> None:
         assert curvature_variance(level_row(kind, np.zeros(3)), x, cov, 0.0) == pytest.approx(
             floor
         )
-    assert curvature_variance(level_row(Kind.RANGE, np.zeros(3)), x, cov, 0.0) == 0.0
-    x[0] = 1e-4
     value = curvature_variance(level_row(Kind.RANGE, np.zeros(3)), x, cov, 0.0)
-    assert value == pytest.approx(0.5 * (1e-8 / 1e-6) ** 2 / 1e-6)
+    assert value == pytest.approx(0.5 * 2.0 / 1e-6)
     for kind in (Kind.LINEAR, Kind.SPEED):
         assert curvature_variance(level_row(kind, np.ones(3)), x, cov, 0.0) == 0.0

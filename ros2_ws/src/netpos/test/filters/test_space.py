@@ -193,14 +193,15 @@ def test_a_flat_covariance_is_refused() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_bend_variance_of_each_kind(seed: int) -> None:
-    """Half the squared trace of what lies across the line of sight over its length; of angles the
-    squared entries, over the fourth power, of a bearing in the plane."""
+    """Of ranges half the trace of (h'' P)^2; of angles half the squared entries of P over the
+    fourth power of the distance, of a bearing in the plane."""
     rng = np.random.default_rng(seed)
     nav, A = state(rng), rng.normal(size=(ERR, ERR))
     cov, origin = A @ A.T, rng.normal(0.0, 20.0, 3)
     d, P = nav[:3] - origin, cov[:3, :3]
     r2, rho2 = d @ d, d[:2] @ d[:2]
-    ranged = np.trace((np.eye(3) - np.outer(d, d) / r2) @ P) ** 2 / r2
+    bent = (np.eye(3) - np.outer(d, d) / r2) @ P
+    ranged = np.trace(bent @ bent) / r2
     angle = np.linalg.norm(P) ** 2 / r2**2
     for kind, twice in (
         (Kind.RANGE, ranged),

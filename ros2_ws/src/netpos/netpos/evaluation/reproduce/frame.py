@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from copy import copy
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from types import TracebackType
@@ -42,19 +42,31 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """One figure: the paper's (None where it has none), ours (None where it cannot be computed),
-    and whether ours keeps the target (None where there is no target)."""
+    """One figure.
+
+    paper: what the paper says. baseline: the paper's own filter on our simulation, with the same
+    measurements. ours: netpos with the settings of the scenario. defaults: netpos with the motion,
+    clock and start parameters of the library, as a user has who tunes nothing. Each is None where
+    there is none or it cannot be computed. ok: whether ours keeps the target (None where there is
+    no target).
+    """
 
     name: str
     unit: str
     paper: float | None
     ours: float | None
     ok: bool | None
+    baseline: float | None = None
+    defaults: float | None = None
 
     def __post_init__(self) -> None:
-        for value in (self.paper, self.ours):
+        for value in (self.paper, self.baseline, self.ours, self.defaults):
             if value is not None and not math.isfinite(value):
                 raise ValueError(f"row {self.name!r} must be finite or None, got {value}")
+
+    def beside(self, baseline: float | None = None, defaults: float | None = None) -> Row:
+        """The same row with the paper's own filter and the default settings beside it."""
+        return replace(self, baseline=baseline, defaults=defaults)
 
 
 def shown(name: str, unit: str, ours: float | None, paper: float | None = None) -> Row:

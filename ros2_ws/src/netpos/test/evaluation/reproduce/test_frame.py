@@ -89,7 +89,7 @@ def _paper(row: Row) -> SimpleNamespace:
 
 
 def test_result_has_the_agreed_form(monkeypatch: pytest.MonkeyPatch) -> None:
-    paper = _paper(at_most("error", "m", 0.3, 0.4))
+    paper = _paper(at_most("error", "m", 0.3, 0.4).beside(baseline=0.5, defaults=0.6))
     monkeypatch.setitem(PAPERS, "some2026", "some.module")
     monkeypatch.setattr(frame, "import_module", {"some.module": paper}.__getitem__)
     result = reproduce("some2026", runs=7, seed=3, workers=1)
@@ -100,7 +100,17 @@ def test_result_has_the_agreed_form(monkeypatch: pytest.MonkeyPatch) -> None:
         "paper": "some2026",
         "runs": 7,
         "seed": 3,
-        "rows": [{"name": "error", "unit": "m", "paper": 0.4, "ours": 0.3, "ok": True}],
+        "rows": [
+            {
+                "name": "error",
+                "unit": "m",
+                "paper": 0.4,
+                "ours": 0.3,
+                "ok": True,
+                "baseline": 0.5,
+                "defaults": 0.6,
+            }
+        ],
     }
     assert result.outcome.draw(Path("x")) == [Path("x/a.png")]
 
