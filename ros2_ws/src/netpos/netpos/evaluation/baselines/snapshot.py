@@ -22,7 +22,9 @@ MAX_SD_M = 5.0
 GATE_SD = 4.0
 START_AGE_S = 2.0
 EVERY_S = 0.1
-_STARTS = 3  # the best places of the grid, refined
+_STARTS = 6  # the best places of the grid, refined
+_AS_GOOD = 9.0
+_APART_M = 1.0
 _HEADINGS = 4
 _REPEATS = 3
 
@@ -60,10 +62,11 @@ class Fix:
 
 def snapshot(seen: Observations, space: Space, start: Array | None = None) -> Fix | None:
     """Least squares of all rows as one instant; None where they do not fix the position: fewer
-    rows than unknowns, a singular geometry, or an sd above 5 m.
+    rows than unknowns, a singular geometry, an sd above 5 m, or a second solution that fits as
+    well (9 more in the sum of squares, 3 sd).
 
-    start : where the search begins; without it the solution is the one of the smallest cost that a
-        grid of starts leads to
+    start : where the search begins; without it a grid of starts is searched, and only then a
+        second solution is found
     """
     turns = seen.turns
     columns = space.columns(heading=turns)
@@ -77,6 +80,8 @@ def snapshot(seen: Observations, space: Space, start: Array | None = None) -> Fi
         starts = [start]
     found = [_solve(seen, space, state) for state in starts]
     state = min(found, key=lambda solution: _cost(seen, space, solution))
+    if _ambiguous(seen, space, state, found):
+        return None
     for _ in range(_REPEATS):
         near = np.abs(_scaled(seen, space, state)[0]) <= GATE_SD
         if near.all() or near.sum() < len(columns):
@@ -97,6 +102,13 @@ def _scaled(seen: Observations, space: Space, state: Array) -> tuple[Array, Arra
 
 def _cost(seen: Observations, space: Space, state: Array) -> float:
     return float((_scaled(seen, space, state)[0] ** 2).sum())
+
+
+def _ambiguous(seen: Observations, space: Space, best: Array, found: list[Array]) -> bool:
+    """Whether another solution, more than 1 m away, fits nearly as well as the best."""
+    limit = _cost(seen, space, best) + _AS_GOOD
+    apart = [s for s in found if np.linalg.norm((s - best)[: space.dimensions]) > _APART_M]
+    return any(_cost(seen, space, solution) < limit for solution in apart)
 
 
 def _solve(seen: Observations, space: Space, start: Array) -> Array:
