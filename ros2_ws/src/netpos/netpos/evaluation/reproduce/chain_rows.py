@@ -107,6 +107,8 @@ def _headline(name: str, long: Chains, short: Chains) -> Iterator[Row]:
 
 def _details(label: str, ours: Figures, paper: Figures, defaults: Figures) -> Iterator[Row]:
     """Errors, consistency, time not scored and lost runs."""
+    row = shown(f"{label}: RMSE of the median run", "m", ours.median_rmse_m)
+    yield row.beside(paper.median_rmse_m, defaults.median_rmse_m)
     row = shown(f"{label}: largest error", "m", ours.error_max_m)
     yield row.beside(paper.error_max_m, defaults.error_max_m)
     name = f"{label}: NEES, mean (expected 2)"

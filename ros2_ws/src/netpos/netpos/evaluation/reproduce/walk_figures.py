@@ -77,6 +77,12 @@ class Figures:
             error2=error2,
         )
 
+    @property
+    def median_rmse_m(self) -> float:
+        """RMSE of the median run, of those with a scored estimate."""
+        kept = self.error2[np.isfinite(self.error2).any(axis=1)]
+        return float(np.sqrt(np.median(np.nanmean(kept, axis=1))))
+
     def share_above(self, limit_m: float) -> float:
         """Share of runs with at least one scored error above a limit [m]."""
         return float((np.nan_to_num(self.error2) > limit_m**2).any(axis=1).mean())

@@ -60,6 +60,11 @@ def test_lost_is_off_or_without_an_estimate_at_the_end(end_m: float, lost: int) 
     assert Figures.of(TIMES, [scores(0.01), scores(error)]).lost == lost
 
 
+def test_one_bad_run_is_not_the_median() -> None:
+    runs = [scores(0.1, first=10), scores(0.2), scores(9.0), scores(NAN)]
+    assert Figures.of(TIMES, runs).median_rmse_m == pytest.approx(0.2)
+
+
 def test_far_off_at_first_is_not_lost_but_counted() -> None:
     error = np.full(len(TIMES), 0.01)
     error[5] = FAR_M + 0.1
