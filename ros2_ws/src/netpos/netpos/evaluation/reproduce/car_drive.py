@@ -18,9 +18,11 @@ from netpos.evaluation.reproduce.blocked_drive import (
     TIGHT,
     VEHICLE,
     Case,
+    ground_height_m,
     loose_epochs,
     ned,
 )
+from netpos.evaluation.reproduce.drive_tally import Tally, added, is_lost, tally_errors
 from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
 from netpos.filters.error_state import UNCONSTRAINED, Imu, Sensors
 from netpos.filters.measurement import LEVER
@@ -98,8 +100,8 @@ def _variants(sensors: Sensors) -> dict[str, Sensors]:
     return {TIGHT: sensors._replace(constraints=UNCONSTRAINED), VEHICLE: sensors}
 
 
-def station_errors(case: Case, seed: int) -> dict[str, Array]:
-    """(n, 3) north, east, down errors of the antenna against RTK, by coupling."""
+def station_tally(case: Case, seed: int) -> dict[str, Tally]:
+    """Errors of the antenna against RTK, by coupling."""
     known = recording()
     assert known is not None
     made = station_drive(known.drive, fewest=case.fewest, nearest=case.nearest, seed=seed)
@@ -109,12 +111,16 @@ def station_errors(case: Case, seed: int) -> dict[str, Array]:
     after = made.stamps_ns[heard] > known.start[0]
     first = int(np.argmax(after))
     epochs = Epochs(made.stamps_ns[heard][first:], row_start[first:], rows)
-    fixes = fix_each(epochs, float(made.antenna[0, 2]), 0.0)
-    free = _variants(known.sensors)[TIGHT]
-    runs = {LOOSE: _run(known, loose_epochs(epochs, fixes, LEVER_ARM_M), free)}
-    runs |= {name: _run(known, epochs, taken) for name, taken in _variants(known.sensors).items()}
-    truth = made.antenna[heard][first:]
-    return {name: ned(_antenna(done.nav) - truth)[_SKIP:] for name, done in runs.items()}
+    fixes = fix_each(epochs, ground_height_m(made.stations), 0.0)
+    used = _variants(known.sensors)
+    inputs = {LOOSE: (loose_epochs(epochs, fixes, LEVER_ARM_M), used[TIGHT])}
+    inputs |= {name: (epochs, sensors) for name, sensors in used.items()}
+    truth, tallies = made.antenna[heard][first:], {}
+    for name, (told, sensors) in inputs.items():
+        done = _run(known, told, sensors)
+        error = ned(_antenna(done.nav) - truth)[_SKIP:]
+        tallies[name] = tally_errors(error, lost=is_lost(told, done))
+    return tallies
 
 
 def _run(known: Recording, epochs: Epochs, sensors: Sensors) -> Drive:
@@ -127,14 +133,9 @@ def _antenna(nav: Array) -> Array:
     return np.asarray(nav[:, :3] + Rotation.from_quat(nav[:, 6:10]).apply(LEVER_ARM_M))
 
 
-def station_seeds(case: Case, seeds: range) -> dict[str, tuple[int, Array]]:
-    """Epochs and sums of squared north, east, down errors over some seeds, by coupling."""
-    total: dict[str, tuple[int, Array]] = {}
-    for seed in seeds:
-        for name, error in station_errors(case, seed).items():
-            n, square = total.get(name, (0, np.zeros(3)))
-            total[name] = n + len(error), square + (error**2).sum(axis=0)
-    return total
+def station_seeds(case: Case, seeds: range) -> dict[str, Tally]:
+    """Sums over some seeds, by coupling."""
+    return added([station_tally(case, seed) for seed in seeds])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
