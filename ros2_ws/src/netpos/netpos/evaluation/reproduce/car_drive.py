@@ -14,10 +14,12 @@ from netpos.bags.importers.car_imu_rtk import LEVER_ARM_M, CarDrive, imu_samples
 from netpos.bags.importers.common import recordings
 from netpos.evaluation.metrics import NS
 from netpos.evaluation.reproduce.blocked_drive import (
+    DEFAULT,
     LOOSE,
     TIGHT,
     VEHICLE,
     Case,
+    default_config,
     ground_height_m,
     loose_epochs,
     ned,
@@ -46,17 +48,21 @@ SETTLE_S = 30.0
 _SKIP = 20  # epochs after the start that do not count, as in netpos evaluate
 
 
+Start = tuple[int, Array, Array]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
     """The drive, what a tracker needs of it, and its state once RTK and IMU have told the heading:
-    stamp, nav, cov."""
+    stamp, nav, cov; ``unset``: sensors and start by the library's default parameters."""
 
     drive: CarDrive
     imu: Imu
     config: TrackerConfig
     sensors: Sensors
     gate: Array
-    start: tuple[int, Array, Array]
+    start: Start
+    unset: tuple[Sensors, Start]
 
 
 @lru_cache(maxsize=1)
@@ -66,7 +72,7 @@ def recording() -> Recording | None:
     if folder is None:
         return None
     found = load_car_drive(Path(folder))
-    config = TrackerConfig.from_mapping(found.tracker)
+    config, unset = TrackerConfig.from_mapping(found.tracker), default_config()
     return Recording(
         drive=found,
         imu=Imu(found.imu_ns, found.rates),
@@ -74,10 +80,11 @@ def recording() -> Recording | None:
         sensors=sensors_of(config),
         gate=gate_thresholds(config.gate_probability),
         start=_aligned(found, config),
+        unset=(sensors_of(unset), _aligned(found, unset)),
     )
 
 
-def _aligned(found: CarDrive, config: TrackerConfig) -> tuple[int, Array, Array]:
+def _aligned(found: CarDrive, config: TrackerConfig) -> Start:
     """Coarse alignment from rest, by RTK."""
     start, samples = StrapdownStart(config), SampleBuffer()
     pending = iter(imu_samples(found, VUE))
@@ -96,8 +103,14 @@ def _aligned(found: CarDrive, config: TrackerConfig) -> tuple[int, Array, Array]
     raise ValueError(f"{RECORDING}: no heading found; does the recording move?")
 
 
-def _variants(sensors: Sensors) -> dict[str, Sensors]:
-    return {TIGHT: sensors._replace(constraints=UNCONSTRAINED), VEHICLE: sensors}
+def _variants(known: Recording) -> dict[str, tuple[Sensors, Start]]:
+    """Of the tight coupling: what the filter takes to be true, and where it starts."""
+    free = known.sensors._replace(constraints=UNCONSTRAINED)
+    return {
+        TIGHT: (free, known.start),
+        VEHICLE: (known.sensors, known.start),
+        DEFAULT: known.unset,
+    }
 
 
 def station_tally(case: Case, seed: int) -> dict[str, Tally]:
@@ -112,19 +125,19 @@ def station_tally(case: Case, seed: int) -> dict[str, Tally]:
     first = int(np.argmax(after))
     epochs = Epochs(made.stamps_ns[heard][first:], row_start[first:], rows)
     fixes = fix_each(epochs, ground_height_m(made.stations), 0.0)
-    used = _variants(known.sensors)
-    inputs = {LOOSE: (loose_epochs(epochs, fixes, LEVER_ARM_M), used[TIGHT])}
-    inputs |= {name: (epochs, sensors) for name, sensors in used.items()}
+    variants = _variants(known)
+    inputs = dict.fromkeys(variants, epochs)
+    variants[LOOSE], inputs[LOOSE] = variants[TIGHT], loose_epochs(epochs, fixes, LEVER_ARM_M)
     truth, tallies = made.antenna[heard][first:], {}
-    for name, (told, sensors) in inputs.items():
-        done = _run(known, told, sensors)
+    for name, variant in variants.items():
+        done = _run(known, inputs[name], *variant)
         error = ned(_antenna(done.nav) - truth)[_SKIP:]
-        tallies[name] = tally_errors(error, lost=is_lost(told, done))
+        tallies[name] = tally_errors(error, lost=is_lost(inputs[name], done))
     return tallies
 
 
-def _run(known: Recording, epochs: Epochs, sensors: Sensors) -> Drive:
-    result: Drive = drive(*known.start, known.imu, epochs, sensors, known.gate)
+def _run(known: Recording, epochs: Epochs, sensors: Sensors, start: Start) -> Drive:
+    result: Drive = drive(*start, known.imu, epochs, sensors, known.gate)
     return result
 
 
@@ -155,10 +168,10 @@ def outages(variant: str) -> Outages:
     """``outages_with`` what the filter takes to be true."""
     known = recording()
     assert known is not None
-    return outages_with(_variants(known.sensors)[variant])
+    return outages_with(*_variants(known)[variant])
 
 
-def outages_with(sensors: Sensors) -> Outages:
+def outages_with(sensors: Sensors, start: Start) -> Outages:
     """RTK aids the filter, and is withheld for 30 s, again and again, each time from the aided
     state."""
     known = recording()
@@ -168,7 +181,8 @@ def outages_with(sensors: Sensors) -> Outages:
     cov = np.tile(np.diag(np.square(RTK_SD_M)), (len(stamps), 1, 1))
     rows = place_rows(antenna, cov, LEVER_ARM_M)
     row_start = np.arange(len(stamps) + 1) * 3
-    aided = _run(known, Epochs(stamps, row_start, rows.reshape(-1, rows.shape[-1])), sensors)
+    aiding = Epochs(stamps, row_start, rows.reshape(-1, rows.shape[-1]))
+    aided = _run(known, aiding, sensors, start)
     elapsed = (stamps - stamps[0]) / NS
     grid = np.arange(0.0, OUTAGE_S + 0.1, 0.25)
     curves = []

@@ -17,6 +17,7 @@ from netpos.evaluation.pictures import save
 from netpos.evaluation.reproduce import car_drive
 from netpos.evaluation.reproduce.blocked_drive import (
     ALL_ANGLES,
+    DEFAULT,
     DEFAULT_VEHICLE,
     FIX,
     FIX_HEIGHT,
@@ -250,12 +251,17 @@ def _real(work: Work) -> Iterator[Row]:
                     yield from Line.of(tallies, variant).shown(name, unit, cells)
                 else:
                     yield from (shown(f"{name}: {key}", unit, None) for key in cells(NO_DRIVE))
+    coasts = {v: car_drive.outages(v) if there else None for v in (*_HELD, DEFAULT)}
     for variant, what in _HELD.items():
-        coasts = car_drive.outages(variant) if there else None
         for seconds, limit in ((10.0, REAL_OUTAGE_LIMIT_M), (30.0, None)):
-            ours = None if coasts is None else float(np.median(coasts.at(seconds)))
+            ours, unset = _median(coasts[variant], seconds), _median(coasts[DEFAULT], seconds)
             label = f"Real, {seconds:.0f} s without RTK, {what}: median horizontal error"
-            yield shown(label, "m", ours) if limit is None else at_most(label, "m", ours, limit)
+            row = shown(label, "m", ours) if limit is None else at_most(label, "m", ours, limit)
+            yield row.beside(defaults=unset)
+
+
+def _median(coasts: car_drive.Outages | None, seconds: float) -> float | None:
+    return None if coasts is None else float(np.median(coasts.at(seconds)))
 
 
 def _draw(seed: int, folder: Path) -> list[Path]:

@@ -30,8 +30,8 @@ _ONE_SIDED = "at most {}, since the simulated car keeps its constraints exactly"
 ABOUT_COLUMNS = (
     "paper's filter: least squares, or the loose coupling with the covariance of each fix."
     " defaults: tight coupling with motion_model strapdown and nothing else set (noise of the IMU"
-    " and the clock, no vehicle constraints). All filters start from one state, which is wrong by"
-    " as much as they take it to be."
+    " and the clock, no vehicle constraints). On a simulated drive all filters start from one"
+    " state, whose error is drawn from the start covariance of the paper's filter."
 )
 
 
