@@ -37,6 +37,7 @@ from netpos.evaluation.reproduce.drive_rows import (
     Cell,
     Line,
     clock_cells,
+    lost_tracks,
     nees_rows,
     outage_cells,
     rms_cells,
@@ -127,11 +128,20 @@ def _table(case: Case, tallies: dict[str, Tally], fix: Cell, ins: Cell) -> Itera
     for variant in _COUPLINGS:
         label = f"{case.name}, SINS, {variant}"
         yield from table_line(Line.of(tallies, variant), label, ins)
+        yield _lost(Line.of(tallies, variant), label)
         if variant != LOOSE:
             what = {3: "position", 9: "position, velocity, attitude"}
             yield from nees_rows(Line.of(tallies, variant), label, variant, what)
     label = f"{case.name}, SINS, {DEFAULT_VEHICLE}"
     yield from table_line(Line.of(tallies, DEFAULT_VEHICLE), label, ins, judged=False)
+    yield from Line.of(tallies, DEFAULT_VEHICLE).shown(label, "%", lost_tracks)
+
+
+def _lost(line: Line, label: str) -> Row:
+    """SINS loses no track, by the paper's text."""
+    lost = line.ours.lost_percent
+    row = required(f"{label}: lost tracks", "%", lost, lost == 0.0)
+    return line.beside(row, lost_tracks, "lost tracks")
 
 
 def _gains(case: Case, tallies: dict[str, Tally], fix: Cell, ins: Cell) -> Iterator[Row]:

@@ -70,13 +70,22 @@ def rms_cells(tally: Tally) -> dict[str, float]:
     return {f"RMS {axis}": rms for axis, rms in zip(AXES, tally.rms_m, strict=True)}
 
 
-def troubles(tally: Tally) -> dict[str, float]:
+def lost_tracks(tally: Tally) -> dict[str, float]:
+    """Share of drives [%]."""
+    return {"lost tracks": tally.lost_percent}
+
+
+def unscored(tally: Tally) -> dict[str, float]:
     """What a mean hides [%]."""
     return {
-        "lost tracks": tally.lost_percent,
         "time not scored": 100.0 - tally.success_percent,
         f"drives with a 3-D error above {LARGE_ERROR_M:.0f} m": tally.large_percent,
     }
+
+
+def troubles(tally: Tally) -> dict[str, float]:
+    """The same of a track, which may be lost [%]."""
+    return {**lost_tracks(tally), **unscored(tally)}
 
 
 def clock_cells(tally: Tally) -> dict[str, float]:
@@ -97,13 +106,13 @@ def _success(tally: Tally) -> dict[str, float]:
 
 
 def table_line(line: Line, label: str, paper: Cell, *, judged: bool = True) -> Iterator[Row]:
-    """The cells of one line of a table, and what they hide."""
+    """The cells of one line of a table, and what its RMS hides."""
     reach, stay = (at_least, at_most) if judged else (shown, shown)
     success = reach(f"{label}: success", "%", line.ours.success_percent, paper[0])
     yield line.beside(success, _success, "success")
     for (key, ours), limit in zip(rms_cells(line.ours).items(), paper[1:], strict=True):
         yield line.beside(stay(f"{label}: {key}", "m", ours, limit), rms_cells, key)
-    yield from line.shown(label, "%", troubles)
+    yield from line.shown(label, "%", unscored)
 
 
 def nees_rows(line: Line, label: str, variant: str, states: Mapping[int, str]) -> Iterator[Row]:
