@@ -155,7 +155,7 @@ class Setup:
                     start, estimate, rejected = PhaseStart(self.config), None, 0
             last_ns = stamp
             if estimate is not None:
-                mean[k], cov[k], decided[k] = estimate.mean, estimate.cov, estimate.decided
+                mean[k], cov[k], decided[k] = estimate.mean, estimate.cov, not estimate.modes
         return Walked(self.times_s, self.truth, mean, cov, decided, nis, dof)
 
 
