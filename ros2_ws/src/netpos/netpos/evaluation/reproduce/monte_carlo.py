@@ -25,6 +25,10 @@ BIN_M = 0.002  # of the histogram of errors
 BINS = 10_000
 
 
+class NothingScoredError(ValueError):
+    """No run of an experiment has an estimate that counts."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tally:
     """Sums over the scored estimates of one run; errors in m, ns and rad. epochs: as many as would
@@ -238,13 +242,13 @@ class Summary:
 
         Raises
         ------
-        ValueError  no run lasts longer than the estimates left out
+        NothingScoredError  no run has an estimate beyond those left out
         """
         kept = list(batches)
         tallies = [t for batch in kept for t in batch.tallies]
         n = sum(t.n for t in tallies)
         if n == 0:
-            raise ValueError(f"{experiment.name}: no run has estimates that count")
+            raise NothingScoredError(f"{experiment.name}: no run has estimates that count")
         clock = sum(t.clock for t in tallies) / n
         clock2 = sum(t.clock2 for t in tallies) / n
         headings, dof = sum(t.heading_n for t in tallies), sum(t.dof for t in tallies)
