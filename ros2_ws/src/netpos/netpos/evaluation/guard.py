@@ -3,7 +3,8 @@
 The seeds and recordings are fixed, so an interval covers harmless changes of the program only
 (rounding, the order of sums), not the spread between runs. Its half width is three times the root
 mean square change of the figure in ``REPLICATES`` runs without a random ``DROPPED`` share of the
-measurements, and at least the resolution ``LEAST`` of the figure.
+measurements, and at least the resolution ``LEAST`` of the figure. A figure of which that is more
+than the ``WIDEST`` share says nothing and is left out.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ import numpy as np
 
 from netpos.evaluation.guarded_runs import Case, Tracked, thinned, track
 
-REPLICATES = 6
-DROPPED = 0.02
+REPLICATES = 5
+DROPPED = 0.01
 WIDTH = 3.0
+WIDEST = 0.5
 _RELATIVE = 0.02
 _SHARE = 0.001
 _DIGITS = 4
@@ -88,19 +90,25 @@ def pooled(runs: Sequence[Tracked]) -> Pooled:
     }
 
 
-# The smallest half width of a figure: what a reader would not call a change.
+def _of_value(value: float) -> float:
+    return _RELATIVE * value
+
+
+# The smallest half width of a figure: what a reader would not call a change. Shares have one of
+# their own; of lost tracks each counts.
 LEAST: dict[str, Callable[[float], float]] = {
-    "rmse_m": lambda value: _RELATIVE * value,
-    "velocity_rmse_mps": lambda value: _RELATIVE * value,
-    "heading_rmse_deg": lambda value: _RELATIVE * value,
-    "clock_offset_sd_ns": lambda value: _RELATIVE * value,
-    "nees_mean": lambda value: _RELATIVE * value,
-    "nis_over_dof": lambda value: _RELATIVE * value,
-    "protection_exceeded": lambda value: _SHARE,
-    "availability": lambda value: _SHARE,
-    "lost_tracks": lambda value: 0.0,
-    "rejected_share": lambda value: _SHARE,
+    "rmse_m": _of_value,
+    "velocity_rmse_mps": _of_value,
+    "heading_rmse_deg": _of_value,
+    "clock_offset_sd_ns": _of_value,
+    "nees_mean": _of_value,
+    "nis_over_dof": _of_value,
+    "protection_exceeded": lambda _: _SHARE,
+    "availability": lambda _: _SHARE,
+    "rejected_share": lambda _: _SHARE,
+    "lost_tracks": lambda _: 0.0,
 }
+_SHARES = ("protection_exceeded", "availability", "rejected_share")
 
 
 def figures_of(case: Case) -> Pooled:
@@ -124,8 +132,13 @@ def baseline_of(full: Pooled, replicates: Sequence[Pooled], runs: int) -> Baseli
     """Intervals around the figures of ``full`` by how far the replicates are off."""
     figures: dict[str, Interval | None] = {}
     for name, value in full.items():
+        if value is None:
+            figures[name] = None
+            continue
         others = [other for replicate in replicates if (other := replicate[name]) is not None]
-        figures[name] = None if value is None else _interval(name, value, others)
+        half = WIDTH * _rms_change(value, others)
+        if LEAST[name] is not _of_value or half <= WIDEST * value:
+            figures[name] = _interval(name, value, max(half, LEAST[name](value)))
     return Baseline(runs=runs, figures=figures)
 
 
@@ -169,11 +182,14 @@ def _line(interval: Interval | None) -> str:
     return json.dumps({"value": interval.value, "low": interval.low, "high": interval.high})
 
 
-def _interval(name: str, value: float, others: Sequence[float]) -> Interval:
-    change = math.sqrt(float(np.mean((np.array(others) - value) ** 2))) if others else 0.0
-    half = max(WIDTH * change, LEAST[name](value))
+def _rms_change(value: float, others: Sequence[float]) -> float:
+    return math.sqrt(float(np.mean((np.array(others) - value) ** 2))) if others else 0.0
+
+
+def _interval(name: str, value: float, half: float) -> Interval:
     rounded = _rounded(value)
-    return Interval(rounded, max(_rounded(rounded - half), 0.0), _rounded(rounded + half))
+    high = min(rounded + half, 1.0) if name in _SHARES else rounded + half
+    return Interval(rounded, max(_rounded(rounded - half), 0.0), _rounded(high))
 
 
 def _rounded(value: float) -> float:
