@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Compare today's tracker with a particle filter on six canonical problems.
 
-    python scripts/oracle.py [--problem N] [--seeds 50] [--particles 20000] [--json FILE]
+    python scripts/oracle.py [--problem N] [--seeds 50] [--particles 10000] [--json FILE]
         [--document docs/oracle.md]
 
 Truth and measurements are drawn from the model, and both filters know its parameters. What is
@@ -46,7 +46,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--problem", type=int, choices=sorted(PROBLEMS), help="only this one")
     parser.add_argument("--seeds", type=_positive, default=50, help="runs a problem")
     parser.add_argument("--first-seed", type=int, default=0, help="seed of the first run")
-    parser.add_argument("--particles", type=_positive, default=20_000)
+    parser.add_argument("--particles", type=_positive, default=10_000)
     parser.add_argument("--share", type=_share, default=1.0, help="end every run earlier")
     parser.add_argument("--json", type=Path, help="write all figures to this file")
     parser.add_argument("--document", type=Path, help="write the tables between its marks")

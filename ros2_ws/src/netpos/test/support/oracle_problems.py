@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from netpos.messages.values import Array, Field, InitialPose, RsuInfo, RsuMeasurement, Velocity
 from particle_filter import Motion, Start
-from particle_rows import Kind
+from particle_kernels import Kind
 from scipy.constants import speed_of_light
 
 T0_NS = 1_000_000_000

@@ -30,13 +30,13 @@ class Moment:
     problem: int
     seed: int
     time_s: float
-    modes: int
     own_radius: float
     """95 % radius of a Gaussian with the oracle's moments over the oracle's radius."""
     error: float
     nees: float
     rank: float
     """Weight nearer to the mean than the truth: uniform where the oracle is right."""
+    modes: int = 0
     tracker_error: float = math.nan
     tracker_nees: float = math.nan
     tracker_inside: float = math.nan
@@ -101,28 +101,38 @@ def _beside(moment: Moment, truth: Array, cloud: Cloud, modes: Modes, told: Any)
     moment.modes_apart = float(np.abs(modes.shares_of(drawn) - modes.weights).max())
 
 
+def _moment(problem: int, seed: int, step: Step, cloud: Cloud) -> Moment:
+    """The oracle's own figures."""
+    error = step.truth[:2] - cloud.mean
+    return Moment(
+        problem=problem,
+        seed=seed,
+        time_s=step.time_s,
+        own_radius=protection_level(cloud.cov, 1.0 - SHARE) / cloud.radius(SHARE),
+        error=math.hypot(*error),
+        nees=_nees(error, cloud.cov),
+        rank=cloud.share_within(math.hypot(*error)),
+    )
+
+
+def alone(problem: int, seed: int, particles: int, share: float = 1.0) -> list[Moment]:
+    """Every scored moment of one run of the oracle, without the tracker and without modes."""
+    steps = posteriors(draw(problem, seed, share), particles, seed)
+    return [_moment(problem, seed, step, cloud) for step, cloud, _ in steps]
+
+
 def compare(problem: int, seed: int, particles: int, share: float = 1.0) -> list[Moment]:
     """Every scored moment of one run of both filters."""
     case = draw(problem, seed, share)
     told, moments = tracked(case), []
     count = particles * PROBLEMS[problem].factor
     for step, cloud, _ in posteriors(case, count, seed):
-        modes, truth = Modes(cloud), step.truth[:2]
-        error = truth - cloud.mean
-        own = protection_level(cloud.cov, 1.0 - SHARE) / cloud.radius(SHARE)
-        moment = Moment(
-            problem=problem,
-            seed=seed,
-            time_s=step.time_s,
-            modes=len(modes.weights),
-            own_radius=own,
-            error=math.hypot(*error),
-            nees=_nees(error, cloud.cov),
-            rank=cloud.share_within(math.hypot(*error)),
-        )
+        modes = Modes(cloud)
+        moment = _moment(problem, seed, step, cloud)
+        moment.modes = len(modes.weights)
         stamp = step.items[-1].stamp_ns
         if stamp in told:
-            _beside(moment, truth, cloud, modes, told[stamp])
+            _beside(moment, step.truth[:2], cloud, modes, told[stamp])
         moments.append(moment)
     return moments
 

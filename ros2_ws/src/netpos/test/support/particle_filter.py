@@ -10,10 +10,7 @@ Noise that was not drawn yet is kept as a covariance until the next measurement.
 update then draws positions where that measurement says and weighs them by that covariance: a
 range of 0.2 m would leave hardly any of the particles spread over 50 m.
 
-The first measurements after a start, or after a silence, say far more than was known, and what
-process noise adds takes seconds to replace the particles they leave. So after each resampling the
-start of every particle is moved by Metropolis-Hastings steps that leave the posterior as it is
-(resample-move: Gilks and Berzuini 2001; steps by differences of particles: ter Braak 2006).
+After a start or a silence, starts are moved: ``particle_moves``.
 """
 
 from __future__ import annotations
@@ -24,13 +21,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from netpos.messages.values import Array
-from numba import njit
-from particle_rows import WIDTH, Kind, log_likelihood
+from particle_kernels import WIDTH, Kind, drift_all, place, scatter, systematic, weigh
+from particle_moves import Starts
 
-TRIES = 16  # candidates of a guided particle
-EPOCHS, ROWS = 64, 96  # starts are moved for so many epochs, and rows
-SWEEPS = 4
-_LEAST_STEP = 3.0  # a step is e^-u of a difference of two particles, u uniform up to this
+_FEW = 0.2  # share of the particles below which measurements count bit by bit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,228 +49,10 @@ class Start:
     clock_sd: tuple[float, float] = (0.0, 0.0)
 
 
-@njit(cache=True)
-def _drift(rng, state, dt, turn_probability):  # type: ignore[no-untyped-def]
-    for i in range(state.shape[0]):
-        if turn_probability > 0.0 and rng.random() < turn_probability:
-            side = 1.0 if rng.random() < 0.5 else -1.0
-            state[i, 2], state[i, 3] = -side * state[i, 3], side * state[i, 2]
-        state[i, 0] += dt * state[i, 2]
-        state[i, 1] += dt * state[i, 3]
-
-
-@njit(cache=True)
-def _scatter(rng, state, pp, pv, vv):  # type: ignore[no-untyped-def]
-    """Add noise with the covariance [[pp, pv], [pv, vv]] of position and velocity per axis."""
-    p = math.sqrt(pp)
-    g = pv / p if p > 0.0 else 0.0
-    v = math.sqrt(max(vv - g * g, 0.0))
-    for i in range(state.shape[0]):
-        for axis in range(2):
-            n = rng.standard_normal()
-            state[i, axis] += p * n
-            state[i, 2 + axis] += g * n + v * rng.standard_normal()
-
-
-@njit(cache=True)
-def _weigh(row, state, clock, weights, variance, gain_offset, gain_drift):  # type: ignore[no-untyped-def]
-    """Add the log likelihood of a row to the log weights; a time moves the clocks, too."""
-    for i in range(state.shape[0]):
-        x, y, vx, vy = state[i, 0], state[i, 1], state[i, 2], state[i, 3]
-        gain, e = log_likelihood(row, x, y, vx, vy, clock[i, 0], variance)
-        weights[i] += gain
-        if int(row[0]) == 4:
-            clock[i, 0] += gain_offset * e
-            clock[i, 1] += gain_drift * e
-
-
-@njit(cache=True)
-def _candidate(rng, row, phase):  # type: ignore[no-untyped-def]
-    """A position as a range, and a phase where its kind is not negative, would have it: x, y and
-    the log of its area over the probability of the draw."""
-    r = row[1] + row[2] * rng.standard_normal()
-    if int(row[0]) == 2 and rng.random() < row[5]:
-        r -= row[6] * rng.standard_exponential()
-    if r <= 0.0:
-        return 0.0, 0.0, -math.inf
-    if phase[0] < 0.0:
-        angle = 2.0 * math.pi * rng.random()
-        return row[3] + r * math.cos(angle), row[4] + r * math.sin(angle), math.log(r)
-    scale, along = phase[5], phase[6]
-    noisy = phase[1] + phase[2] * rng.standard_normal()
-    reach = math.ceil((scale + 2.0 * math.pi) / (2.0 * math.pi))
-    s = (noisy + 2.0 * math.pi * rng.integers(-reach, reach + 1)) / scale
-    half = math.sqrt((row[3] - phase[3]) ** 2 + (row[4] - phase[4]) ** 2)
-    square = r * r - half * half * (1.0 - s * s)
-    if abs(s) >= 1.0 or square <= 0.0:
-        return 0.0, 0.0, -math.inf
-    across = math.sqrt(1.0 - s * s)
-    d = s * half + math.sqrt(square)
-    if d <= 0.0:
-        return 0.0, 0.0, -math.inf
-    c, t = math.cos(along), math.sin(along)
-    x, y = d * (s * c - across * t), d * (s * t + across * c)  # in front: left of ``along``
-    return phase[3] + x, phase[4] + y, math.log(d * r / (math.sqrt(square) * across))
-
-
-@njit(cache=True)
-def _place(rng, state, weights, row, phase, pp, pv, vv):  # type: ignore[no-untyped-def]
-    """Draw every particle from its pending noise and a range in one: one of TRIES candidates."""
-    g, v = pv / pp, math.sqrt(max(vv - pv * pv / pp, 0.0))
-    found, gains = np.empty((TRIES, 2)), np.empty(TRIES)
-    for i in range(state.shape[0]):
-        top = -math.inf
-        for k in range(TRIES):
-            x, y, gain = _candidate(rng, row, phase)
-            dx, dy = x - state[i, 0], y - state[i, 1]
-            found[k, 0], found[k, 1] = dx, dy
-            gains[k] = gain - 0.5 * (dx * dx + dy * dy) / pp
-            top = max(top, gains[k])
-        if top == -math.inf:
-            weights[i] = -math.inf
-            continue
-        total = 0.0
-        for k in range(TRIES):
-            gains[k] = math.exp(gains[k] - top)
-            total += gains[k]
-        left, chosen = total * rng.random(), 0
-        while chosen < TRIES - 1 and left > gains[chosen]:
-            left -= gains[chosen]
-            chosen += 1
-        for axis in range(2):
-            state[i, axis] += found[chosen, axis]
-            state[i, 2 + axis] += g * found[chosen, axis] + v * rng.standard_normal()
-        weights[i] += top + math.log(total)
-
-
-@njit(cache=True)
-def _systematic(shift, probability):  # type: ignore[no-untyped-def]
-    """Index of the particle that each of equally many draws takes (systematic resampling)."""
-    n = probability.size
-    index = np.empty(n, dtype=np.int64)
-    total, j = probability[0], 0
-    for i in range(n):
-        while total < (i + shift) / n and j < n - 1:
-            j += 1
-            total += probability[j]
-        index[i] = j
-    return index
-
-
-@njit(cache=True)
-def _of_way(way, rows, told, times, clock, step, least):  # type: ignore[no-untyped-def]
-    """Log likelihood of all rows along a way (EPOCHS, 4) whose start is moved by ``step`` (4,);
-    ``clock`` (2,) is carried along in place. -inf as soon as it is below ``least``."""
-    total, now = 0.0, 0.0
-    for j in range(rows.shape[0]):
-        k = int(told[j, 0])
-        time = times[k]
-        clock[0] += (time - now) * clock[1]
-        now = time
-        x = way[k, 0] + step[0] + time * step[2]
-        y = way[k, 1] + step[1] + time * step[3]
-        vx, vy = way[k, 2] + step[2], way[k, 3] + step[3]
-        gain, e = log_likelihood(rows[j], x, y, vx, vy, clock[0], told[j, 1])
-        total += gain
-        if total < least:
-            return -math.inf
-        if int(rows[j, 0]) == 4:
-            clock[0] += told[j, 2] * e
-            clock[1] += told[j, 3] * e
-    return total
-
-
-@njit(cache=True)
-def _log_prior(step, off, precision):  # type: ignore[no-untyped-def]
-    """Log density of a start ``off`` + ``step`` (4,) away from its mean."""
-    total = 0.0
-    for axis in range(2):
-        p, v = off[axis] + step[axis], off[2 + axis] + step[2 + axis]
-        total += precision[0, 0] * p * p + 2.0 * precision[0, 1] * p * v + precision[1, 1] * v * v
-    return -0.5 * total
-
-
-@njit(cache=True)
-def _shift(state, step, time):  # type: ignore[no-untyped-def]
-    for axis in range(2):
-        state[axis] += step[axis] + time * step[2 + axis]
-        state[2 + axis] += step[2 + axis]
-
-
-@njit(cache=True)
-def _move_starts(rng, off, ways, first_clock, rows, told, times, precision, state, clock):  # type: ignore[no-untyped-def]
-    """SWEEPS Metropolis-Hastings steps of the start of every particle, and what follows of it.
-
-    off (N, 4): start minus its prior mean; ways (N, EPOCHS, 4): states since; rows (m, WIDTH) and
-    told (m, 4): epoch, innovation variance and clock gains of each; times (k,): of the epochs, 0
-    at the start; state (N, 4), clock (N, 2): at the last of them. A step moves position, velocity
-    or both by a share of the difference of two starts drawn before the sweeps.
-    """
-    n, others = off.shape[0], ways[:, 0, :].copy()
-    step, still, moved = np.zeros(4), np.zeros(4), np.empty(2)
-    for i in range(n):
-        moved[:] = first_clock[i]
-        current = _of_way(ways[i], rows, told, times, moved, still, -math.inf)
-        current += _log_prior(still, off[i], precision)
-        for _ in range(SWEEPS):
-            a, b, part = rng.integers(0, n), rng.integers(0, n), rng.integers(0, 3)
-            size = math.exp(-_LEAST_STEP * rng.random())
-            for c in range(4):
-                used = part == 2 or c // 2 == part
-                step[c] = size * (others[a, c] - others[b, c]) if used else 0.0
-            moved[:] = first_clock[i]
-            there = _log_prior(step, off[i], precision)
-            least = current + math.log(1.0 - rng.random())
-            there += _of_way(ways[i], rows, told, times, moved, step, least - there)
-            if there > least:
-                current = there
-                for k in range(times.size):
-                    _shift(ways[i, k], step, times[k])
-                _shift(off[i], step, 0.0)
-                _shift(state[i], step, times[-1])
-                clock[i] = moved
-
-
 def _axis_noise(dt: float, density: float) -> Array:
     """Covariance of value and rate after ``dt`` of a rate doing a random walk."""
     q = density**2
     return q * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
-
-
-class _Starts:
-    """Where the particles started, by which ways they came, and all they were told since."""
-
-    def __init__(self, means: Array, cov: Array, state: Array, clock: Array) -> None:
-        self._off, self._clock = state - means, clock.copy()
-        self._ways = np.zeros((len(state), EPOCHS, 4), dtype=np.float32)
-        self._precision, self._now = np.linalg.inv(cov), 0.0
-        self._rows: list[Array] = []
-        self._told: list[list[float]] = []
-        self._times: list[float] = []
-
-    @property
-    def full(self) -> bool:
-        return len(self._times) == EPOCHS or len(self._rows) >= ROWS
-
-    def wait(self, dt: float) -> None:
-        self._now += dt
-
-    def begin_epoch(self, state: Array) -> None:
-        self._ways[:, len(self._times)] = state
-        self._times.append(self._now)
-
-    def take(self, row: Array, variance: float, gain: Array) -> None:
-        self._rows.append(row)
-        self._told.append([len(self._times) - 1.0, variance, *gain])
-
-    def choose(self, index: npt.NDArray[np.int64]) -> None:
-        self._off, self._clock = self._off[index], self._clock[index]
-        self._ways = self._ways[index]
-
-    def move(self, rng: np.random.Generator, state: Array, clock: Array) -> None:
-        told = np.array(self._rows), np.array(self._told), np.array(self._times)
-        ways = self._off, self._ways, self._clock
-        _move_starts(rng, *ways, *told, self._precision, state, clock)
 
 
 class ParticleFilter:
@@ -292,7 +68,7 @@ class ParticleFilter:
         self.clock_cov = np.diag(np.square(start.clock_sd))
         self.least_effective = float(particles)
         """Smallest effective number of particles after any update."""
-        self._starts: _Starts | None = None
+        self._starts: Starts | None = None
         self._started = False
 
     @property
@@ -306,7 +82,7 @@ class ParticleFilter:
         if dt <= 0.0:
             return
         turns = -math.expm1(-self._motion.turns_hz * dt)
-        _drift(self._rng, self.state, dt, turns)
+        drift_all(self._rng, self.state, dt, turns)
         if self._starts is not None:
             self._starts.wait(dt)
         F = np.array([[1.0, dt], [0.0, 1.0]])
@@ -325,18 +101,54 @@ class ParticleFilter:
         placed = self._draw(rows, guided)
         if self._starts is not None:
             self._starts.begin_epoch(self.state)
+        gains = np.zeros(len(self.state))
         for k, row in enumerate(rows):
-            self._take(row, already=k < placed)
-        if not self._weights.max() > -math.inf:
+            self._take(row, None if k < placed else gains)
+        if not (self._weights + gains).max() > -math.inf:
             raise ValueError("no particle explains the measurements; take more particles")
-        effective = 1.0 / float((self.probability**2).sum())
-        self.least_effective = min(self.least_effective, effective)
-        if effective < 0.5 * len(self.state):
-            self._resample()
-            if self._starts is not None:
-                self._starts.move(self._rng, self.state, self.clock)
+        self._weigh_in_parts(len(rows) - placed, gains)
         if self._starts is not None and self._starts.full:
             self._starts = None
+
+    def _weigh_in_parts(self, count: int, gains: Array) -> None:
+        """Add log likelihoods (N,) of the last ``count`` rows to the weights: at once, or while
+        starts are moved, bit by bit, so that never more than half of the particles is lost
+        (tempering: Neal 2001)."""
+        done = 0.0
+        while done < 1.0:
+            part = 1.0 - done
+            if self._starts is not None and self._effective(part, gains) < _FEW:
+                if self._effective(0.0, gains) < 0.5:
+                    gains = self._renew(count, done, gains)
+                part = self._part(part, gains)
+            self._weights += part * gains if part < 1.0 else gains
+            done = min(done + part, 1.0) if part < 1.0 - done else 1.0
+            share = self._effective(0.0, gains)
+            self.least_effective = min(self.least_effective, share * len(gains))
+            if share < 0.5:
+                gains = self._renew(count, done, gains)
+
+    def _part(self, most: float, gains: Array) -> float:
+        """Largest share up to ``most`` by which gains may count and leave half the particles."""
+        low, high = 0.0, most
+        for _ in range(30):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self._effective(middle, gains) > 0.49 else (low, middle)
+        return max(low, 1e-6)
+
+    def _effective(self, part: float, gains: Array) -> float:
+        """Effective share of the particles were ``part`` of the gains added."""
+        total = self._weights + (part * gains if part > 0.0 else 0.0)
+        p = np.exp(total - total.max())
+        return float(p.sum() ** 2 / (p**2).sum() / len(p))
+
+    def _renew(self, count: int, done: float, gains: Array) -> Array:
+        """Resample and move; the gains of the particles there are then."""
+        gains = gains[self._resample()]
+        if self._starts is None:
+            return gains
+        part = (count if done < 1.0 else 0), done
+        return self._starts.move(self._rng, part, self.state, self.clock)
 
     def _draw(self, rows: Array, guided: bool) -> int:
         """Draw the pending noise; how many of the rows that has taken account of."""
@@ -348,17 +160,18 @@ class ParticleFilter:
             phase, placed = np.full(WIDTH, -1.0), 1
             if len(rows) > 1 and int(rows[1, 0]) == Kind.PHASE:
                 phase, placed = rows[1], 2
-            _place(self._rng, self.state, self._weights, rows[0], phase, pp, pv, vv)
+            place(self._rng, self.state, self._weights, rows[0], phase, pp, pv, vv)
         else:
-            _scatter(self._rng, self.state, pp, pv, vv)
+            scatter(self._rng, self.state, pp, pv, vv)
         if (guided or not self._started) and self._motion.turns_hz == 0.0:
-            self._starts = _Starts(means, noise, self.state, self.clock)
+            self._starts = Starts(means, noise, self.state, self.clock)
         self._started = True
         self._pending = np.zeros((2, 2))
         return placed
 
-    def _take(self, row: Array, *, already: bool) -> None:
-        """Weigh by a row, unless ``already`` done; times update the clocks."""
+    def _take(self, row: Array, gains: Array | None) -> None:
+        """Add the log likelihood of a row to ``gains`` unless it has been taken account of; times
+        update the clocks."""
         variance, gain = row[2] ** 2, np.zeros(2)
         if int(row[0]) == Kind.TOA:
             P = self.clock_cov
@@ -368,14 +181,14 @@ class ParticleFilter:
             self.clock_cov = A @ P @ A.T + np.outer(gain, gain) * row[2] ** 2
         if self._starts is not None:
             self._starts.take(row, variance, gain)
-        if not already:
-            _weigh(row, self.state, self.clock, self._weights, variance, gain[0], gain[1])
+        if gains is not None:
+            weigh(row, self.state, self.clock, gains, variance, gain[0], gain[1])
 
-    def _resample(self) -> None:
-        """Draw particles of equal weight."""
-        if np.ptp(self._weights) > 0.0:
-            index = _systematic(self._rng.random(), self.probability)
-            self.state, self.clock = self.state[index], self.clock[index]
-            if self._starts is not None:
-                self._starts.choose(index)
+    def _resample(self) -> npt.NDArray[np.int64]:
+        """Draw particles of equal weight; the index of each among the old ones."""
+        index = systematic(self._rng.random(), self.probability)
+        self.state, self.clock = self.state[index], self.clock[index]
+        if self._starts is not None:
+            self._starts.choose(index)
         self._weights[:] = 0.0
+        return index
