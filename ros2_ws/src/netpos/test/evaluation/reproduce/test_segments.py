@@ -58,9 +58,7 @@ def test_a_track_that_was_lost_comes_back_as_in_the_tracker(seed: int) -> None:
 def test_defaults_keep_facts_only() -> None:
     config = Setup(LOSING).config
     assert config == TrackerConfig(require_initial_pose=True)
-    imu = Setup(
-        Experiment(name="x", scenario="intersection_turn", estimator="defaults")
-    ).config
+    imu = Setup(Experiment(name="x", scenario="intersection_turn", estimator="defaults")).config
     assert imu == TrackerConfig(motion_model="inertial", require_initial_pose=True)
     assert set(FACTS) == {"require_initial_pose", "device_height_m", "motion_model"}
 
