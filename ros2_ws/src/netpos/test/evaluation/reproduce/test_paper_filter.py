@@ -88,9 +88,7 @@ def _filterpy(route: dict[str, Any], noise: PaperNoise) -> tuple[Array, Array]:
     [PaperNoise(), PaperNoise(velocity_sd_mps=0.0, accel_sd_mps2=2.0, drift_sd=1e-6)],
 )
 def test_it_is_the_textbook_filter(route: dict[str, Any], noise: PaperNoise) -> None:
-    done, means, covs = run_paper_filter(
-        *route["epochs"][:3], route["mean"], route["cov"], noise
-    )
+    done, means, covs = run_paper_filter(*route["epochs"][:3], route["mean"], route["cov"], noise)
     expected, expected_covs = _filterpy(route, noise)
     assert done == len(expected) > 600
     np.testing.assert_allclose(means[:, :2], expected[:, :2], rtol=0, atol=1e-5)
@@ -104,9 +102,7 @@ def test_a_run_starts_from_the_pose_and_sees_the_measurements_of_ours(
     route: dict[str, Any],
 ) -> None:
     track = Setup(PAPER).run(route["simulation"].scenario.seed)
-    _, means, _ = run_paper_filter(
-        *route["epochs"][:3], route["mean"], route["cov"], PaperNoise()
-    )
+    _, means, _ = run_paper_filter(*route["epochs"][:3], route["mean"], route["cov"], PaperNoise())
     np.testing.assert_array_equal(track.mean, means)
     assert track.losses == 0
     assert track.tracked.all()
