@@ -10,6 +10,7 @@ gives, and then of netpos. The first seed is one that no reproduction scores.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from netpos.evaluation.reproduce.experiment import Estimator, Experiment
@@ -73,12 +74,12 @@ def _cell(summary: Summary) -> str:
     return f"{summary.rmse_m:.2f} m, {summary.clock_sd_ns:.1f} ns{lost}"
 
 
-def table(work: Work, candidates: tuple[Candidate, ...] = CANDIDATES) -> list[str]:
+def table(work: Work, candidates: tuple[Candidate, ...] = CANDIDATES) -> Iterator[str]:
     """Lines of a table: a candidate a line, the paper's filter and ours per interval."""
     experiments = [experiment for experiment, _, _ in METIS]
     heads = [f"{e.name}, {who}" for who in ("paper's filter", "netpos") for e in experiments]
     paper = [f"{rmse_m} m, {clock_ns:g} ns" for _, rmse_m, clock_ns in METIS]
-    lines = [["errors", *heads], ["---"] * 7, ["the paper", *paper, "", "", ""]]
+    yield from map(_line, (["errors", *heads], ["---"] * 7, ["the paper", *paper, "", "", ""]))
     estimators: tuple[Estimator, ...] = ("paper", "scenario")
     for candidate in candidates:
         cells = [
@@ -86,8 +87,11 @@ def table(work: Work, candidates: tuple[Candidate, ...] = CANDIDATES) -> list[st
             for estimator in estimators
             for experiment in experiments
         ]
-        lines.append([candidate.name, *cells])
-    return [f"| {' | '.join(cells)} |" for cells in lines]
+        yield _line([candidate.name, *cells])
+
+
+def _line(cells: list[str]) -> str:
+    return f"| {' | '.join(cells)} |"
 
 
 def main() -> None:
@@ -97,7 +101,8 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=None)
     options = parser.parse_args()
     with Work(options.runs, FIRST_SEED, options.workers) as work:
-        print("\n".join(table(work)))
+        for line in table(work):
+            print(line, flush=True)
 
 
 if __name__ == "__main__":
