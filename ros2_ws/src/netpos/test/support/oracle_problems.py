@@ -360,8 +360,7 @@ def _phase_step(rng: np.random.Generator, time_s: float, state: Array, scored: b
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Name and draw; ``factor`` times as many particles as the others, where starts are not
-    moved."""
+    """Name and draw; ``factor``: it takes so many times the particles of the others."""
 
     name: str
     draw: Callable[..., Case]
@@ -372,7 +371,7 @@ PROBLEMS = {
     1: Problem("first fix from four anchors on a car", first_fix),
     2: Problem("the same anchors after 20 s of silence", silence),
     3: Problem("passing one RSU, clock unknown", pass_by),
-    4: Problem("phase sectors", phase_sectors),
+    4: Problem("phase sectors", phase_sectors, 2),
     5: Problem("undeclared turns, one RSU", turn, 5),
     6: Problem("blocked paths, 30 %", blocked_paths),
 }
