@@ -1,9 +1,9 @@
-# netpos: make setup | demo | test | lint | bench | clean
+# netpos: make setup | demo | test | lint | baselines | bench | clean
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 SHELL_FILES := env.sh $(wildcard scripts/*.sh) scripts/ros2_standin/ros2 $(wildcard docker/*.sh) .ci/run
 
-.PHONY: help setup demo test test-unit test-integration lint bench clean
+.PHONY: help setup demo test test-unit test-integration baselines lint bench clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 20
@@ -25,6 +25,9 @@ test-integration: setup ## the real processes, started with ros2 run
 
 lint: setup ## ruff, mypy, shellcheck
 	@. ./env.sh && ruff check . && ruff format --check . && mypy && shellcheck -x $(SHELL_FILES)
+
+baselines: setup ## rewrite the figures the tests hold scenarios and recordings to; read the diff before committing it
+	@. ./env.sh && python scripts/baselines.py
 
 bench: setup ## speed as ratios measured in one run
 	@. ./env.sh && netpos bench

@@ -1,7 +1,10 @@
-"""Measure dead reckoning on the public recordings: python scripts/pdr_results.py [DATA_FOLDER]."""
+"""Measure dead reckoning on the public recordings:
+python scripts/pdr_results.py [DATA_FOLDER] [--json FILE]."""
 
 from __future__ import annotations
 
+import argparse
+import json
 import os
 import sys
 from collections.abc import Iterator
@@ -109,14 +112,25 @@ def attitude_rows(data: Path) -> Iterator[Row]:
 def main() -> None:
     """Print the table; exit 1 where a recording is absent."""
     default = Path(__file__).resolve().parents[1].parent / "shared" / "data"
-    data = Path(sys.argv[1] if len(sys.argv) > 1 else os.environ.get("NETPOS_DATA", default))
+    parser = argparse.ArgumentParser(description=__doc__)
+    folder = os.environ.get("NETPOS_DATA", default)
+    parser.add_argument("data", nargs="?", type=Path, default=folder, help="folder of recordings")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows as JSON")
+    arguments = parser.parse_args()
+    data, recorded = Path(arguments.data), []
     print("| what | measured | error | aim | met |\n|---|---|---|---|---|")
     try:
         for rows in (step_rows, contact_rows, walk_rows, attitude_rows):
             for name, text, error, aim, met in rows(data):
                 print(f"| {name} | {text} | {error} | {aim} | {'yes' if met else '**no**'} |")
+                ok = bool(met) if aim else None
+                recorded.append(
+                    {"name": name, "ours": text, "error": error, "target": aim, "ok": ok}
+                )
     except FileNotFoundError as error:
         sys.exit(f"netpos: {error}")
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps({"rows": recorded}, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ _LEVELS = {
     TrackState.INITIALISING: DiagnosticStatus.WARN,
     TrackState.TRACKING: DiagnosticStatus.OK,
     TrackState.COASTING: DiagnosticStatus.WARN,
+    TrackState.AMBIGUOUS: DiagnosticStatus.WARN,
 }
 
 
@@ -102,7 +103,8 @@ def _device(tracker: str, status: TrackStatus, silent_s: float) -> Any:
         **_steps(status.steps),
         **{f"rejected: {reason}": str(n) for reason, n in sorted(status.rejected.items())},
     }
-    state = status.state.name.lower()
+    places = [f"{100 * m.weight:.0f} % at ({m.x_m:.1f}, {m.y_m:.1f}) m" for m in status.modes]
+    state = status.state.name.lower() + (f": {', '.join(places)}" if places else "")
     return DiagnosticStatus(
         level=DiagnosticStatus.STALE if silent_s else _LEVELS[status.state],
         name=f"{tracker}: {status.vue_id}",

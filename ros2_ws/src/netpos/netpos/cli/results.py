@@ -32,6 +32,14 @@ def evaluate(
             "--errors", metavar="FILE", help="Draw errors against time: .png, .svg or .pdf."
         ),
     ] = None,
+    bounds_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--bounds",
+            metavar="FILE",
+            help="Draw the error beside its bounds: .png, .svg or .pdf.",
+        ),
+    ] = None,
     skip: Annotated[int, typer.Option(help="Estimates at the start that do not count.")] = 20,
     vue: Annotated[str | None, typer.Option(help="Only this device.")] = None,
 ) -> None:
@@ -45,16 +53,26 @@ def evaluate(
     evaluation = evaluate_bag(bag, skip=skip, vue=vue)
     if json_file is not None:
         write_json(json_file, evaluation.to_json())
-    if map_file is not None or errors_file is not None:
-        from netpos.evaluation.pictures import draw_errors, draw_map, save  # noqa: PLC0415
-
-        if map_file is not None:
-            save(draw_map(evaluation), map_file)
-        if errors_file is not None:
-            save(draw_errors(evaluation), errors_file)
+    pictures = (("map", map_file), ("errors", errors_file), ("bounds", bounds_file))
+    _draw(evaluation, {kind: path for kind, path in pictures if path is not None})
     console = Console()
     for table in tables(evaluation):
         console.print(table)
+
+
+def _draw(evaluation: Evaluation, files: dict[str, Path]) -> None:
+    if not files:
+        return
+    from netpos.evaluation.pictures import (  # noqa: PLC0415 - slow to load
+        draw_bounds,
+        draw_errors,
+        draw_map,
+        save,
+    )
+
+    draw = {"map": draw_map, "errors": draw_errors, "bounds": draw_bounds}
+    for kind, path in files.items():
+        save(draw[kind](evaluation), path)
 
 
 def report(
@@ -168,7 +186,7 @@ def bench_table(results: Iterable[Result]) -> Table:
     from rich.markup import escape  # noqa: PLC0415
     from rich.table import Table  # noqa: PLC0415
 
-    from netpos.evaluation.bench import Row  # noqa: PLC0415
+    from netpos.evaluation.bench import Row, quantity  # noqa: PLC0415
 
     table = Table("what", "ours", "reference", "", "ratio", "target", "")
     for row in results:
@@ -195,12 +213,3 @@ def bench_remarks(results: Iterable[Result]) -> list[str]:
         for r in results
         if isinstance(r, LeftOut) or r.note
     ]
-
-
-def quantity(value: float, unit: str) -> str:
-    """A figure with its unit; seconds in the prefix that suits them."""
-    if unit == "s":
-        for limit, factor, name in ((1e-3, 1e6, "µs"), (1.0, 1e3, "ms")):
-            if abs(value) < limit:
-                return f"{value * factor:.3g} {name}"
-    return f"{value:.4g} {unit}".rstrip()

@@ -4,14 +4,18 @@ against time. No display is needed.
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from PIL import Image
 from scipy.stats import chi2
 
 from netpos.evaluation.evaluate import Evaluation, VueEvaluation
@@ -20,6 +24,8 @@ from netpos.evaluation.pairing import Trajectory, wrap_angle
 from netpos.messages.values import Array
 
 FORMATS = (".png", ".svg", ".pdf")
+PNG_DPI = 110
+PNG_COLOURS = 64
 ELLIPSE_PROBABILITY = 0.95
 ELLIPSES_PER_TRACK = 45
 LABELLED_RSUS = 14
@@ -29,14 +35,30 @@ RSU_COLOUR = "#117733"
 BUILDING_COLOUR = "#E4E0D8"
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, SVG or PDF, by the file's suffix; ValueError for another."""
-    if path.suffix.lower() not in FORMATS:
+def save(figure: Figure, path: Path, description: str = "") -> None:
+    """Write a figure as PNG, SVG or PDF, by the file's suffix; ValueError for another.
+
+    Files are small (a PNG has a palette of 64 colours), and the same figure gives the same SVG. An
+    SVG carries ``description`` as text.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
         raise ValueError(
             f"{path}: pictures are written as {', '.join(FORMATS)}; choose one of these"
         )
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=160, bbox_inches="tight", pad_inches=0.15)
+    frame: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.15}
+    if suffix == ".png":
+        drawn = io.BytesIO()
+        figure.savefig(drawn, format="png", dpi=PNG_DPI, **frame)
+        image = Image.open(drawn).convert("RGB")
+        image.quantize(PNG_COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
+    elif suffix == ".svg":
+        about = {"Date": None, "Description": description or None}
+        with rc_context({"svg.hashsalt": "netpos"}):
+            figure.savefig(path, metadata=about, **frame)
+    else:
+        figure.savefig(path, **frame)
 
 
 def ellipse_axes(
@@ -165,8 +187,11 @@ def _draw_track(
         zorder=3,
     )
     axes.plot(*estimate.position[0, :2], "o", mfc="white", mec=colour, ms=6, zorder=4)
-    shown = estimate.take(np.unique(np.linspace(0, n - 1, ELLIPSES_PER_TRACK).astype(np.int64)))
-    return handles + _draw_ellipses(axes, shown, colour, extent_m)
+    first = int(np.searchsorted(estimate.stamp_ns, vue.scored.from_ns))
+    if first < n:
+        chosen = np.unique(np.linspace(first, n - 1, ELLIPSES_PER_TRACK).astype(np.int64))
+        handles += _draw_ellipses(axes, estimate.take(chosen), colour, extent_m)
+    return handles
 
 
 def _draw_ellipses(axes: Axes, shown: Trajectory, colour: str, extent_m: float) -> list[Line2D]:
@@ -205,7 +230,8 @@ def _draw_ellipses(axes: Axes, shown: Trajectory, colour: str, extent_m: float) 
 
 def draw_map(evaluation: Evaluation) -> Figure:
     """Plan view in map axes: buildings, RSUs, true and estimated tracks, 95 % ellipses evenly
-    along each track, enlarged (the legend says by how much) where they would be lost.
+    along the scored part of each track, enlarged (the legend says by how much) where they would
+    be lost.
 
     A hollow dot marks the first estimate. Estimates outside the view are counted below it.
     """
@@ -319,3 +345,39 @@ def draw_errors(evaluation: Evaluation) -> Figure:
     for index, (name, vue) in enumerate(evaluation.vues.items()):
         _draw_column(grid[:, index], name, vue, TRACK_COLOURS[index % len(TRACK_COLOURS)])
     return figure
+
+
+def draw_bounds(evaluation: Evaluation) -> Figure:
+    """Horizontal error against time beside what the tracker says of it, a panel per device: the
+    longer half axis of the 95 % ellipse, and the protection level where one was told.
+
+    The scale is logarithmic; estimates that are not scored are left out.
+    """
+    n = len(evaluation.vues)
+    figure = Figure(figsize=(8.0, 0.6 + 2.8 * n), layout="constrained")
+    panels = figure.subplots(n, 1, sharex=True, squeeze=False)[:, 0]
+    for index, (axes, (name, vue)) in enumerate(zip(panels, evaluation.vues.items(), strict=True)):
+        _draw_bound_panel(axes, vue, TRACK_COLOURS[index % len(TRACK_COLOURS)])
+        axes.set_ylabel(f"{name}\nposition error [m]" if n > 1 else "position error [m]")
+    panels[-1].set_xlabel("time since the start of the ground truth [s]")
+    return figure
+
+
+def _draw_bound_panel(axes: Axes, vue: VueEvaluation, colour: str) -> None:
+    counted = vue.scored.counted
+    t = (counted.estimate.stamp_ns - int(vue.run.truth.stamp_ns[0])) / NS
+    told = {s.stamp_ns: s.protection_level_m for s in vue.run.statuses}
+    level = np.array([told.get(stamp, -1.0) for stamp in counted.estimate.stamp_ns.tolist()])
+    if (level > 0.0).any():
+        level = np.where(level > 0.0, level, np.nan)
+        axes.plot(t, level, color=TRACK_COLOURS[1], lw=1.2, label="protection level")
+    major, _, _ = ellipse_axes(counted.estimate.position_cov[:, :2, :2])
+    if major.any():
+        axes.plot(t, major / 2.0, color="black", lw=1.2, ls="--", label="95 % ellipse, half axis")
+    axes.plot(t, counted.horizontal_error, color=colour, lw=0.8, label="error")
+    axes.set_yscale("log")
+    if counted.horizontal_error.size:
+        axes.set_ylim(bottom=max(0.1 * float(np.median(counted.horizontal_error)), 1e-4))
+    axes.grid(color="#DDDDDD", lw=0.5)
+    axes.margins(x=0.01)
+    axes.legend(frameon=False, fontsize=9, ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0))

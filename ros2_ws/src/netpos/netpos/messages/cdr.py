@@ -307,4 +307,7 @@ class CdrCodec:
             value.steps.length_factor_sd,
             value.steps.heading_offset_rad,
             value.steps.heading_offset_sd_rad,
+            [mode.weight for mode in value.modes],
+            [mode.x_m for mode in value.modes],
+            [mode.y_m for mode in value.modes],
         )

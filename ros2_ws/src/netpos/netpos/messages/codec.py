@@ -26,6 +26,7 @@ from netpos.messages.values import (
     RsuMeasurement,
     Step,
     StepCalibration,
+    TrackMode,
     TrackState,
     TrackStatus,
 )
@@ -191,6 +192,9 @@ class Codec(CommonCodec):
             step_length_factor_sd=float(status.steps.length_factor_sd),
             step_heading_offset=float(status.steps.heading_offset_rad),
             step_heading_offset_sd=float(status.steps.heading_offset_sd_rad),
+            mode_weights=np.array([mode.weight for mode in status.modes], dtype=np.float64),
+            mode_x=np.array([mode.x_m for mode in status.modes], dtype=np.float64),
+            mode_y=np.array([mode.y_m for mode in status.modes], dtype=np.float64),
         )
 
     @staticmethod
@@ -210,6 +214,7 @@ class Codec(CommonCodec):
             position_sd_m=float(msg.position_sd),
             protection_level_m=float(msg.protection_level),
             steps=_step_calibration(msg),
+            modes=_modes(msg),
         )
 
     def step_to_msg(self, step: Step) -> Any:
@@ -225,6 +230,17 @@ class Codec(CommonCodec):
             heading_var=float(step.heading_var),
             cadence=float(step.cadence_hz),
         )
+
+
+def _modes(msg: Any) -> tuple[TrackMode, ...]:
+    """Modes of a netpos_msgs/TrackStatus; recordings may be older than that."""
+    if not hasattr(msg, "mode_weights"):
+        return ()
+    columns = (msg.mode_weights, msg.mode_x, msg.mode_y)
+    return tuple(
+        TrackMode(weight=float(w), x_m=float(x), y_m=float(y))
+        for w, x, y in zip(*columns, strict=True)
+    )
 
 
 def _step_calibration(msg: Any) -> StepCalibration:

@@ -41,6 +41,7 @@ class TrackState(IntEnum):
     INITIALISING = 1
     TRACKING = 2
     COASTING = 3
+    AMBIGUOUS = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -191,6 +192,15 @@ class StepCalibration:
     heading_offset_sd_rad: float = 0.0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackMode:
+    """One of several places where a device may be: its probability and its position in map."""
+
+    weight: float
+    x_m: float
+    y_m: float
+
+
 @dataclass(slots=True, kw_only=True)
 class TrackStatus:
     """Health of one track at one epoch; counts since start."""
@@ -207,6 +217,8 @@ class TrackStatus:
     position_sd_m: float = 0.0
     protection_level_m: float = -1.0
     steps: StepCalibration = StepCalibration()
+    modes: tuple[TrackMode, ...] = ()
+    """While it is AMBIGUOUS: the modes that matter, the most probable first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,7 +14,7 @@ import numpy as np
 from netpos.filters import filterpy_backend, imm
 from netpos.filters.measurement import GROUP
 from netpos.filters.motion import Parameter
-from netpos.messages.values import Array
+from netpos.messages.values import Array, TrackMode
 from netpos.tracking import engine
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.engine import Option
@@ -57,8 +57,13 @@ class Estimate(Protocol):
         """Mean and covariance predicted in the last ``step``."""
 
     @property
-    def decided(self) -> bool:
-        """Whether it is known which of several solutions is the true one."""
+    def modes(self) -> tuple[TrackMode, ...]:
+        """Where the device may be while that is not decided, the most probable place first; none
+        where it is."""
+
+    def radius(self, level_m: float) -> float:
+        """Radius [m] round ``mean`` that holds ``level_m``, the level of the Gaussian, and all
+        other places where the device may be."""
 
     @property
     def motion(self) -> Array:
@@ -66,6 +71,17 @@ class Estimate(Protocol):
 
     def copy(self) -> Estimate:
         """An independent copy."""
+
+
+class OnePlace:
+    """An estimate that is one Gaussian."""
+
+    @property
+    def modes(self) -> tuple[TrackMode, ...]:
+        return ()
+
+    def radius(self, level_m: float) -> float:
+        return level_m
 
 
 class OneModel:
@@ -85,11 +101,13 @@ class OneModel:
     def shake(self, accel_density: float) -> None:
         self._motion[Parameter.ACCEL] = accel_density
 
+    def set_motion(self, motion: Array) -> None:
+        """Go on with the parameters (Parameter,) of another estimate."""
+        self._motion = motion.copy()
 
-class Single(OneModel):
+
+class Single(OnePlace, OneModel):
     """One motion model in the compiled engine."""
-
-    decided = True
 
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
         self.stamp_ns = stamp_ns
@@ -158,10 +176,9 @@ class Single(OneModel):
         return twin
 
 
-class _Looks:
+class _Looks(OnePlace):
     """The looks of ``engine.step`` for estimates that are not one compiled step."""
 
-    decided = True
     stamp_ns: int
     mean: Array
     cov: Array

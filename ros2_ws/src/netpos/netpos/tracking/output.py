@@ -189,15 +189,22 @@ def clock_state(stamp_ns: int, vue_id: str, mean: Array, cov: Array) -> ClockSta
 
 
 def track_state(
-    config: TrackerConfig, stamp_ns: int, last_accepted_ns: int | None, position_sd_m: float
+    config: TrackerConfig,
+    stamp_ns: int,
+    last_accepted_ns: int | None,
+    position_sd_m: float,
+    *,
+    decided: bool = True,
 ) -> TrackState:
     """What a track is worth at ``stamp_ns``; last_accepted_ns : of its last accepted measurement,
-    None before the first fix; position_sd_m : along its worst axis [m], inf where it is not
-    decided."""
+    None before the first fix; position_sd_m : along its worst axis [m]; decided : whether it is
+    known which of several places is the true one."""
     if last_accepted_ns is None:
         return TrackState.WAITING
     if stamp_ns - last_accepted_ns > config.coast_after_s * 1e9:
         return TrackState.COASTING
+    if not decided:
+        return TrackState.AMBIGUOUS
     if position_sd_m > config.initial_position_sd_max_m:
         return TrackState.INITIALISING
     return TrackState.TRACKING

@@ -94,6 +94,48 @@ def protection_level(cov2: Array, risk: float, inflation: float = 1.0) -> float:
 
 
 @leaf
+def gaussian_tail(xx: float, xy: float, yy: float, radius: float) -> float:
+    """P(|e| > radius) for e ~ N(0, [[xx, xy], [xy, yy]]): what ``gaussian_radius`` inverts."""
+    small, large = eigenvalues(xx, xy, yy)
+    if radius <= 0.0:
+        return 1.0
+    if large <= 0.0:
+        return 0.0
+    u, ratio, total = radius * radius / large, max(small, 0.0) / large, 0.0
+    for i in range(_COS2.size):
+        axis = _COS2[i] + ratio * (1.0 - _COS2[i])
+        if axis > 0.0:
+            total += _WEIGHT[i] * math.exp(-0.5 * u / axis)
+    return total
+
+
+@kernel
+def mixture_radius(means: Array, covs: Array, weights: Array, centre: Array, risk: float) -> float:
+    """Radius round ``centre`` (2,) that a position with the mixture of means (K, n), covs (K, n,
+    n), weights (K,) leaves with at most the probability ``risk``.
+
+    Of a component at distance d at most the tail of its own error beyond radius - d lies outside.
+    """
+    low, high = 0.0, 0.0
+    away = np.hypot(means[:, 0] - centre[0], means[:, 1] - centre[1])
+    for k in range(weights.size):
+        P = covs[k]
+        high = max(high, away[k] + gaussian_radius(P[0, 0], P[0, 1], P[1, 1], risk))
+    while high - low > 1e-4 * high:
+        middle = 0.5 * (low + high)
+        outside = 0.0
+        for k in range(weights.size):
+            P = covs[k]
+            tail = gaussian_tail(P[0, 0], P[0, 1], P[1, 1], middle - away[k])
+            outside += weights[k] * tail
+        if outside > risk:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+@leaf
 def radius_of(cov2: Array, risk: float) -> float:
     """``gaussian_radius`` of cov2 (2, 2); not a number where it is no covariance."""
     xx, xy, yy = cov2[0, 0], cov2[0, 1], cov2[1, 1]

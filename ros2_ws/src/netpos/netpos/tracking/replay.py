@@ -72,7 +72,7 @@ def replay_bag(
                 f"{bag_in} has no {topics.RSU_MEASUREMENTS}: record that topic to replay"
             )
         metadata = {**source.metadata, **as_metadata(asdict(config), settings)}
-        tracker = _tracker(config, settings, smooth=smooth)
+        tracker = tracker_of(config, settings, smooth=smooth)
         epochs = estimates = 0
         with whole_bag(bag_out, metadata=metadata) as out:
             for name, info in source.topics.items():
@@ -105,7 +105,9 @@ def _changed(settings: TrackerSettings, overrides: Mapping[str, Any]) -> Tracker
     )
 
 
-def _tracker(config: TrackerConfig, settings: TrackerSettings, *, smooth: bool) -> Tracker | Chain:
+def tracker_of(
+    config: TrackerConfig, settings: TrackerSettings, *, smooth: bool = False
+) -> Tracker | Chain:
     """One tracker, or one for each of several networks with the fusion of their tracks."""
     if not settings.networks:
         return Tracker(config, keep_posteriors=smooth)

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from netpos.messages.values import ClockState, NetworkTrack, Odometry, StepCalibration, TrackStatus
+from netpos.messages.values import (
+    ClockState,
+    NetworkTrack,
+    Odometry,
+    StepCalibration,
+    TrackMode,
+    TrackStatus,
+)
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.output import track_state
 
@@ -58,19 +64,19 @@ def track_status(
     heard_ns: int | None = None,
     position_sd_m: float = 0.0,
     level_m: float = -1.0,
-    decided: bool = True,
+    modes: tuple[TrackMode, ...] = (),
     steps: StepCalibration | None = None,
 ) -> TrackStatus:
     """Status of a track after an ``epoch``.
 
     accepted, rejected : counts since start; heard_ns : stamp of the last accepted measurement,
-    None before the first fix; decided : whether it is known which of several solutions is true
+    None before the first fix; modes : where the device may be while that is not decided
     """
-    sd_m = position_sd_m if decided else math.inf
+    state = track_state(config, epoch.stamp_ns, heard_ns, position_sd_m, decided=not modes)
     return TrackStatus(
         stamp_ns=epoch.stamp_ns,
         vue_id=vue_id,
-        state=track_state(config, epoch.stamp_ns, heard_ns, sd_m),
+        state=state,
         nis=epoch.nis,
         nis_dof=epoch.dof,
         used=len(epoch.sources),
@@ -80,4 +86,5 @@ def track_status(
         position_sd_m=position_sd_m,
         protection_level_m=level_m,
         steps=steps or _NO_STEPS,
+        modes=modes,
     )

@@ -9,7 +9,7 @@ import numpy as np
 
 from netpos.filters.compile import leaf
 from netpos.filters.measurement import BIAS, COMMON, GROUP, KIND, Kind
-from netpos.messages.values import Array
+from netpos.messages.values import Array, TrackMode
 from netpos.tracking import engine, sector_bank
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.engine import Option
@@ -110,6 +110,22 @@ class Sectors(OneModel):
         return self._decided
 
     @property
+    def modes(self) -> tuple[TrackMode, ...]:
+        """The sectors that carry more than the integrity risk while none is decided."""
+        if self._decided:
+            return ()
+        weights, risk = self.probabilities, self._config.integrity_risk
+        return tuple(
+            TrackMode(
+                weight=float(weights[s]),
+                x_m=float(self._means[s, 0]),
+                y_m=float(self._means[s, 1]),
+            )
+            for s in np.argsort(-weights, kind="stable").tolist()
+            if weights[s] > risk
+        )
+
+    @property
     def probabilities(self) -> Array:
         """Probability of each sector (S,); they sum to one."""
         weights: Array = np.exp(self._weights)
@@ -148,11 +164,13 @@ class Sectors(OneModel):
                 )
         return self._seen
 
-    def radius(self, level_m: float, risk: float) -> float:
-        """Radius [m] round ``mean`` that also holds the rivals, all but ``risk`` of them.
+    def radius(self, level_m: float) -> float:
+        """Radius [m] round ``mean`` that also holds the rivals, all but the integrity risk of
+        them.
 
         level_m : protection level of the most probable sector alone
         """
+        risk = self._config.integrity_risk
         order = np.argsort(self._weights)
         left = risk / 2.0
         radius, centre = level_m, self.mean[:2]

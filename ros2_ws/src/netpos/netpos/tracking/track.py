@@ -29,6 +29,7 @@ from netpos.tracking.history import History, merge
 from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser, with_heading
 from netpos.tracking.memory import TrackMemory
+from netpos.tracking.mixture import MixtureEstimate, with_components
 from netpos.tracking.models import heading_index, initial_extra_sd, options_of, pose_state
 from netpos.tracking.networks.secondary import Secondary
 from netpos.tracking.observations import FittedEpoch
@@ -36,7 +37,6 @@ from netpos.tracking.phase_start import PhaseStart, corrections, with_sectors
 from netpos.tracking.report import Applied, TrackOutput, total, track_status
 from netpos.tracking.rivals import Rivals
 from netpos.tracking.rsus import BiasStates, Rsu
-from netpos.tracking.sectors import Sectors
 from netpos.tracking.sequencer import Epoch, Item
 from netpos.tracking.smoothing import FixedLag, Posterior, Smoother
 from netpos.tracking.steadiness import Steadiness
@@ -119,7 +119,7 @@ class Track:
                 gap_s = (epoch.stamp_ns - estimate.stamp_ns) * 1e-9
                 if gap_s > self._config.max_gap_s:
                     self._forget()
-            items, watched = self._split(epoch.stamp_ns, items)
+            items, watched = self._sorted_out(epoch.stamp_ns, items)
             if items:
                 applied = self._apply(epoch.stamp_ns, items)
             if watched:
@@ -130,7 +130,7 @@ class Track:
         """Keep the posterior and add what the smoother makes of it."""
         state, estimate = self._state, self._state.estimate
         unkept = self._fixed_lag is None and self.posteriors is None
-        if estimate is None or unkept or not estimate.decided:
+        if estimate is None or unkept or estimate.modes:
             return result
         posterior = Posterior.of(estimate, state.segment, state.bias)
         if self.posteriors is not None:
@@ -166,7 +166,7 @@ class Track:
             return Applied(stamp_ns, sources=self._try_first_fix(stamp_ns, batch))
         return self._update(stamp_ns, batch)
 
-    def _split(
+    def _sorted_out(
         self, stamp_ns: int, items: list[Source]
     ) -> tuple[list[Source], list[RsuMeasurement]]:
         """What may be fused, and what comes from an isolated RSU and is only looked at."""
@@ -226,7 +226,7 @@ class Track:
     def _update(self, stamp_ns: int, batch: Batch) -> Applied:
         state = self._state
         state.estimate = with_sectors(self._config, state.estimate, batch.rows)
-        estimate = self._prepare(stamp_ns, batch.items)
+        estimate = self._split(stamp_ns, self._prepare(stamp_ns, batch.items), batch.rows)
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
         blocked = self._config.nlos_probability > 0.0
         if blocked:
@@ -253,6 +253,16 @@ class Track:
         sources = self._note_accepted(stamp_ns, batch, accepted) if dof > 0 else ()
         self._note_misfit(not refused or mostly_accepted(batch, accepted))
         return Applied(stamp_ns, nis, dof, sources)
+
+    def _split(self, stamp_ns: int, estimate: Estimate, rows: Array) -> Estimate:
+        """The estimate as a mixture where it is too wide for ``rows``; a smoother does not reach
+        from the one to the other."""
+        state = self._state
+        state.estimate = with_components(self._config, estimate, stamp_ns, rows, state.bias)
+        if state.estimate is not estimate:
+            state.segment += 1
+            state.rivals = Rivals(self._config)
+        return state.estimate
 
     def _note_misfit(self, fits: bool) -> None:
         """Count the epochs in a row that did not fit; too many, and the track is lost."""
@@ -301,7 +311,8 @@ class Track:
         if math.isnan(unnoticed_m):
             return False
         state.unnoticed_m = unnoticed_m
-        if state.rivals.present or len(accepted) == 1:
+        alone = len(accepted) == 1 and not isinstance(estimate, MixtureEstimate)
+        if state.rivals.present or alone:
             state.unnoticed_m = state.rivals.level(
                 unnoticed_m, stamp_ns, estimate, *fitted, (nis, dof), state.bias
             )
@@ -375,7 +386,7 @@ class Track:
             heard_ns=state.last_accepted_ns,
             position_sd_m=sd_m,
             level_m=self._level(epoch.stamp_ns, estimate, radius_m),
-            decided=estimate.decided,
+            modes=estimate.modes,
             steps=state.biases.step_calibration(mean, cov) if self._calibrates_steps else None,
         )
         track = None
@@ -396,5 +407,4 @@ class Track:
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
         moved = state.unnoticed_m + config.manoeuvre_speed_sd_mps * unheard_s
         level = max(level, min(moved, _LEVEL_MAX_M))
-        risk = config.integrity_risk
-        return estimate.radius(level, risk) if isinstance(estimate, Sectors) else level
+        return estimate.radius(level)

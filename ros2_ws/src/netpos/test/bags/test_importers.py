@@ -84,6 +84,19 @@ def test_ble_by_hand(tmp_path: Path) -> None:
     np.testing.assert_allclose(yaw[2:], [math.pi / 2] * 2 + [math.pi] * 5, atol=1e-12)
 
 
+def test_a_person_stands_at_a_corner_until_departure(tmp_path: Path) -> None:
+    """1 m in 0.2 s, 0.4 s of standing, 1 m in 0.2 s."""
+    corners = "1000,NaN,0,0\n1200,1600,100,0\n1800,NaN,100,100\n"
+    import_ble_aoa(ble_folder(tmp_path / "ble", truth=corners), tmp_path / "bag")
+    _, _, truth = values(tmp_path / "bag")
+    assert [t.stamp_ns // 10**6 for t in truth] == [*range(1000, 1801, 100)]
+    place = np.array([t.position[:2] for t in truth])
+    np.testing.assert_allclose(place[:, 0], [0, 0.5, 1, 1, 1, 1, 1, 1, 1], atol=1e-12)
+    np.testing.assert_allclose(place[:, 1], [0, 0, 0, 0, 0, 0, 0, 0.5, 1], atol=1e-12)
+    speeds = [t.linear_velocity[0] for t in truth]
+    assert speeds == pytest.approx([5, 5, 0, 0, 0, 0, 5, 5, 5])
+
+
 def test_uwb_by_hand(tmp_path: Path) -> None:
     counts = import_uwb_anchors(uwb_folder(tmp_path / "LOS"), tmp_path / "bag")
     assert counts == {"/rsu/info": 1, "/rsu/measurements": 2, "/vue_1/ground_truth": 3}
@@ -124,6 +137,9 @@ def test_a_heading_that_passes_180_degrees_does_not_spin() -> None:
         ("", TRUTH, "holds no data"),
         (BEACONS, TRUTH.replace("1400", "1200"), r"truth_uc1_run1.csv, line 3: time does not"),
         (BEACONS, "1,NaN,1,1\n", "holds one corner"),
+        (BEACONS, TRUTH.replace("1200,NaN", "1200,1200"), "line 2: the departure is not after"),
+        (BEACONS, TRUTH.replace("1200,NaN", "1200,1400"), "line 3: time does not increase"),
+        (BEACONS, TRUTH.replace("1200,NaN", "1200,soon"), "line 2: departure 'soon' is not"),
     ],
 )
 def test_ble_refuses(tmp_path: Path, beacons: str, truth: str, message: str) -> None:
@@ -192,7 +208,12 @@ def residuals(bag: Path) -> dict[str, Array]:
 
 @pytest.mark.parametrize(
     ("run", "beacons", "corners"),
-    [("uc1_run1", 7949, 16), ("uc1_run2", 8436, 16), ("uc2_run1", 4966, 10)],
+    [
+        ("uc1_run1", 7949, 16),
+        ("uc1_run2", 8436, 16),
+        ("uc2_run1", 4966, 10),
+        ("uc3_run1", 42365, 16),
+    ],
 )
 def test_real_ble(tmp_path: Path, run: str, beacons: int, corners: int) -> None:
     folder = DATA / "ble_aoa"

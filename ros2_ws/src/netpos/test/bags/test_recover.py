@@ -10,6 +10,7 @@ import tempfile
 import time
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -18,7 +19,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from netpos.bags import BagError, BagReader, BagWriter, codec
 from netpos.bags.qos import is_latched
-from netpos.bags.recover import recover
+from netpos.bags.recover import checksums, recover
 from netpos.bags.types import definition
 
 CLOCK = "rosgraph_msgs/msg/Clock"
@@ -157,6 +158,77 @@ def test_never_overwrites(tmp_path: Path, original: tuple[bytes, Counter]) -> No
         recover(folder)
     assert [f.name for f in (tmp_path / "run_recovered").iterdir()] == ["mine"]
     assert (folder / "run_0.mcap").read_bytes() == original[0][:-50]
+
+
+def write_clocks(folder: Path, entries: list[tuple[int, int]], seed: str = "3") -> Path:
+    """A bag of clocks (log time, time said)."""
+    with BagWriter(folder, metadata={"seed": seed}) as bag:
+        for log_time_ns, said_ns in entries:
+            bag.write("/clock", codec().clock_to_msg(said_ns), log_time_ns)
+    return folder
+
+
+def test_checksums_cover_log_times(tmp_path: Path) -> None:
+    """The same payloads and the same log times, paired the other way round."""
+    straight = checksums(write_clocks(tmp_path / "straight", [(1, 10), (2, 20)]))
+    again = checksums(write_clocks(tmp_path / "again", [(1, 10), (2, 20)]))
+    crossed = checksums(write_clocks(tmp_path / "crossed", [(1, 20), (2, 10)]))
+    assert straight == again
+    assert straight["/clock"][0] == crossed["/clock"][0] == 2
+    assert straight["/clock"][1] != crossed["/clock"][1]
+
+
+def test_files_are_joined_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    """Of messages with one log time the earlier file's come first; what the last file says of the
+    run counts. As text, run_10 comes before run_9."""
+    (tmp_path / "run").mkdir()
+    for number in (2, 9, 10, 11):
+        bag = write_clocks(tmp_path / f"part_{number}", [(5, number)], str(number))
+        shutil.move(bag / f"part_{number}_0.mcap", tmp_path / "run" / f"run_{number}.mcap")
+    report = recover(tmp_path / "run")
+    assert report.messages == 4
+    with BagReader(report.output) as reader:
+        assert [e.message.clock.nanosec for e in reader.messages()] == [2, 9, 10, 11]
+        assert reader.metadata["seed"] == "11"
+
+
+def test_a_recovery_that_fails_half_way_leaves_nothing(
+    tmp_path: Path, original: tuple[bytes, Counter], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk is full after ten messages; once there is room, recovery works."""
+    folder = damaged(tmp_path, original[0][:-50])
+    write_raw, room = BagWriter.write_raw, iter(range(10))
+
+    def write_until_full(self: BagWriter, *entry: Any) -> None:
+        if next(room, None) is None:
+            assert (tmp_path / "run_recovered").is_dir()
+            raise OSError("no space left on device")
+        write_raw(self, *entry)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(BagWriter, "write_raw", write_until_full)
+        with pytest.raises(OSError, match="no space left"):
+            recover(folder)
+    assert sorted(f.name for f in tmp_path.iterdir()) == ["run"]
+    assert content(recover(folder).output) == original[1]
+
+
+def test_a_recovery_that_does_not_read_back_as_written_is_discarded(
+    tmp_path: Path, original: tuple[bytes, Counter], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A writer that notes other log times."""
+    folder = damaged(tmp_path, original[0][:-50])
+    write_raw = BagWriter.write_raw
+
+    def write_late(
+        self: BagWriter, topic: str, type_name: str, cdr: bytes, log_ns: int, sent_ns: int
+    ) -> None:
+        write_raw(self, topic, type_name, cdr, log_ns + 1, sent_ns)
+
+    monkeypatch.setattr(BagWriter, "write_raw", write_late)
+    with pytest.raises(BagError, match="did not read back as written"):
+        recover(folder)
+    assert sorted(f.name for f in tmp_path.iterdir()) == ["run"]
 
 
 CDR = b"\0\1\0\0" + bytes(8)

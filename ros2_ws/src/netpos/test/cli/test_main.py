@@ -55,10 +55,13 @@ def test_evaluate_shows_units_and_values(netpos: Netpos, bag: Path) -> None:
 
 
 def test_evaluate_draws(netpos: Netpos, bag: Path, tmp_path: Path) -> None:
-    pictures = tmp_path / "map.png", tmp_path / "errors.svg"
-    assert netpos("evaluate", bag, "--map", pictures[0], "--errors", pictures[1]).exit_code == 0
-    assert pictures[0].read_bytes().startswith(b"\x89PNG")
-    assert b"<svg" in pictures[1].read_bytes()
+    drawn, errors, bounds = (tmp_path / name for name in ("map.png", "errors.svg", "bounds.svg"))
+    pictures = ("--map", drawn, "--errors", errors, "--bounds", bounds)
+    assert netpos("evaluate", bag, *pictures).exit_code == 0
+    assert drawn.read_bytes().startswith(b"\x89PNG")
+    assert b"<svg" in errors.read_bytes()
+    assert b"<svg" in bounds.read_bytes()
+    assert errors.read_bytes() != bounds.read_bytes()
 
 
 @pytest.mark.parametrize("command", ["evaluate", "recover"])

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from netpos.cli.main import app
-from netpos.cli.results import bench_remarks, quantity
+from netpos.cli.results import bench_remarks
 from netpos.evaluation import bench as package
 from netpos.evaluation.bench import PARTS, as_json, bench, chosen
 from netpos.evaluation.bench.common import (
@@ -18,6 +18,7 @@ from netpos.evaluation.bench.common import (
     Unavailable,
     faster,
     growth_exponent,
+    quantity,
     side_by_side,
     within,
 )

@@ -17,6 +17,7 @@ from netpos.inertial.steps import (
     amplitude_response,
     band_pass_kernel,
 )
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 G = 9.80665
@@ -300,3 +301,60 @@ def test_reset_forgets_an_open_bout() -> None:
 def test_bad_config_names_the_value(bad: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(bad))):
         StepConfig(**bad)
+
+
+def streamed(t: np.ndarray, vertical: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps (n,) and force (n, 3) of a vertical acceleration (n,) over gravity at times (n,)."""
+    force = np.column_stack([np.zeros((t.size, 2)), G + vertical])
+    return np.rint(t * 1e9).astype(np.int64), force
+
+
+def test_impacts_are_dated_without_a_lag() -> None:
+    """Jumps of the force at any phase of the 20 ms cells: found half a sample before the first
+    sample after the jump, on the average; half a cell is 10 ms."""
+    jumps = 4.0 + np.cumsum(np.random.default_rng(2).uniform(0.55, 0.75, 60))
+    t = np.arange(0.0, jumps[-1] + 3.0, 0.01)
+    after = np.searchsorted(t, jumps)
+    config = StepConfig.waist()
+    steps = detect(*streamed(t, 2.0 * (np.searchsorted(jumps, t) % 2)), config)
+    found = ends(steps) - config.contact_lag_s
+    assert found.size == jumps.size
+    late = found - (t[after] - 0.005)
+    assert np.abs(late).max() <= 0.5 * CELL_S
+    assert abs(late.mean()) < 0.003
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.95, 9), (1.05, 8)])
+def test_a_rebound_is_no_step(share: float, expected: int) -> None:
+    """Eight steps, then a dip and the low rise after it: counted only where its height is at least
+    ``min_height_fraction`` of its prominence, both taken from the band-passed signal."""
+    cadence_hz = 1.8
+    t = np.arange(0.0, 12.0, CELL_S)
+    last = START_S + 7.5 / cadence_hz
+    edge = np.minimum(t - START_S, START_S + 8 / cadence_hz - t) * cadence_hz
+    walk = np.clip(edge + 0.25, 0.0, 1.0) * np.cos(2 * np.pi * cadence_hz * (t - START_S))
+    vertical = -3.0 * walk - 4.0 * np.exp(-0.5 * ((t - last - 0.4) / 0.12) ** 2)
+    gravity = lfilter([CELL_S], [1.0, CELL_S - 1.0], vertical)  # its change, low-passed with 1 s
+    band = np.convolve(vertical - gravity, band_pass_kernel(0.08, 0.4, 0.5), "same")
+    valley = band[(t > last) & (t < last + 0.6)].min()
+    height = band[(t > last + 0.5) & (t < last + 1.3)].max()
+    config = StepConfig(min_height_fraction=share * height / (height - valley))
+    assert len(detect(*streamed(t, vertical), config)) == expected
+
+
+def test_a_bounce_is_the_rise_from_the_valley_to_the_step() -> None:
+    """A limp: the vertical rises from -3 to 3 and from -1 to 1 m/s^2 in turn. Counted with the
+    fall from the peak before, or from the deeper valley before, the small ones would be 4. The
+    band-pass takes a part of what alternates."""
+    cadence_hz, turning = 1.8, np.tile([-3.0, 3.0, -1.0, 1.0], 14)
+    in_halves = np.arange(0.0, 14 * 4 - 1, 0.01 * 2 * cadence_hz)
+    which = in_halves.astype(int)
+    share = 0.5 * (1.0 - np.cos(np.pi * (in_halves - which)))
+    vertical = turning[which] * (1.0 - share) + turning[which + 1] * share
+    t = np.arange(vertical.size) * 0.01
+    middle = detect(*streamed(t, vertical))[6:20]
+    peak_at = (np.array([s.end_ns for s in middle]) * 1e-9 + 0.05) * 2 * cadence_hz
+    expected = np.where(np.round(peak_at).astype(int) % 4 == 1, 6.0, 2.0)
+    bounce = np.array([s.bounce_mps2 for s in middle])
+    assert set(expected) == {2.0, 6.0}
+    np.testing.assert_allclose(bounce, expected, atol=0.9)

@@ -20,6 +20,7 @@ from netpos.messages.values import (
     Odometry,
     RsuMeasurement,
     StepCalibration,
+    TrackMode,
     TrackState,
     TrackStatus,
 )
@@ -95,6 +96,9 @@ statuses = st.builds(
         length_factor_sd=doubles,
         heading_offset_rad=doubles,
         heading_offset_sd_rad=doubles,
+    ),
+    modes=st.lists(st.builds(TrackMode, weight=doubles, x_m=doubles, y_m=doubles), max_size=4).map(
+        tuple
     ),
 )
 
@@ -275,7 +279,17 @@ def test_types_are_flattened_to_their_fields() -> None:
     assert list(flat_items("netpos_msgs/msg/ClockState")) == [*header, "d", "d", "4d"]
     assert list(flat_items("netpos_msgs/msg/Beacon")) == [*header, "string", "I", *"dddd"]
     status = list(flat_items("netpos_msgs/msg/TrackStatus"))
-    assert status == [*header, *"BdIIQQ", "string[]", "Q[]", "string[]", *"dddddd"]
+    assert status == [
+        *header,
+        *"BdIIQQ",
+        "string[]",
+        "Q[]",
+        "string[]",
+        *"dddddd",
+        "d[]",
+        "d[]",
+        "d[]",
+    ]
     with pytest.raises(BagError, match="transforms cannot be laid out"):
         list(flat_items("tf2_msgs/msg/TFMessage"))
 

@@ -26,6 +26,7 @@ from netpos.messages.values import (
     RsuMeasurement,
     Step,
     StepCalibration,
+    TrackMode,
     TrackState,
     TrackStatus,
     Velocity,
@@ -126,6 +127,7 @@ STATUS = TrackStatus(
         heading_offset_rad=-0.3,
         heading_offset_sd_rad=0.04,
     ),
+    modes=(TrackMode(weight=0.7, x_m=1.0, y_m=-2.0), TrackMode(weight=0.3, x_m=3.0, y_m=4.0)),
 )
 ODOMETRY = Odometry(
     stamp_ns=STAMP,

@@ -6,7 +6,16 @@ import math
 
 import numpy as np
 import pytest
-from netpos.radio.measure import ALWAYS_VISIBLE, Errors, Sight, Sites, observe
+from netpos.radio.arrays import AntennaArray, direction_bound
+from netpos.radio.measure import (
+    ALWAYS_VISIBLE,
+    AZIMUTH,
+    ELEVATION,
+    Errors,
+    Sight,
+    Sites,
+    observe,
+)
 from netpos.radio.noise import stream_key
 from netpos.world.buildings import line_of_sight
 
@@ -110,3 +119,37 @@ def test_a_number_of_rsus_is_drawn_for_each_beacon() -> None:
         assert seen.rsu[i].tolist() == [*range(seen.heard_by[i])] + [-1] * (8 - seen.heard_by[i])
     again = observe(stamps[7:], np.zeros((n - 7, 3)), np.zeros(n - 7), sites, nearest, FIXED)
     np.testing.assert_array_equal(again.heard_by, seen.heard_by[7:])
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(4, 16), (16, 4)])
+def test_azimuth_and_elevation_have_each_its_own_bound(rows: int, columns: int) -> None:
+    """Variances and scatter of both, against the bound of the array; a planar array of 4 rows and
+    16 columns tells the azimuth better than the elevation, the other one worse."""
+    array = AntennaArray(kind="planar", rows=rows, columns=columns)
+    errors = FIXED._replace(
+        with_elevation=True,
+        snr_at_0_db_loss=1e10,
+        path_loss=np.array([20.0, 30.0, math.inf, 0.0, 0.0]),
+        second_moment=array.second_moment(),
+        rms_bandwidth_hz=1e6,
+    )
+    azimuth, elevation, away, n = 0.5, 0.3, 40.0, 4000
+    flat = away * math.cos(elevation)
+    place = [
+        flat * math.cos(azimuth),
+        flat * math.sin(azimuth),
+        away * math.sin(elevation),
+    ]
+    sight = Sight(1, math.inf, np.zeros((0, 4)), ALWAYS_VISIBLE, 50.0, 1.5)
+    sites = _sites(np.zeros((1, 2)))
+    seen = observe(np.arange(1, n + 1), np.tile(place, (n, 1)), np.zeros(n), sites, sight, errors)
+    snr = 1e10 * 10.0 ** (-(20.0 + 30.0 * math.log10(away)) / 10.0)
+    bound = np.diag(direction_bound(array, snr, azimuth, elevation))
+    better, worse = sorted(bound)
+    assert better < 0.5 * worse
+    assert (better == bound[0]) == (columns > rows)
+    both = [AZIMUTH, ELEVATION]
+    np.testing.assert_allclose(seen.variances[0, 0, both], bound, rtol=1e-9)
+    scatter = seen.values[:, 0, both] - [azimuth, elevation]
+    four_sd = 4.0 * math.sqrt(2.0 / n)
+    np.testing.assert_allclose((scatter**2).mean(axis=0), bound, rtol=four_sd)

@@ -114,21 +114,23 @@ def test_largest_sd() -> None:
 
 
 @pytest.mark.parametrize(
-    ("heard_ns", "position_sd", "expected"),
+    ("heard_ns", "position_sd", "decided", "expected"),
     [
-        (None, 0.0, TrackState.WAITING),
-        (0, 1.0, TrackState.TRACKING),
-        (0, 1.0001, TrackState.INITIALISING),
-        (-1, 0.0, TrackState.COASTING),
-        (-1, math.inf, TrackState.COASTING),
-        (0, math.inf, TrackState.INITIALISING),
+        (None, 0.0, True, TrackState.WAITING),
+        (0, 1.0, True, TrackState.TRACKING),
+        (0, 1.0001, True, TrackState.INITIALISING),
+        (-1, 0.0, True, TrackState.COASTING),
+        (-1, 0.0, False, TrackState.COASTING),
+        (0, 0.5, False, TrackState.AMBIGUOUS),
+        (0, 50.0, False, TrackState.AMBIGUOUS),
     ],
 )
 def test_what_a_track_is_worth(
-    heard_ns: int | None, position_sd: float, expected: TrackState
+    heard_ns: int | None, position_sd: float, decided: bool, expected: TrackState
 ) -> None:
     config = TrackerConfig(coast_after_s=2.0, initial_position_sd_max_m=1.0)
-    assert output.track_state(config, 2_000_000_000, heard_ns, position_sd) is expected
+    state = output.track_state(config, 2_000_000_000, heard_ns, position_sd, decided=decided)
+    assert state is expected
 
 
 @pytest.mark.parametrize("velocity", [(5.0, -2.0), (1e-3, 0.0)])

@@ -30,7 +30,9 @@ from netpos.tracking.protection import (
     RISK_MIN,
     NisWindow,
     gaussian_radius,
+    gaussian_tail,
     manoeuvre_level,
+    mixture_radius,
     protection_level,
     radius_limit,
 )
@@ -367,3 +369,36 @@ def test_nothing_is_told_of_what_is_not_sound(where: str) -> None:
     args = (np.zeros(6), np.eye(6), row, np.ones(1), 0.1, mean, cov, options(), 1e-4, fits)
     assert math.isnan(fits_and_level(*args))
     assert np.array_equal(fits, [[7.0, 7.0]])
+
+
+@pytest.mark.parametrize("risk", [0.3, 1e-2, 1e-4, 1e-8])
+@pytest.mark.parametrize("sides", [(1.0, 0.0, 1.0), (4.0, 1.5, 1.0), (9.0, 0.0, 1e-6)])
+def test_the_tail_beyond_a_radius_is_its_risk(
+    sides: tuple[float, float, float], risk: float
+) -> None:
+    assert gaussian_tail(*sides, gaussian_radius(*sides, risk)) == pytest.approx(risk, rel=1e-4)
+    assert gaussian_tail(*sides, 0.0) == 1.0
+    assert gaussian_tail(0.0, 0.0, 0.0, 1.0) == 0.0
+
+
+def test_the_radius_of_one_component_is_that_of_its_gaussian() -> None:
+    cov = np.array([[4.0, 1.5], [1.5, 1.0]])
+    found = mixture_radius(np.zeros((1, 2)), cov[None], np.ones(1), np.zeros(2), 1e-3)
+    assert found == pytest.approx(protection_level(cov, 1e-3), rel=1e-3)
+
+
+@pytest.mark.parametrize("weights", [(0.5, 0.5), (0.9, 0.1), (0.999, 0.001)])
+def test_the_radius_of_a_mixture_holds_its_samples(weights: tuple[float, float]) -> None:
+    """At least as many as promised, and not by a radius much too large."""
+    rng, risk, draws = np.random.default_rng(8), 1e-2, 400_000
+    means = np.array([[0.0, 0.0], [6.0, -8.0]])
+    covs = np.array([[[1.0, 0.3], [0.3, 0.5]], [[0.4, 0.0], [0.0, 2.0]]])
+    chosen = rng.random(draws) < weights[1]
+    first, second = (
+        rng.multivariate_normal(m, P, draws) for m, P in zip(means, covs, strict=True)
+    )
+    drawn = np.where(chosen[:, None], second, first)
+    centre = np.average(means, axis=0, weights=weights)
+    radius = mixture_radius(means, covs, np.array(weights), centre, risk)
+    reached = np.quantile(np.linalg.norm(drawn - centre, axis=1), 1.0 - risk)
+    assert reached * 0.99 <= radius <= 1.2 * reached

@@ -37,13 +37,18 @@ from netpos.tracking.models import pose_state
 from netpos.tracking.sectors import Sectors
 
 
-def test_initialising_until_the_evidence_decides() -> None:
+def test_ambiguous_until_the_evidence_decides() -> None:
     walk = Walk(np.array([-1.0, 4.0]), 0.4, 3.0, seed=5)
     outputs = tracked(walk)
     states = [o.status.state for o in outputs]
     first = states.index(TrackState.TRACKING)
     assert 2 <= first <= 20
-    assert set(states[:first]) == {TrackState.INITIALISING}
+    assert set(states[:first]) == {TrackState.AMBIGUOUS}
+    modes = outputs[0].status.modes
+    assert len(modes) > 1
+    assert [m.weight for m in modes] == sorted((m.weight for m in modes), reverse=True)
+    assert min(math.hypot(*(walk.position[0] - (m.x_m, m.y_m))) for m in modes) < 0.3
+    assert outputs[-1].status.modes == ()
     assert set(states[first:]) == {TrackState.TRACKING}
     error = errors(walk, outputs)
     assert error[first:].max() < 0.15
@@ -65,7 +70,7 @@ def test_standing_still_leaves_the_sector_open() -> None:
     walk.phases = wrap(phases + PHASE_SD * rng.standard_normal(40))
     walk.velocities -= walk.velocity
     outputs = tracked(walk)
-    assert {o.status.state for o in outputs} == {TrackState.INITIALISING}
+    assert {o.status.state for o in outputs} == {TrackState.AMBIGUOUS}
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -2,7 +2,8 @@
 
 A folder holds runs ``beacons_RUN.csv`` + ``truth_RUN.csv`` such as ``uc1_run1``. Beacon lines:
 epoch ms, tag, RSSI dBm, azimuth deg, elevation deg, RSSI of the second polarisation dBm, channel,
-anchor. Truth lines: epoch ms, unused, x cm, y cm at the corners of the walk.
+anchor. Truth lines: epoch ms of arrival, epoch ms of departure, x cm, y cm at the corners of the
+walk; where the person does not stop, the departure is ``NaN``.
 
 Signs. The authors count azimuth clockwise seen from above (bearing in the room = facing -
 azimuth), an RSU counter-clockwise: the sign turns. Azimuth is the angle to the array's own axis
@@ -174,8 +175,15 @@ def _truth(file: Path, vue_id: str) -> list[Odometry]:
         stamp_ns = row.integer(0, "time") * MS
         if stamps and stamp_ns <= stamps[-1]:
             raise row.error("time does not increase")
+        corner = [row.number(2, "x") / 100, row.number(3, "y") / 100]
         stamps.append(stamp_ns)
-        corners.append([row.number(2, "x") / 100, row.number(3, "y") / 100])
+        corners.append(corner)
+        if row.values[1].strip().lower() != "nan":
+            departure_ns = row.integer(1, "departure") * MS
+            if departure_ns <= stamp_ns:
+                raise row.error("the departure is not after the arrival")
+            stamps.append(departure_ns)
+            corners.append(corner)
     if len(stamps) < 2:
         raise BagError(f"{file} holds one corner; a walk needs two")
     return walk(np.array(stamps), np.array(corners), vue_id)

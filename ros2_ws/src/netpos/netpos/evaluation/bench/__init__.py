@@ -17,9 +17,19 @@ from collections.abc import Iterable, Iterator
 from importlib import import_module
 from typing import Any
 
-from netpos.evaluation.bench.common import LeftOut, Result, Row, Unavailable, as_json
+from netpos.evaluation.bench.common import LeftOut, Result, Row, Unavailable, as_json, quantity
 
-__all__ = ["PARTS", "LeftOut", "Result", "Row", "as_json", "bench", "chosen", "surroundings"]
+__all__ = [
+    "PARTS",
+    "LeftOut",
+    "Result",
+    "Row",
+    "as_json",
+    "bench",
+    "chosen",
+    "quantity",
+    "surroundings",
+]
 
 # What can be measured: module and function, imported when its turn comes.
 PARTS = {

@@ -131,3 +131,12 @@ def as_json(results: Iterable[Result], surroundings: Mapping[str, Any]) -> dict[
         "rows": [{**asdict(row), "ok": row.ok} for row in results if isinstance(row, Row)],
         "left_out": [asdict(row) for row in results if isinstance(row, LeftOut)],
     }
+
+
+def quantity(value: float, unit: str) -> str:
+    """A figure with its unit; seconds in the prefix that suits them."""
+    if unit == "s":
+        for limit, factor, name in ((1e-3, 1e6, "µs"), (1.0, 1e3, "ms")):
+            if abs(value) < limit:
+                return f"{value * factor:.3g} {name}"
+    return f"{value:.4g} {unit}".rstrip()

@@ -1,4 +1,4 @@
-"""deng2022's drives: one seed through least squares and the strapdown filter; sums over many."""
+"""deng2022's drives: one seed through least squares and the strapdown filter."""
 
 from __future__ import annotations
 
@@ -9,16 +9,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from netpos.evaluation.consistency import MeanTest, chi2_mean_bounds, effective_size, nees
 from netpos.evaluation.metrics import NS
-from netpos.evaluation.reproduce.frame import Work
+from netpos.evaluation.pairing import Mask
 from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
 from netpos.filters.error_state import UNCONSTRAINED, Imu
 from netpos.filters.measurement import LEVER
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.filters.position_fix import FixStatus
-from netpos.filters.space import CLOCK, place_rows
-from netpos.messages.values import Array
+from netpos.filters.space import place_rows
+from netpos.messages.values import Array, RsuInfo
 from netpos.radio.noise import generator
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking.config import TrackerConfig
@@ -30,13 +29,15 @@ VUE = "vue_1"
 SCENARIO = "blocked_5g_drive"
 HEIGHT_SD_M = 3.0
 """How well the height of a car's antenna is known without measuring it, where that is used."""
+MAST_M = 10.0
+"""Usual height of a station above the street: the mean of the paper's 5 to 15 m."""
 OUTAGE_EVERY_S = 60
 ALL_ANGLES = ("azimuth", "elevation", "range")
 # Of the state handed to the filter at the start, which the paper takes as known: position [m],
 # velocity [m/s], roll and pitch, heading [rad].
 START_SD = (1.0, 0.1, float(np.radians(0.2)), float(np.radians(1.0)))
 
-FIX, FIX_HEIGHT, LOOSE, LOOSE_DIAGONAL, LOOSE_FIXED, TIGHT, VEHICLE = (
+FIX, FIX_HEIGHT, LOOSE, LOOSE_DIAGONAL, LOOSE_FIXED, TIGHT, VEHICLE, DEFAULT, DEFAULT_VEHICLE = (
     "least squares",
     "least squares, height known to 3 m",
     "loose",
@@ -44,8 +45,9 @@ FIX, FIX_HEIGHT, LOOSE, LOOSE_DIAGONAL, LOOSE_FIXED, TIGHT, VEHICLE = (
     "loose, one covariance for all",
     "tight",
     "tight, vehicle constraints",
+    "tight, default parameters",
+    "tight, default IMU noise, vehicle constraints",
 )
-VARIANTS = (FIX, FIX_HEIGHT, LOOSE, LOOSE_DIAGONAL, LOOSE_FIXED, TIGHT, VEHICLE)
 RANGE_SD_M = 1.0
 FEW_STATIONS = 2
 
@@ -72,8 +74,9 @@ class Run:
     """One seed of a case: epochs, the truth of base_link and of the antenna, and what became of
     it.
 
-    position (N, 3), velocity (N, 3) and attitude of base_link, antenna (N, 3); heard (N,) whether
-    any station did; clock_m (N,) offset of its clock; fixes by variant; drives by variant
+    position (N, 3), velocity (N, 3) and attitude of base_link, antenna (N, 3); silence_end (N,)
+    the predictions at the end of outages, see ``with_silence_ends``; clock_m (N,) offset of its
+    clock; fixes by variant; epochs and drives by variant
     """
 
     stamps_ns: np.ndarray[tuple[int], np.dtype[np.int64]]
@@ -81,65 +84,11 @@ class Run:
     velocity: Array
     attitude: Rotation
     antenna: Array
-    heard: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    silence_end: Mask
     clock_m: Array
     fixes: dict[str, Fixes]
+    epochs: dict[str, Epochs]
     drives: dict[str, Drive]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Tally:
-    """Sums over the epochs of some runs, of one variant. square: north, east, down error^2 [m^2];
-    solved of n epochs; nees: its sums for position (3), position, velocity, attitude (9) and the
-    clock's offset (1); outage_m: (k, 2) horizontal and 3-D errors at the end of the outages;
-    clock_m2: error^2 and variance of the clock's offset [m^2]. Without a clock its sums are 0."""
-
-    n: int
-    solved: int
-    square: Array
-    nees: Array
-    n_eff: Array
-    outage_m: Array
-    clock_m2: Array
-
-    def __add__(self, other: Tally) -> Tally:
-        return Tally(
-            n=self.n + other.n,
-            solved=self.solved + other.solved,
-            square=self.square + other.square,
-            nees=self.nees + other.nees,
-            n_eff=self.n_eff + other.n_eff,
-            outage_m=np.vstack([self.outage_m, other.outage_m]),
-            clock_m2=self.clock_m2 + other.clock_m2,
-        )
-
-    @property
-    def success_percent(self) -> float:
-        """Share of epochs with a position."""
-        return 100.0 * self.solved / self.n
-
-    @property
-    def rms_m(self) -> tuple[float, float, float]:
-        """North, east, down, over the epochs with a position."""
-        north, east, down = np.sqrt(self.square / self.solved).tolist()
-        return north, east, down
-
-    @property
-    def clock_ns(self) -> tuple[float, float]:
-        """RMS error of the clock's offset, and that its covariance says."""
-        error, said = (1e9 / SPEED_OF_LIGHT_MPS * np.sqrt(self.clock_m2 / self.n)).tolist()
-        return error, said
-
-    def nees_test(self, states: int) -> MeanTest:
-        """Mean NEES of the position (``states`` 3), of all but the biases (9) or of the clock's
-        offset (1)."""
-        which = {3: 0, 9: 1, 1: 2}[states]
-        n_eff = float(self.n_eff[which])
-        return MeanTest(
-            mean=float(self.nees[which] / self.n),
-            bounds=chi2_mean_bounds(states, n_eff),
-            n_eff=n_eff,
-        )
 
 
 @lru_cache(maxsize=8)
@@ -169,8 +118,15 @@ def config_of(case: Case) -> TrackerConfig:
     return TrackerConfig.from_mapping({**scenario.tracker, **parameters})
 
 
+def default_config() -> TrackerConfig:
+    """What a user has who names the motion model and sets nothing else: the library's noise of the
+    IMU and of the clock, no vehicle constraints."""
+    return TrackerConfig(motion_model="strapdown")
+
+
 def epochs_of(simulation: Simulation, case: Case) -> Epochs:
-    """Rows of all beacons; outages leave epochs without any."""
+    """Rows of all beacons. An outage leaves epochs without any: from the last beacon that is heard
+    to the next one are ``outage_s`` seconds."""
     beacons = simulation.beacons(VUE)
     seen = simulation.observations(VUE)
     if case.outage_s:
@@ -183,6 +139,42 @@ def epochs_of(simulation: Simulation, case: Case) -> Epochs:
     counts = np.zeros(beacons.stamp_ns.size, dtype=np.int64)
     counts[heard] = np.diff(row_start)
     return Epochs(beacons.stamp_ns, np.append(0, np.cumsum(counts)), rows)
+
+
+def with_silence_ends(epochs: Epochs) -> Epochs:
+    """The same epochs, and before each that ends a silence one of the same stamp without rows.
+
+    What a filter says there is its prediction after the whole silence, just before it uses the
+    first measurement.
+    """
+    rows = np.diff(epochs.row_start)
+    first = np.flatnonzero((rows[:-1] == 0) & (rows[1:] > 0)) + 1
+    row_start = np.append(0, np.cumsum(np.insert(rows, first, 0)))
+    stamps = np.insert(epochs.stamps_ns, first, epochs.stamps_ns[first])
+    return Epochs(stamps, row_start, epochs.rows)
+
+
+def silence_ends(epochs: Epochs) -> Mask:
+    """(N,) which of the epochs ``with_silence_ends`` has added."""
+    return np.append(np.diff(epochs.stamps_ns) == 0, [False])
+
+
+def ground_height_m(stations: tuple[RsuInfo, ...]) -> float:
+    """Where a fix starts that knows no height: the street, by the usual height of the masts."""
+    return float(np.mean([info.position[2] for info in stations])) - MAST_M
+
+
+def fixes_of(simulation: Simulation, epochs: Epochs) -> dict[str, Fixes]:
+    """Least squares without a height, as in the paper, and with the usual height of the antenna:
+    wrong by one draw a drive, since an error of the map or of the car does not change on the
+    way."""
+    device = simulation.scenario.devices[0]
+    wrong_m = HEIGHT_SD_M * generator(simulation.scenario.seed, f"{VUE}/height").standard_normal()
+    known_m = device.antenna_height_m + device.lever_arm_m[2] + wrong_m
+    return {
+        FIX: fix_each(epochs, ground_height_m(simulation.rsus), 0.0),
+        FIX_HEIGHT: fix_each(epochs, known_m, HEIGHT_SD_M),
+    }
 
 
 def loose_epochs(epochs: Epochs, fixes: Fixes, lever: tuple[float, float, float]) -> Epochs:
@@ -225,111 +217,46 @@ def started(simulation: Simulation, case: Case, config: TrackerConfig) -> tuple[
 
 def run(case: Case, seed: int) -> Run:
     """One drive through every variant."""
-    simulation, config = simulation_of(case).with_seed(seed), config_of(case)
-    device = simulation.scenario.devices[0]
-    epochs = epochs_of(simulation, case)
+    simulation = simulation_of(case).with_seed(seed)
+    epochs, beacons = with_silence_ends(epochs_of(simulation, case)), simulation.beacons(VUE)
     truth = simulation.truth(VUE, epochs.stamps_ns)
-    height_m = device.antenna_height_m + device.lever_arm_m[2]
-    fixes = {
-        FIX: fix_each(epochs, height_m, 0.0),
-        FIX_HEIGHT: fix_each(epochs, height_m, HEIGHT_SD_M),
-    }
-    sensors, gate = sensors_of(config), gate_thresholds(config.gate_probability)
-    free = sensors._replace(constraints=UNCONSTRAINED)
-    begin, imu = (int(epochs.stamps_ns[0]), *started(simulation, case, config)), imu_of(simulation)
-    taken = {TIGHT: (epochs, free), VEHICLE: (epochs, sensors)}
+    lever, fixes = simulation.scenario.devices[0].lever_arm_m, fixes_of(simulation, epochs)
+    of_beacon = np.searchsorted(beacons.stamp_ns, epochs.stamps_ns)
+    inputs = {TIGHT: epochs, VEHICLE: epochs, DEFAULT: epochs, DEFAULT_VEHICLE: epochs}
     loose = {} if case.one_way else {LOOSE: fixes[FIX]}
     if case.nearest <= FEW_STATIONS and loose:
         loose |= less_told(fixes[FIX])
-    for name, told in loose.items():
-        taken[name] = (loose_epochs(epochs, told, device.lever_arm_m), free)
+    inputs |= {name: loose_epochs(epochs, used, lever) for name, used in loose.items()}
     return Run(
         stamps_ns=epochs.stamps_ns,
         position=truth.position,
         velocity=truth.velocity,
         attitude=truth.rotation,
-        antenna=truth.position + truth.rotation.apply(device.lever_arm_m),
-        heard=np.diff(epochs.row_start) > 0,
-        clock_m=SPEED_OF_LIGHT_MPS * simulation.beacons(VUE).clock_offset_s,
+        antenna=truth.position + truth.rotation.apply(lever),
+        silence_end=silence_ends(epochs),
+        clock_m=SPEED_OF_LIGHT_MPS * beacons.clock_offset_s[of_beacon],
         fixes=fixes,
-        drives={name: drive(*begin, imu, which, by, gate) for name, (which, by) in taken.items()},
+        epochs=inputs,
+        drives=_drives(simulation, case, inputs),
     )
+
+
+def _drives(simulation: Simulation, case: Case, inputs: dict[str, Epochs]) -> dict[str, Drive]:
+    """The filter of each variant on its epochs. All start from one state, each as uncertain as its
+    parameters say."""
+    imu, known, unset = imu_of(simulation), config_of(case), default_config()
+    drives = {}
+    for name, epochs in inputs.items():
+        config = unset if name in (DEFAULT, DEFAULT_VEHICLE) else known
+        sensors = sensors_of(config)._replace(constraints=UNCONSTRAINED)
+        if name in (VEHICLE, DEFAULT_VEHICLE):
+            sensors = sensors._replace(constraints=sensors_of(known).constraints)
+        begin = (int(epochs.stamps_ns[0]), *started(simulation, case, config))
+        gate = gate_thresholds(config.gate_probability)
+        drives[name] = drive(*begin, imu, epochs, sensors, gate)
+    return drives
 
 
 def ned(error: Array) -> Array:
     """North, east, down (..., 3) of an error in map."""
     return np.stack([error[..., 1], error[..., 0], -error[..., 2]], axis=-1)
-
-
-def _tally_fixes(done: Run, fixes: Fixes) -> Tally:
-    good = fixes.status == FixStatus.CONVERGED
-    error = ned(fixes.position - done.antenna)[good]
-    return Tally(
-        n=good.size,
-        solved=int(good.sum()),
-        square=(error**2).sum(axis=0),
-        nees=np.zeros(3),
-        n_eff=np.zeros(3),
-        outage_m=np.zeros((0, 2)),
-        clock_m2=np.zeros(2),
-    )
-
-
-def error_of(done: Run, result: Drive) -> Array:
-    """(N, 9) position, velocity and attitude, estimate minus truth in the filter's terms."""
-    turned = Rotation.from_quat(result.nav[:, 6:10]) * done.attitude.inv()
-    return np.hstack(
-        [
-            result.nav[:, :3] - done.position,
-            result.nav[:, 3:6] - done.velocity,
-            turned.as_rotvec(),
-        ]
-    )
-
-
-def _tally_drive(done: Run, result: Drive) -> Tally:
-    error = error_of(done, result)
-    values = [nees(error[:, :k], result.cov[:, :k, :k])[0] for k in (3, 9)]
-    offset, offset_var = _clock(done, result)
-    values.append(nees(offset[:, None], offset_var[:, None, None])[0])
-    silent = ~done.heard
-    ends = np.flatnonzero(silent[:-1] & done.heard[1:])
-    ends = ends[ends >= OUTAGE_EVERY_S // 2]  # of whole outages
-    at_end = [np.linalg.norm(error[ends, :k], axis=1) for k in (2, 3)]
-    return Tally(
-        n=len(error),
-        solved=int(np.isfinite(error).all(axis=1).sum()),
-        square=(ned(error[:, :3]) ** 2).sum(axis=0),
-        nees=np.array([v.sum() for v in values]),
-        n_eff=np.array([effective_size(v) if v.size else 0.0 for v in values]),
-        outage_m=np.column_stack(at_end),
-        clock_m2=np.array([(offset**2).sum(), offset_var.sum()]),
-    )
-
-
-def _clock(done: Run, result: Drive) -> tuple[Array, Array]:
-    """(N,) error [m] and variance [m^2] of the clock's offset; 0 without one."""
-    if result.cov.shape[1] <= CLOCK:
-        return np.zeros(len(result.nav)), np.zeros(len(result.nav))
-    return result.nav[:, CLOCK + 1] - done.clock_m, result.cov[:, CLOCK, CLOCK]
-
-
-def tally_seeds(case: Case, seeds: range) -> dict[str, Tally]:
-    """Sums over some seeds, by variant."""
-    total: dict[str, Tally] = {}
-    for seed in seeds:
-        done = run(case, seed)
-        parts = {name: _tally_fixes(done, fixes) for name, fixes in done.fixes.items()}
-        parts |= {name: _tally_drive(done, result) for name, result in done.drives.items()}
-        for name, part in parts.items():
-            total[name] = total[name] + part if name in total else part
-    return total
-
-
-def over_seeds(work: Work, case: Case) -> dict[str, Tally]:
-    """Sums over all seeds of the work, by variant."""
-    jobs = work.over_seeds(case.name, tally_seeds, case)
-    total = jobs[0]
-    for job in jobs[1:]:
-        total = {name: total[name] + job[name] for name in total}
-    return total

@@ -14,13 +14,17 @@ from netpos.bags.importers.car_imu_rtk import LEVER_ARM_M, CarDrive, imu_samples
 from netpos.bags.importers.common import recordings
 from netpos.evaluation.metrics import NS
 from netpos.evaluation.reproduce.blocked_drive import (
+    DEFAULT,
     LOOSE,
     TIGHT,
     VEHICLE,
     Case,
+    default_config,
+    ground_height_m,
     loose_epochs,
     ned,
 )
+from netpos.evaluation.reproduce.drive_tally import Tally, added, is_lost, tally_errors
 from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
 from netpos.filters.error_state import UNCONSTRAINED, Imu, Sensors
 from netpos.filters.measurement import LEVER
@@ -44,17 +48,21 @@ SETTLE_S = 30.0
 _SKIP = 20  # epochs after the start that do not count, as in netpos evaluate
 
 
+Start = tuple[int, Array, Array]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
     """The drive, what a tracker needs of it, and its state once RTK and IMU have told the heading:
-    stamp, nav, cov."""
+    stamp, nav, cov; ``unset``: sensors and start by the library's default parameters."""
 
     drive: CarDrive
     imu: Imu
     config: TrackerConfig
     sensors: Sensors
     gate: Array
-    start: tuple[int, Array, Array]
+    start: Start
+    unset: tuple[Sensors, Start]
 
 
 @lru_cache(maxsize=1)
@@ -64,7 +72,7 @@ def recording() -> Recording | None:
     if folder is None:
         return None
     found = load_car_drive(Path(folder))
-    config = TrackerConfig.from_mapping(found.tracker)
+    config, unset = TrackerConfig.from_mapping(found.tracker), default_config()
     return Recording(
         drive=found,
         imu=Imu(found.imu_ns, found.rates),
@@ -72,10 +80,11 @@ def recording() -> Recording | None:
         sensors=sensors_of(config),
         gate=gate_thresholds(config.gate_probability),
         start=_aligned(found, config),
+        unset=(sensors_of(unset), _aligned(found, unset)),
     )
 
 
-def _aligned(found: CarDrive, config: TrackerConfig) -> tuple[int, Array, Array]:
+def _aligned(found: CarDrive, config: TrackerConfig) -> Start:
     """Coarse alignment from rest, by RTK."""
     start, samples = StrapdownStart(config), SampleBuffer()
     pending = iter(imu_samples(found, VUE))
@@ -94,12 +103,18 @@ def _aligned(found: CarDrive, config: TrackerConfig) -> tuple[int, Array, Array]
     raise ValueError(f"{RECORDING}: no heading found; does the recording move?")
 
 
-def _variants(sensors: Sensors) -> dict[str, Sensors]:
-    return {TIGHT: sensors._replace(constraints=UNCONSTRAINED), VEHICLE: sensors}
+def _variants(known: Recording) -> dict[str, tuple[Sensors, Start]]:
+    """Of the tight coupling: what the filter takes to be true, and where it starts."""
+    free = known.sensors._replace(constraints=UNCONSTRAINED)
+    return {
+        TIGHT: (free, known.start),
+        VEHICLE: (known.sensors, known.start),
+        DEFAULT: known.unset,
+    }
 
 
-def station_errors(case: Case, seed: int) -> dict[str, Array]:
-    """(n, 3) north, east, down errors of the antenna against RTK, by coupling."""
+def station_tally(case: Case, seed: int) -> dict[str, Tally]:
+    """Errors of the antenna against RTK, by coupling."""
     known = recording()
     assert known is not None
     made = station_drive(known.drive, fewest=case.fewest, nearest=case.nearest, seed=seed)
@@ -109,16 +124,20 @@ def station_errors(case: Case, seed: int) -> dict[str, Array]:
     after = made.stamps_ns[heard] > known.start[0]
     first = int(np.argmax(after))
     epochs = Epochs(made.stamps_ns[heard][first:], row_start[first:], rows)
-    fixes = fix_each(epochs, float(made.antenna[0, 2]), 0.0)
-    free = _variants(known.sensors)[TIGHT]
-    runs = {LOOSE: _run(known, loose_epochs(epochs, fixes, LEVER_ARM_M), free)}
-    runs |= {name: _run(known, epochs, taken) for name, taken in _variants(known.sensors).items()}
-    truth = made.antenna[heard][first:]
-    return {name: ned(_antenna(done.nav) - truth)[_SKIP:] for name, done in runs.items()}
+    fixes = fix_each(epochs, ground_height_m(made.stations), 0.0)
+    variants = _variants(known)
+    inputs = dict.fromkeys(variants, epochs)
+    variants[LOOSE], inputs[LOOSE] = variants[TIGHT], loose_epochs(epochs, fixes, LEVER_ARM_M)
+    truth, tallies = made.antenna[heard][first:], {}
+    for name, variant in variants.items():
+        done = _run(known, inputs[name], *variant)
+        error = ned(_antenna(done.nav) - truth)[_SKIP:]
+        tallies[name] = tally_errors(error, lost=is_lost(inputs[name], done))
+    return tallies
 
 
-def _run(known: Recording, epochs: Epochs, sensors: Sensors) -> Drive:
-    result: Drive = drive(*known.start, known.imu, epochs, sensors, known.gate)
+def _run(known: Recording, epochs: Epochs, sensors: Sensors, start: Start) -> Drive:
+    result: Drive = drive(*start, known.imu, epochs, sensors, known.gate)
     return result
 
 
@@ -127,14 +146,9 @@ def _antenna(nav: Array) -> Array:
     return np.asarray(nav[:, :3] + Rotation.from_quat(nav[:, 6:10]).apply(LEVER_ARM_M))
 
 
-def station_seeds(case: Case, seeds: range) -> dict[str, tuple[int, Array]]:
-    """Epochs and sums of squared north, east, down errors over some seeds, by coupling."""
-    total: dict[str, tuple[int, Array]] = {}
-    for seed in seeds:
-        for name, error in station_errors(case, seed).items():
-            n, square = total.get(name, (0, np.zeros(3)))
-            total[name] = n + len(error), square + (error**2).sum(axis=0)
-    return total
+def station_seeds(case: Case, seeds: range) -> dict[str, Tally]:
+    """Sums over some seeds, by coupling."""
+    return added([station_tally(case, seed) for seed in seeds])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,10 +168,10 @@ def outages(variant: str) -> Outages:
     """``outages_with`` what the filter takes to be true."""
     known = recording()
     assert known is not None
-    return outages_with(_variants(known.sensors)[variant])
+    return outages_with(*_variants(known)[variant])
 
 
-def outages_with(sensors: Sensors) -> Outages:
+def outages_with(sensors: Sensors, start: Start) -> Outages:
     """RTK aids the filter, and is withheld for 30 s, again and again, each time from the aided
     state."""
     known = recording()
@@ -167,7 +181,8 @@ def outages_with(sensors: Sensors) -> Outages:
     cov = np.tile(np.diag(np.square(RTK_SD_M)), (len(stamps), 1, 1))
     rows = place_rows(antenna, cov, LEVER_ARM_M)
     row_start = np.arange(len(stamps) + 1) * 3
-    aided = _run(known, Epochs(stamps, row_start, rows.reshape(-1, rows.shape[-1])), sensors)
+    aiding = Epochs(stamps, row_start, rows.reshape(-1, rows.shape[-1]))
+    aided = _run(known, aiding, sensors, start)
     elapsed = (stamps - stamps[0]) / NS
     grid = np.arange(0.0, OUTAGE_S + 0.1, 0.25)
     curves = []

@@ -1,4 +1,5 @@
-"""What no filter can beat on deng2022's drives, and what smoothing makes of their outages.
+"""What no filter can beat on deng2022's drives, how good their geometry is, and what smoothing
+makes of their outages.
 
 The posterior Cramér-Rao bound along the true way: the covariance of a filter whose measurements
 and IMU are free of errors, so that it linearises at the truth, and which takes them to be as
@@ -22,12 +23,14 @@ from netpos.evaluation.reproduce.blocked_drive import (
     config_of,
     epochs_of,
     imu_of,
+    silence_ends,
     simulation_of,
     started,
+    with_silence_ends,
 )
 from netpos.evaluation.reproduce.frame import Work
 from netpos.filters.error_state import UNCONSTRAINED, Sensors
-from netpos.filters.measurement import VALUE
+from netpos.filters.measurement import ORIGIN, VALUE
 from netpos.filters.space import linearise_in_space
 from netpos.messages.values import Array
 from netpos.scenario import Simulation, load_scenario
@@ -111,7 +114,7 @@ def bound_drives(case: Case, seed: int) -> tuple[Epochs, dict[str, Drive]]:
     changes = {**changes_of(case), **_FREE_OF_ERRORS}
     exact = Simulation(load_scenario(SCENARIO, seed=seed, changes=changes))
     config, cov = config_of(case), np.diag(start_sd(config_of(case), *START_SD) ** 2)
-    epochs = epochs_of(simulation_of(case).with_seed(seed), case)
+    epochs = with_silence_ends(epochs_of(simulation_of(case).with_seed(seed), case))
     states = true_states(exact, epochs)
     epochs = without_errors(epochs, states, cov)
     begin, imu = (int(epochs.stamps_ns[0]), states[0], cov), imu_of(exact)
@@ -124,10 +127,9 @@ def bound_drives(case: Case, seed: int) -> tuple[Epochs, dict[str, Drive]]:
 
 def _squares(epochs: Epochs, square: Array) -> Squares:
     """Of (N, 3) squares of east, north, up."""
-    heard = np.diff(epochs.row_start) > 0
-    ends = np.flatnonzero(~heard[:-1] & heard[1:])
-    ned = square[:, [1, 0, 2]]
-    return Squares(len(ned), ned.sum(axis=0), len(ends), ned[ends].sum(axis=0))
+    ends, ned = silence_ends(epochs), square[:, [1, 0, 2]]
+    n = int(ends.sum())
+    return Squares(len(ned) - n, ned[~ends].sum(axis=0), n, ned[ends].sum(axis=0))
 
 
 def _bounds(case: Case, seeds: range) -> dict[str, Squares]:
@@ -138,6 +140,31 @@ def _bounds(case: Case, seeds: range) -> dict[str, Squares]:
             part = _squares(epochs, np.diagonal(done.cov, axis1=1, axis2=2)[:, :3])
             total[name] = total[name] + part if name in total else part
     return total
+
+
+def dilution(epochs: Epochs, antenna: Array) -> Array:
+    """Horizontal and vertical dilution of precision of ranges alone, (k, 2), of the epochs with at
+    least three stations; antenna (N, 3) where it really was."""
+    found = []
+    for place, first, last in zip(antenna, epochs.row_start, epochs.row_start[1:], strict=False):
+        if last - first >= 3:
+            away = place - epochs.rows[first:last, ORIGIN : ORIGIN + 3]
+            u = away / np.linalg.norm(away, axis=1)[:, None]
+            var = np.diagonal(np.linalg.inv(u.T @ u))
+            found.append((np.sqrt(var[0] + var[1]), np.sqrt(var[2])))
+    return np.array(found).reshape(-1, 2)
+
+
+def _dilutions(case: Case, seeds: range) -> tuple[int, Array]:
+    n, total = 0, np.zeros(2)
+    for seed in seeds:
+        simulation = simulation_of(case).with_seed(seed)
+        epochs = epochs_of(simulation, case)
+        truth = simulation.truth(VUE, epochs.stamps_ns)
+        lever = simulation.scenario.devices[0].lever_arm_m
+        found = dilution(epochs, truth.position + truth.rotation.apply(lever))
+        n, total = n + len(found), total + found.sum(axis=0)
+    return n, total
 
 
 def _smoothed(case: Case, seeds: range) -> dict[str, Squares]:
@@ -173,6 +200,14 @@ def bounds(work: Work, case: Case) -> dict[str, Squares]:
     """The bound by variant: squares of the smallest standard deviations."""
     few = work.with_runs(min(work.runs, BOUND_RUNS))
     return _added(few.over_seeds(f"bound, {case.name}", _bounds, case))
+
+
+def mean_dilution(work: Work, case: Case) -> tuple[float, float]:
+    """Mean horizontal and vertical dilution of precision of a case that measures ranges alone."""
+    few = work.with_runs(min(work.runs, BOUND_RUNS))
+    parts = few.over_seeds(f"geometry, {case.name}", _dilutions, case)
+    n, total = sum(part[0] for part in parts), np.sum([part[1] for part in parts], axis=0)
+    return float(total[0] / n), float(total[1] / n)
 
 
 def in_outages(work: Work, case: Case) -> dict[str, Squares]:

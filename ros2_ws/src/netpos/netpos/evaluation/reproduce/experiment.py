@@ -4,29 +4,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from netpos.evaluation.bounds import bound_covariances
-from netpos.evaluation.metrics import NS
-from netpos.evaluation.reproduce.integrity import reported
+from netpos.evaluation.reproduce.paper_filter import follow_paper
 from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
-from netpos.filters.measurement import BIAS
+from netpos.evaluation.reproduce.segments import Epochs, Flags, Followed, Follower, Ints
 from netpos.filters.motion import N_CORE, SPEED_OF_LIGHT_MPS
-from netpos.messages.values import Array, ImuSample
+from netpos.messages.values import Array
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.simulation import Beacons
-from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.engine import run_epochs
-from netpos.tracking.imu_buffer import ImuBuffer
-from netpos.tracking.models import grown, initial_extra_sd, motions_of, options_of, pose_state
-
-Ints = npt.NDArray[np.int64]
+from netpos.tracking.models import pose_state
+from netpos.tracking.rsus import Rsu
 
 VUE = "vue_1"
+
+Estimator = Literal["scenario", "defaults", "paper"]
+
+FACTS = ("require_initial_pose", "device_height_m", "motion_model")
+"""Parameters of the tracker that are no tuning: what a user knows of the device and its start."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,6 +35,8 @@ class Experiment:
 
     start_drawn: the filter starts not where the scenario says but off the truth by a draw from its
     own start covariance, as its bound takes for granted.
+    estimator: scenario, our tracker with the settings of the scenario; defaults, our tracker with
+    the library's defaults but for ``FACTS``; paper, the filter of ``paper_filter``.
     """
 
     name: str
@@ -43,14 +44,16 @@ class Experiment:
     changes: tuple[tuple[str, object], ...] = ()
     tracker: tuple[tuple[str, object], ...] = ()
     start_drawn: bool = False
+    estimator: Estimator = "scenario"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
-    """One run: N epochs with at least one measurement, up to the loss of the track if ``lost``.
+    """One run: N epochs with at least one measurement.
 
     stamps_ns (N,); truth and mean (N, n) in the filter's units; cov and bound (N, n, n); nis, dof
-    (N,); level (N,) the protection level [m]
+    (N,); level (N,) the protection level [m]; tracked (N,), elsewhere mean, cov and level are NaN;
+    losses: how often the track was lost
     """
 
     stamps_ns: Ints
@@ -61,23 +64,14 @@ class Track:
     nis: Array
     dof: Array
     level: Array
-    lost: bool
+    tracked: Flags
+    losses: int
 
     @property
     def error_m(self) -> Array:
-        """(N,) horizontal errors."""
+        """(N,) horizontal errors; NaN while there is no track."""
         error: Array = np.hypot(*(self.mean[:, :2] - self.truth[:, :2]).T)
         return error
-
-
-class Epochs(NamedTuple):
-    """Epochs of a run: stamps_ns (N,), row_start (N + 1,), rows (M, ROW_WIDTH), biases (2, k) in
-    the rows."""
-
-    stamps_ns: Ints
-    row_start: Ints
-    rows: Array
-    bias: Array
 
 
 class Setup:
@@ -87,12 +81,14 @@ class Setup:
         scenario = load_scenario(experiment.scenario, changes=dict(experiment.changes))
         self.simulation = Simulation(scenario)
         """Under the scenario's own seed."""
-        self.config = TrackerConfig.from_mapping({**scenario.tracker, **dict(experiment.tracker)})
-        self._templates = RowTemplates.of(self.simulation.rsus, self.simulation.fields)
-        self._options = options_of(self.config)
-        self._extra_sd = initial_extra_sd(self.config)
-        self._motions = motions_of(self.config)
-        self._start_drawn = experiment.start_drawn
+        settings = {**scenario.tracker, **dict(experiment.tracker)}
+        if experiment.estimator == "defaults":
+            settings = {name: settings[name] for name in FACTS if name in settings}
+        self.config = TrackerConfig.from_mapping(settings)
+        rsus = self.simulation.rsus
+        self._templates = RowTemplates.of(rsus, self.simulation.fields)
+        self._follower = Follower(self.config, tuple(Rsu.of(info) for info in rsus))
+        self._experiment = experiment
 
     def run(self, seed: int) -> Track:
         """Simulate, estimate and bound one seed.
@@ -105,39 +101,37 @@ class Setup:
         simulation = self.simulation.with_seed(seed)
         mean, cov = self._start(simulation)
         heard, epochs = self._epochs(simulation)
-        prior = self._grown(mean, cov, epochs)[1]
+        prior = self._follower.grown(mean, cov, epochs.bias)[1]
         truth = _truth(simulation.beacons(VUE), heard, len(prior))
-        if self._start_drawn:
+        if self._experiment.start_drawn:
             mean = np.random.default_rng([seed, 1]).multivariate_normal(truth[0, :N_CORE], cov)
-        if self.config.use_imu:
-            if epochs.bias.size:
-                raise ValueError(
-                    "an inertial motion model takes no RSU biases here; undeclare them"
-                )
-            done, *filled, motions = self._stepped(epochs, mean, cov, simulation.imu(VUE))
-        elif self.config.motion_model == "interacting":
-            done, *filled, _ = self._stepped(epochs, mean, cov, None)
-            motions = self._motions[1:2]  # straight on: bound and level know one model
-        else:
-            done, *filled = self._compiled(epochs, mean, cov)
-            motions = self._motions
-        height_m, risk = self.config.device_height_m, self.config.integrity_risk
-        bound = bound_covariances(*epochs[:3], truth, prior, height_m, motions, epochs.bias)
-        means, covs, nis, dof, taken = (array[:done] for array in filled)
-        means, covs, level = reported(
-            *epochs[:3], means, covs, nis, dof, taken, motions, epochs.bias, self._options, risk
-        )
+        found = self._followed(simulation, epochs, mean, cov, truth)
+        height_m = self.config.device_height_m
+        bound = bound_covariances(*epochs[:3], truth, prior, height_m, found.motions, epochs.bias)
         return Track(
-            stamps_ns=epochs.stamps_ns[:done],
-            truth=truth[:done],
-            mean=means,
-            cov=covs,
-            bound=bound[:done],
-            nis=nis,
-            dof=dof,
-            level=level,
-            lost=done < heard.size,
+            stamps_ns=epochs.stamps_ns,
+            truth=truth,
+            mean=found.means,
+            cov=found.covs,
+            bound=bound,
+            nis=found.nis,
+            dof=found.dof,
+            level=found.level,
+            tracked=found.tracked,
+            losses=found.losses,
         )
+
+    def _followed(
+        self, simulation: Simulation, epochs: Epochs, mean: Array, cov: Array, truth: Array
+    ) -> Followed:
+        """What the estimator makes of the epochs of a run."""
+        if self._experiment.estimator == "paper":
+            return follow_paper(self.config, epochs, mean, cov, truth)
+        if not self.config.use_imu:
+            return self._follower.follow(epochs, mean, cov, None)
+        if epochs.bias.size:
+            raise ValueError("an inertial motion model takes no RSU biases here; undeclare them")
+        return self._follower.follow(epochs, mean, cov, simulation.imu(VUE))
 
     def _start(self, simulation: Simulation) -> tuple[Array, Array]:
         """Mean and covariance of the initial pose."""
@@ -150,71 +144,14 @@ class Setup:
 
     def _epochs(self, simulation: Simulation) -> tuple[Ints, Epochs]:
         """The beacons heard, (N,), and their epochs."""
+        seen = simulation.observations(VUE)
         heard, row_start, rows, bias = observation_rows(
-            simulation.observations(VUE), self._templates, N_CORE + self._extra_sd.size
+            seen, self._templates, self._follower.first_bias
         )
         if not heard.size or heard[0] > 0:
             raise ValueError(f"no RSU hears the first beacon of {simulation.scenario.name}")
         stamps_ns = simulation.beacons(VUE).stamp_ns[heard]
-        return heard, Epochs(stamps_ns, row_start, rows, bias)
-
-    def _compiled(
-        self, epochs: Epochs, mean: Array, cov: Array
-    ) -> tuple[int, Array, Array, Array, Array, Array]:
-        """Epochs done, means, covariances, NIS, degrees of freedom, accepted groups: all epochs in
-        one kernel."""
-        mean, cov = self._grown(mean, cov, epochs)
-        filled = _room(epochs.stamps_ns.size, mean.size)
-        motion = self._motions[0]
-        done = run_epochs(*epochs[:3], mean, cov, motion, epochs.bias, self._options, *filled)
-        return done, *filled
-
-    def _grown(self, mean: Array, cov: Array, epochs: Epochs) -> tuple[Array, Array]:
-        """The start with the motion model's own states and the biases."""
-        return grown(mean, cov, np.append(self._extra_sd, epochs.bias[0]))
-
-    def _stepped(
-        self, epochs: Epochs, mean: Array, cov: Array, samples: list[ImuSample] | None
-    ) -> tuple[int, Array, Array, Array, Array, Array, Array]:
-        """As ``_compiled``, epoch by epoch; also the motions (N, Parameter). The IMU's samples
-        drive the filter between them (None: no IMU). A slow error becomes a state when it is first
-        heard of, as in a tracker: until then it is in the results only."""
-        imu = ImuBuffer()
-        for sample in samples or ():
-            imu.add(sample)
-        count, config = epochs.stamps_ns.size, self.config
-        sd, first = np.append(self._extra_sd, epochs.bias[0]), N_CORE + self._extra_sd.size
-        mean, cov = grown(mean, cov, self._extra_sd)
-        filled = _room(count, N_CORE + sd.size)
-        means, covs, nis, dof, groups = filled
-        motions = np.tile(self._motions[0], (count, 1))
-        heard_ns = int(epochs.stamps_ns[0])
-        estimate = estimates.start(config, heard_ns, mean, cov)
-        rejected, known = 0, first
-        for k, stamp in enumerate(epochs.stamps_ns.tolist()):
-            rows = epochs.rows[epochs.row_start[k] : epochs.row_start[k + 1]].copy()
-            known = max(known, int(rows[:, BIAS].max()) + 1)
-            estimate.grow(sd[: known - N_CORE])
-            if samples is not None:
-                yaw, speed, _ = imu.increments(estimate.stamp_ns, stamp)
-                estimate.drive(yaw, speed, config.gyro_noise_density)
-            unheard_s, bias = (stamp - heard_ns) / NS, epochs.bias[:, : known - first].copy()
-            nis[k], dof[k], taken = estimate.step(stamp, unheard_s, rejected, rows, bias)
-            means[k], covs[k] = grown(estimate.mean, estimate.cov, sd)
-            groups[k] = taken.sum()
-            if samples is not None:
-                motions[k] = estimate.motion
-            rejected = 0 if 2 * taken.sum() >= taken.size else rejected + 1
-            heard_ns = stamp if dof[k] else heard_ns
-            if rejected >= config.max_rejected_epochs:
-                return k + 1, *filled, motions
-        return count, *filled, motions
-
-
-def _room(epochs: int, n: int) -> tuple[Array, Array, Array, Array, Array]:
-    """Means, covariances, NIS, degrees of freedom and accepted groups, to be filled."""
-    figures = np.empty((3, epochs))
-    return np.empty((epochs, n)), np.empty((epochs, n, n)), figures[0], figures[1], figures[2]
+        return heard, Epochs(stamps_ns, row_start, rows, bias, seen.rsu[heard])
 
 
 def _truth(beacons: Beacons, heard: Ints, n: int) -> Array:
@@ -228,7 +165,7 @@ def _truth(beacons: Beacons, heard: Ints, n: int) -> Array:
     return truth
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def setup_of(experiment: Experiment) -> Setup:
     """The set-up of an experiment, built once per process."""
     return Setup(experiment)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from netpos.evaluation.consistency import MeanTest, chi2_mean_bounds, effective_size
+from netpos.evaluation.consistency import MeanTest, nees_over_runs
 from netpos.evaluation.metrics import MIN_SPEED_FOR_HEADING_MPS, NS, SKIP_EPOCHS
 from netpos.evaluation.reproduce.experiment import Experiment, Track, setup_of
 from netpos.evaluation.reproduce.frame import Work
@@ -17,6 +17,7 @@ from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages.values import Array
 
 Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 DIVERGED_M = 5.0
 LEVEL_MAX_M = 1000.0  # counted of a protection level: where a direction is open it has no end
@@ -24,11 +25,17 @@ BIN_M = 0.002  # of the histogram of errors
 BINS = 10_000
 
 
+class NothingScoredError(ValueError):
+    """No run of an experiment has an estimate that counts."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tally:
-    """Sums over the scored estimates of one run; errors in m, ns and rad."""
+    """Sums over the scored estimates of one run; errors in m, ns and rad. epochs: as many as would
+    be scored were there always a track; losses: how often the track was lost."""
 
     n: int
+    epochs: int
     error2: float
     error: float
     error_max: float
@@ -37,7 +44,6 @@ class Tally:
     heading2: float
     heading_n: int
     nees: float
-    nees_n_eff: float
     nis: float
     dof: float
     exceeded: int
@@ -46,18 +52,31 @@ class Tally:
     rate_hz: float
     ready_s: float | None
     speed_max: float
-    lost: bool
+    losses: int
+
+    @property
+    def astray(self) -> bool:
+        """An error above ``DIVERGED_M`` at some time, or no track."""
+        return self.losses > 0 or self.error_max > DIVERGED_M
 
 
 @kernel
 def _sums(
-    mean: Array, cov: Array, truth: Array, bound: Array, skip: int, out: Array, histogram: Ints
-) -> Array:
-    """Add to out (8,): error^2, error, clock error and its square [ns], heading error^2, their
-    number, bound^2, largest error; count errors in the histogram; returns the NEES (N - skip,)."""
+    mean: Array,
+    cov: Array,
+    truth: Array,
+    bound: Array,
+    tracked: Flags,
+    out: Array,
+    histogram: Ints,
+) -> None:
+    """Add to out (10,), over the epochs ``tracked``: error^2, error, clock error and its square
+    [ns], heading error^2, their number, bound^2, largest error, NEES, number of epochs; count
+    errors in the histogram."""
     to_ns = 1e9 / SPEED_OF_LIGHT_MPS
-    nees = np.empty(max(mean.shape[0] - skip, 0))
-    for i in range(skip, mean.shape[0]):
+    for i in range(mean.shape[0]):
+        if not tracked[i]:
+            continue
         x, y = mean[i, 0] - truth[i, 0], mean[i, 1] - truth[i, 1]
         square = x * x + y * y
         error = np.sqrt(square)
@@ -75,24 +94,28 @@ def _sums(
         out[6] += bound[i, 0, 0] + bound[i, 1, 1]
         out[7] = max(out[7], error)
         a, b, c = cov[i, 0, 0], cov[i, 0, 1], cov[i, 1, 1]
-        nees[i - skip] = (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
+        out[8] += (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
+        out[9] += 1.0
         histogram[min(int(error / BIN_M), BINS)] += 1
-    return nees
 
 
 def tally(track: Track, position_sd_max_m: float, histogram: Ints, skip: int) -> Tally:
-    """Sums of one run without its first ``skip`` estimates; errors are counted in ``histogram``
+    """Sums of one run without its first ``skip`` epochs; errors are counted in ``histogram``
     (BINS + 1,). Ready: position sd (largest axis) at most ``position_sd_max_m``."""
-    out = np.zeros(8)
-    nees = _sums(track.mean, track.cov, track.truth, track.bound, skip, out, histogram)
-    error2, error, clock, clock2, heading2, heading_n, bound2, error_max = out.tolist()
+    scored = track.tracked.copy()
+    scored[:skip] = False
+    out = np.zeros(10)
+    _sums(track.mean, track.cov, track.truth, track.bound, scored, out, histogram)
+    error2, error, clock, clock2, heading2, heading_n, bound2, error_max, nees, n = out.tolist()
     a, b, c = track.cov[:, 0, 0], track.cov[:, 0, 1], track.cov[:, 1, 1]
     largest = (a + c) / 2 + np.hypot((a - c) / 2, b)
     ready = np.flatnonzero(largest <= position_sd_max_m**2)
     elapsed = (track.stamps_ns - track.stamps_ns[0]) / NS
     speed = np.hypot(track.truth[:, 2], track.truth[:, 3])
+    level = track.level[scored]
     return Tally(
-        n=nees.size,
+        n=int(n),
+        epochs=max(scored.size - skip, 0),
         error2=error2,
         error=error,
         error_max=error_max,
@@ -100,41 +123,47 @@ def tally(track: Track, position_sd_max_m: float, histogram: Ints, skip: int) ->
         clock2=clock2,
         heading2=heading2,
         heading_n=int(heading_n),
-        nees=float(nees.sum()),
-        nees_n_eff=effective_size(nees) if nees.size else 0.0,
-        nis=float(track.nis[skip:].sum()),
-        dof=float(track.dof[skip:].sum()),
-        exceeded=int((track.error_m > track.level)[skip:].sum()),
-        level=float(np.minimum(track.level, LEVEL_MAX_M)[skip:].sum()),
+        nees=nees,
+        nis=float(track.nis[scored].sum()),
+        dof=float(track.dof[scored].sum()),
+        exceeded=int((track.error_m[scored] > level).sum()),
+        level=float(np.minimum(level, LEVEL_MAX_M).sum()),
         bound2=bound2,
-        rate_hz=float((elapsed.size - 1) / elapsed[-1]),
+        rate_hz=float((track.tracked.sum() - 1) / elapsed[-1]),
         ready_s=float(elapsed[ready[0]]) if ready.size else None,
         speed_max=float(speed.max()),
-        lost=track.lost,
+        losses=track.losses,
     )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Batch:
-    """Some seeds: their tallies, their histogram (BINS + 1,), and squared errors (runs, N) where
-    asked for."""
+    """Some seeds: their tallies, their histogram (BINS + 1,), and where asked for squared errors
+    and bounds (runs, N)."""
 
     tallies: list[Tally]
     histogram: Ints
-    error2: Array | None
+    error2: Array | None = None
+    bound2: Array | None = None
 
 
 def _batch(argument: tuple[Experiment, int, bool], seeds: range) -> Batch:
     experiment, skip, series = argument
     setup = setup_of(experiment)
     histogram = np.zeros(BINS + 1, dtype=np.int64)
-    tallies, squares = [], []
+    tallies, squares, bounds = [], [], []
     for seed in seeds:
         track = setup.run(seed)
         tallies.append(tally(track, setup.config.initial_position_sd_max_m, histogram, skip))
         if series:
             squares.append(track.error_m**2)
-    return Batch(tallies=tallies, histogram=histogram, error2=_stacked(squares))
+            bounds.append(track.bound[:, 0, 0] + track.bound[:, 1, 1])
+    return Batch(
+        tallies=tallies,
+        histogram=histogram,
+        error2=_stacked(squares),
+        bound2=_stacked(bounds),
+    )
 
 
 def _stacked(series: list[Array]) -> Array | None:
@@ -147,17 +176,23 @@ def _stacked(series: list[Array]) -> Array | None:
     return out
 
 
+def _joined(parts: list[Array | None]) -> Array | None:
+    """The series of all batches, ``_stacked``."""
+    return _stacked([row for part in parts if part is not None for row in part])
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Summary:
     """Figures over all runs of an experiment.
 
     rmse_m over all scored estimates, mean_error_m what fokin2020:eq.34 calls RMSE; clock_sd_ns
-    about the mean; nees of the position (2 degrees of freedom); exceeded: share of estimates whose
-    error is above their protection level, the mean of which is level_m, and exceeded_runs the runs
-    that have such; bound_rmse_m the posterior Cramér-Rao bound of rmse_m; lost: runs that ended
-    with a lost track; diverged: these, and runs with an error above 5 m; rate_hz and ready_s of
-    the worst run, ready_s None where a run never got ready; error2 (runs, N) m^2 of all estimates
-    for experiments with one route, NaN after a loss.
+    about the mean; nees of the position (2 degrees of freedom), tested over runs; exceeded: share
+    of estimates whose error is above their protection level, the mean of which is level_m, and
+    exceeded_runs the runs that have such, None of an estimator without levels; bound_rmse_m the
+    posterior Cramér-Rao bound of rmse_m; availability: share of the epochs to be scored that have
+    a track; losses: tracks lost in all runs; astray: runs with a loss or an error above 5 m;
+    rate_hz and ready_s of the worst run, ready_s None where a run never got ready; error2, bound2
+    (runs, N) m^2 of all epochs for experiments with one route, error2 NaN where there is no track.
     """
 
     experiment: Experiment
@@ -171,17 +206,19 @@ class Summary:
     heading_rmse_deg: float | None
     nees: MeanTest
     nis_over_dof: float | None
-    exceeded: float
-    exceeded_runs: int
-    level_m: float
+    exceeded: float | None
+    exceeded_runs: int | None
+    level_m: float | None
     bound_rmse_m: float
-    diverged: int
-    lost: int
+    availability: float
+    losses: int
+    astray: int
     rate_hz: float
     ready_s: float | None
     speed_max_mps: float
     histogram: Ints
     error2: Array | None
+    bound2: Array | None
 
     @property
     def bound_ratio(self) -> float:
@@ -205,19 +242,19 @@ class Summary:
 
         Raises
         ------
-        ValueError  no run lasts longer than the estimates left out
+        NothingScoredError  no run has an estimate beyond those left out
         """
         kept = list(batches)
         tallies = [t for batch in kept for t in batch.tallies]
         n = sum(t.n for t in tallies)
         if n == 0:
-            raise ValueError(f"{experiment.name}: no run has estimates that count")
+            raise NothingScoredError(f"{experiment.name}: no run has estimates that count")
         clock = sum(t.clock for t in tallies) / n
         clock2 = sum(t.clock2 for t in tallies) / n
         headings, dof = sum(t.heading_n for t in tallies), sum(t.dof for t in tallies)
-        n_eff = sum(t.nees_n_eff for t in tallies)
+        epochs = sum(t.epochs for t in tallies)
+        levels = experiment.estimator != "paper"
         ready = [t.ready_s for t in tallies]
-        series = [row for batch in kept if batch.error2 is not None for row in batch.error2]
         return cls(
             experiment=experiment,
             runs=len(tallies),
@@ -232,23 +269,23 @@ class Summary:
             )
             if headings
             else None,
-            nees=MeanTest(
-                mean=sum(t.nees for t in tallies) / n,
-                bounds=chi2_mean_bounds(2, n_eff),
-                n_eff=n_eff,
+            nees=nees_over_runs(
+                np.array([t.nees for t in tallies]), np.array([t.n for t in tallies]), 2
             ),
-            exceeded=sum(t.exceeded for t in tallies) / n,
-            exceeded_runs=sum(t.exceeded > 0 for t in tallies),
-            level_m=sum(t.level for t in tallies) / n,
+            exceeded=sum(t.exceeded for t in tallies) / n if levels else None,
+            exceeded_runs=sum(t.exceeded > 0 for t in tallies) if levels else None,
+            level_m=sum(t.level for t in tallies) / n if levels else None,
             nis_over_dof=sum(t.nis for t in tallies) / dof if dof else None,
             bound_rmse_m=float(np.sqrt(sum(t.bound2 for t in tallies) / n)),
-            diverged=sum(t.lost or t.error_max > DIVERGED_M for t in tallies),
-            lost=sum(t.lost for t in tallies),
+            availability=n / epochs,
+            losses=sum(t.losses for t in tallies),
+            astray=sum(t.astray for t in tallies),
             rate_hz=min(t.rate_hz for t in tallies),
             ready_s=None if None in ready else max(r for r in ready if r is not None),
             speed_max_mps=max(t.speed_max for t in tallies),
             histogram=np.sum([batch.histogram for batch in kept], axis=0),
-            error2=_stacked(series),
+            error2=_joined([batch.error2 for batch in kept]),
+            bound2=_joined([batch.bound2 for batch in kept]),
         )
 
 

@@ -68,6 +68,12 @@ class Setting:
     start_var: float = 1e3
 
 
+def common_stamps_ns(setting: Setting) -> Ints:
+    """The common instants: every fix of the network that is last."""
+    stamps = [network.stamps_ns(setting.duration_s) for network in setting.networks]
+    return max(stamps, key=lambda own: int(own[0]))
+
+
 def position_rows(fixes: Array, sd_m: Array) -> Array:
     """Filter rows (2 n, ROW_WIDTH) of fixes (n, 2) with standard deviations (n,): those a tracker
     makes of them."""
@@ -167,9 +173,7 @@ class Stages:
         self.setting = setting
         self.networks = [Pass(setting, [network]) for network in setting.networks]
         self.central = Pass(setting, setting.networks)
-        reference = max(self.networks, key=lambda p: int(p.stamps_ns[0]))
-        self.stamps_ns = reference.stamps_ns
-        """The common instants: every fix of the network that is last."""
+        self.stamps_ns = common_stamps_ns(setting)
         self.time_s = (self.stamps_ns - START_NS) / NS
         self._moves = [self._to_common(p.stamps_ns) for p in (*self.networks, self.central)]
         self.covs: dict[str, Array] = {}

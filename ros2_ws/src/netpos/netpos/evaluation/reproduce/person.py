@@ -1,8 +1,9 @@
 """A person whose steps are not as long as dead reckoning believes, and whose heading is off, round
 petukhov's rectangle with the anchor hidden: with and without a state for it.
 
-Everything goes through the tracker as in a live run; its parameters are those of the scenario
-``pedestrian_rectangle``.
+Everything goes through the tracker as in a live run, but a step's velocity comes during the step;
+parameters are those of the scenario ``pedestrian_rectangle``. The paper's scheme and the library's
+defaults, neither of which estimates the person, walk beside it.
 """
 
 from __future__ import annotations
@@ -13,11 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netpos.evaluation.consistency import nees
+from netpos.evaluation.consistency import MeanTest, nees, nees_over_runs
+from netpos.evaluation.reproduce.chain_rows import SCHEME
 from netpos.evaluation.reproduce.experiment import VUE
 from netpos.evaluation.reproduce.frame import Row, Work, required, shown
 from netpos.evaluation.reproduce.rectangle import ERRORS, Case, setup_of
 from netpos.evaluation.reproduce.steps import Person, reported_velocity, velocity_rows
+from netpos.evaluation.reproduce.waist_chain import Variant
+from netpos.evaluation.reproduce.walk_figures import FAR_M
 from netpos.filters.measurement import ORIGIN
 from netpos.messages.values import Array, Beacon, TrackState, Velocity
 from netpos.radio.noise import generator
@@ -27,10 +31,13 @@ RUNS = 100  # at most: every run is a tracker's, message by message
 HIDDEN_S = (10.0, 25.0)
 OFF = (0.10, 0.15)  # of the length
 HEADING_SD_RAD = math.radians(3.0)
-Settings = tuple[tuple[str, object], ...]
 
-UNKNOWN: Settings = (("step_length_factor_sd", 0.0), ("step_heading_offset_sd_rad", 0.0))
-ESTIMATED: Settings = (("step_length_factor_sd", 0.12), ("step_heading_offset_sd_rad", 0.05))
+UNKNOWN = Variant(name="not estimated")
+ESTIMATED = Variant(
+    name="estimated",
+    settings=(("step_length_factor_sd", 0.12), ("step_heading_offset_sd_rad", 0.05)),
+)
+DEFAULTS = Variant(name="defaults", defaults=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,14 +60,20 @@ def person_of(seed: int) -> Person:
     return Person(length_factor=1.0 + off, heading_offset_rad=HEADING_SD_RAD * rng.normal())
 
 
-def case_of(settings: Settings) -> Case:
+def case_of(variant: Variant) -> Case:
     """The rectangle with the anchor hidden."""
-    return Case(name="person", wavelengths=4.0, tracker=settings, hidden_s=HIDDEN_S)
+    return Case(
+        name="person",
+        wavelengths=4.0,
+        tracker=variant.settings,
+        defaults=variant.defaults,
+        hidden_s=HIDDEN_S,
+    )
 
 
-def walk(seed: int, settings: Settings) -> Walk:
-    """One seed through a tracker with ``settings`` over the scenario's own."""
-    setup, person = setup_of(case_of(settings)), person_of(seed)
+def walk(seed: int, variant: Variant) -> Walk:
+    """One seed through a tracker."""
+    setup, person = setup_of(case_of(variant)), person_of(seed)
     rng = generator(seed, f"{VUE}/steps")
     rows, _ = velocity_rows(setup.times_s, setup.steps, ERRORS, rng, 0.0, person)
     tracker = Tracker(setup.config)
@@ -109,26 +122,54 @@ def _scored(outputs: list[TrackOutput], truth: dict[int, Array], person: Person)
     )
 
 
-def _job(settings: Settings, seeds: range) -> list[Walk]:
-    return [walk(seed, settings) for seed in seeds]
+def _job(variant: Variant, seeds: range) -> list[Walk]:
+    return [walk(seed, variant) for seed in seeds]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Summary:
+    """heard_rmse_m : while the anchor is heard. hidden_rmse_m, hidden_nees : once it has been
+    hidden for 5 s. first_s : mean time of the first scored estimate. far : share of runs with an
+    error above 5 m."""
+
+    heard_rmse_m: float
+    hidden_rmse_m: float
+    hidden_nees: MeanTest
+    first_s: float
+    far: float
+
+    @classmethod
+    def of(cls, runs: list[Walk]) -> _Summary:
+        heard, _ = window(runs, 0.0, HIDDEN_S[0])
+        hidden, test = window(runs, HIDDEN_S[0] + 5.0, HIDDEN_S[1])
+        far = [(np.hypot(*run.error.T) > FAR_M).any() for run in runs]
+        return cls(
+            heard_rmse_m=heard,
+            hidden_rmse_m=hidden,
+            hidden_nees=test,
+            first_s=float(np.mean([run.times_s[0] for run in runs])),
+            far=float(np.mean(far)),
+        )
 
 
 def rows(work: Work) -> Iterator[Row]:
-    """Figures of both, hidden and not."""
+    """Figures of all, hidden and not."""
     few = work.with_runs(min(work.runs, RUNS))
-    unknown, estimated = (
-        [run for part in few.over_seeds(f"person, {label}", _job, settings) for run in part]
-        for label, settings in (("unknown", UNKNOWN), ("estimated", ESTIMATED))
-    )
+    walks = {
+        variant.name: [
+            run
+            for part in few.over_seeds(f"person, {variant.name}", _job, variant)
+            for run in part
+        ]
+        for variant in (UNKNOWN, ESTIMATED, SCHEME, DEFAULTS)
+    }
+    by = {name: _Summary.of(runs) for name, runs in walks.items()}
     name = "steps 10 to 15 % off, heading 3 deg"
-    for what, runs in (("not estimated", unknown), ("estimated", estimated)):
-        heard, _ = _scores(runs, 0.0, HIDDEN_S[0])
-        hidden, values = _scores(runs, HIDDEN_S[0] + 5.0, HIDDEN_S[1])
-        yield shown(f"{name}, {what}: RMSE", "m", heard)
-        yield shown(f"{name}, {what}: RMSE, anchor hidden for 5 to 15 s", "m", hidden)
-        yield shown(f"{name}, {what}: NEES then, mean (expected 2)", "1", values)
-    off = np.array([run.off for run in estimated])
-    sd = np.array([run.sd for run in estimated])
+    for what in (UNKNOWN.name, ESTIMATED.name):
+        columns = by[what], by[SCHEME.name], by[DEFAULTS.name]
+        yield from _compared(f"{name}, {what}", *columns, judged=what == ESTIMATED.name)
+    off = np.array([run.off for run in walks[ESTIMATED.name]])
+    sd = np.array([run.sd for run in walks[ESTIMATED.name]])
     for i, (what, unit) in enumerate((("length factor", "1"), ("heading offset", "rad"))):
         rms = float(np.sqrt(np.mean(off[:, i] ** 2)))
         yield shown(f"{name}: error of the {what} after 10 s, RMS", unit, rms)
@@ -136,10 +177,33 @@ def rows(work: Work) -> Iterator[Row]:
         yield required(f"{name}: sd of the {what} then", unit, mean_sd, rms <= 1.2 * mean_sd)
 
 
-def _scores(runs: list[Walk], from_s: float, to_s: float) -> tuple[float, float]:
-    """RMSE [m] and mean NEES of the estimates between two times."""
-    chosen = [(run, (run.times_s >= from_s) & (run.times_s < to_s)) for run in runs]
-    error = np.concatenate([run.error[use] for run, use in chosen])
-    cov = np.concatenate([run.cov[use] for run, use in chosen])
-    rmse = float(np.sqrt((error**2).sum(axis=1).mean()))
-    return rmse, float(nees(error, cov)[0].mean())
+def _compared(
+    name: str, ours: _Summary, paper: _Summary, defaults: _Summary, *, judged: bool
+) -> Iterator[Row]:
+    """``judged``: the NEES is, as only a filter that estimates the person can be consistent."""
+    row = shown(f"{name}: RMSE", "m", ours.heard_rmse_m)
+    yield row.beside(paper.heard_rmse_m, defaults.heard_rmse_m)
+    row = shown(f"{name}: RMSE, anchor hidden for 5 to 15 s", "m", ours.hidden_rmse_m)
+    yield row.beside(paper.hidden_rmse_m, defaults.hidden_rmse_m)
+    test = ours.hidden_nees
+    label = f"{name}: NEES then, mean (expected 2)"
+    ok = test.consistent if judged else None
+    row = Row(name=label, unit="1", paper=None, ours=test.mean, ok=ok)
+    yield row.beside(paper.hidden_nees.mean, defaults.hidden_nees.mean)
+    row = shown(f"{name}: time before the first scored estimate", "s", ours.first_s)
+    yield row.beside(paper.first_s, defaults.first_s)
+    row = shown(f"{name}: share of runs with an error above 5 m", "1", ours.far)
+    yield row.beside(paper.far, defaults.far)
+
+
+def window(runs: list[Walk], from_s: float, to_s: float) -> tuple[float, MeanTest]:
+    """RMSE [m] and NEES of the estimates between two times."""
+    errors, sums, counts = [], [], []
+    for run in runs:
+        use = (run.times_s >= from_s) & (run.times_s < to_s)
+        values = nees(run.error[use], run.cov[use])[0]
+        errors.append(run.error[use])
+        sums.append(values.sum())
+        counts.append(values.size)
+    rmse = float(np.sqrt((np.concatenate(errors) ** 2).sum(axis=1).mean()))
+    return rmse, nees_over_runs(np.array(sums), np.array(counts), 2)

@@ -1,24 +1,25 @@
 """petukhov: one anchor with a long baseline, steps, a square-root UKF.
 
-The rectangle is walked as the paper has it, in steps of constant velocity, with dead reckoning by
-the paper's error model. ``paper`` is its scheme: the sector by the direction of the first step,
-step velocities taken as white, no gate. ``netpos`` is ours: a filter per sector, one error per
-step. The whole chain from a simulated gait is beside it, loose and tight.
+The headline is the whole chain from a simulated gait (``chain_rows``): the tracker hears of a
+step after the step. Beside it the rectangle is walked in steps of constant velocity, with dead
+reckoning by the paper's error model. There the tracker knows a step's velocity during the step,
+and the name of every such row says so. The column of the paper's own filter is its scheme: the
+sector by the direction of the first step, step velocities taken as white, no gate.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from netpos.evaluation.consistency import MeanTest, chi2_mean_bounds, effective_size, nees
-from netpos.evaluation.reproduce import person, rectangle
+from netpos.evaluation.reproduce import chain_rows, person, rectangle
 from netpos.evaluation.reproduce import petukhov_pictures as pictures
+from netpos.evaluation.reproduce.chain_rows import PAPER, RATIO, RMSE_M
 from netpos.evaluation.reproduce.frame import (
     Outcome,
     Row,
@@ -31,32 +32,27 @@ from netpos.evaluation.reproduce.frame import (
 from netpos.evaluation.reproduce.rectangle import Case, Walked
 from netpos.evaluation.reproduce.sector_choice import Conditions, Found, sector_choice
 from netpos.evaluation.reproduce.troubles import Trouble
-from netpos.evaluation.reproduce.waist_chain import Chain, run_chain, run_chains
 from netpos.evaluation.reproduce.walk_bound import known_instants_rmse_m
+from netpos.evaluation.reproduce.walk_figures import (
+    FAR_M,
+    LOST_M,
+    Figures,
+    Scores,
+    ratio_at_same_instants,
+)
 from netpos.messages.values import Array
 
-RMSE_M, RATIO, LIVE_RMSE_M = 0.03, 2.0, 0.12
-AIM_M, HIDDEN_M = 0.02, 0.5
+DURING = "step velocities during the step they describe"
+AIM_M = 0.02
 RIGHT_AFTER = {2: 0.99, 5: 0.999}
 HIDDEN_S = (10.0, 15.0)
 DECIDED_S = 1.3  # when sectors are decided, for the bound
-CHAIN_RUNS = 40  # of the whole chain at most: it simulates an IMU
 
-PAPER = (
-    ("ambiguity", "step_heading"),
-    ("process_noise", "werner"),
-    ("steady_accel_density_mps2_sqrthz", 0.0),
-    ("velocity_step_sd_mps", 0.1),  # sigma_xi = 1 m/s^2 over T = 0.1 s (petukhov:eq.2, 4, 23)
-    ("velocity_correlation_s", 0.0),
-    ("gate_probability", 1.0),
-)
-LONG = Case(name="netpos, L = 4 lambda", wavelengths=4.0)
-SHORT = Case(name="netpos, L = lambda/2", wavelengths=0.5)
-PAPER_LONG = Case(name="paper's scheme, L = 4 lambda", wavelengths=4.0, tracker=PAPER)
-PAPER_SHORT = Case(name="paper's scheme, L = lambda/2", wavelengths=0.5, tracker=PAPER)
+LONG = Case(name="L = 4 lambda", wavelengths=4.0)
+SHORT = Case(name="L = lambda/2", wavelengths=0.5)
 HIDDEN = Case(name="anchor hidden for 5 s", wavelengths=4.0, hidden_s=HIDDEN_S)
 
-WRONG_S, FAR_M = 10.0, 0.3
+WRONG_S, WRONG_M = 10.0, 0.3
 TROUBLES = tuple(
     Case(name=name, wavelengths=4.0, trouble=trouble)
     for name, trouble in (
@@ -73,88 +69,84 @@ TARGET = Conditions()
 BY_BASELINE = tuple(Conditions(wavelengths=w) for w in (1.0, 2.0, 6.0, 8.0, 10.0))
 BY_PHASE = tuple(Conditions(phase_sd_deg=sd) for sd in (3.0, 12.0, 18.0, 30.0))
 POOR_HEADING = Conditions(heading_sd_deg=6.0)
-# The IMU's forward acceleration is not all there is: a turn on the spot may have to be revealed.
-TIGHT = (("motion_model", "inertial"), ("manoeuvre_speed_sd_mps", 0.3))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Figures:
-    """Over all runs of a case: RMSE and largest error of the decided estimates, their NEES;
-    error2 (runs, n) m^2, NaN where not decided."""
+class Compared:
+    """Figures of netpos, of the paper's scheme (None where it has none) and of the library's
+    defaults, on the same runs."""
 
-    runs: int
-    rmse_m: float
-    error_max_m: float
-    nees: MeanTest
-    decided_s: float
-    lost: int
-    error2: Array
+    ours: Figures
+    paper: Figures | None
+    defaults: Figures
+
+
+def paper_s(case: Case) -> Case:
+    """The paper's scheme in the same case."""
+    return replace(case, name=f"{case.name}, paper's scheme", tracker=PAPER)
+
+
+def by_default(case: Case) -> Case:
+    """The library's default parameters in the same case."""
+    return replace(case, name=f"{case.name}, defaults", defaults=True)
 
 
 def warm_up() -> None:
     """Compile, or load, every kernel."""
-    for case in (LONG, PAPER_LONG):
+    for case in (LONG, paper_s(LONG), by_default(LONG)):
         rectangle.setup_of(case).run(0)
-    run_chain(0)
-    run_chain(0, TIGHT)
+    chain_rows.warm_up()
     person.walk(0, person.ESTIMATED)
 
 
 def reproduce(work: Work) -> Outcome:
     """All rows, and pictures of the run with the first seed."""
-    cases = (LONG, SHORT, PAPER_LONG, PAPER_SHORT, HIDDEN)
-    walked = {case: _figures(work, case) for case in cases}
-    conditions = (TARGET, *BY_BASELINE, *BY_PHASE, POOR_HEADING)
-    found = {c: sector_choice(work, c) for c in conditions}
+    chain = tuple(chain_rows.rows(work))
+    walked = {case: compared(work, case) for case in (LONG, SHORT, HIDDEN)}
+    conditions = (TARGET, POOR_HEADING)
+    known = {c: sector_choice(work, replace(c, defaults=True)) for c in conditions}
+    found = {c: sector_choice(work, c) for c in (*conditions, *BY_BASELINE, *BY_PHASE)}
     some = work.with_runs(min(work.runs, TROUBLED_RUNS))
-    troubled = {case: _figures(some, case) for case in TROUBLES}
-    few = work.with_runs(min(work.runs, CHAIN_RUNS))
-    chains = {
-        "loose": run_chains(few, "whole chain, loose"),
-        "tight": run_chains(few, "whole chain, tight", TIGHT),
-    }
-    rows = [
-        *_walk(rectangle.setup_of(LONG)),
-        *_pair(walked[PAPER_LONG], walked[PAPER_SHORT], PAPER_LONG, PAPER_SHORT),
-        *_pair(walked[LONG], walked[SHORT], LONG, SHORT),
+    troubled = {case: compared(some, case) for case in TROUBLES}
+    during = [
+        *_baselines(walked[LONG], walked[SHORT]),
         *_beyond(walked),
         *_troubled(troubled),
-        *_sectors(found),
-        *_chains(chains),
+        *_sectors(found, known),
         *person.rows(work),
     ]
-    return Outcome(rows=tuple(rows), draw=partial(_draw, work.seed, walked, found))
+    rows = (*chain, *_walk(rectangle.setup_of(LONG)), *_during(during))
+    return Outcome(rows=rows, draw=partial(_draw, work.seed, walked, found))
 
 
-def _job(case: Case, seeds: range) -> list[tuple[Array, Array, float]]:
-    """Squared errors (n,), NEES (n,), NaN where not decided, and the time of decision."""
+def _during(rows: Iterable[Row]) -> Iterator[Row]:
+    """The same rows, each labelled with what no causal system has."""
+    return (replace(row, name=f"{row.name}; {DURING}") for row in rows)
+
+
+def _job(case: Case, seeds: range) -> list[Scores]:
     setup = rectangle.setup_of(case)
     return [_scores(setup.run(seed)) for seed in seeds]
 
 
-def _scores(run: Walked) -> tuple[Array, Array, float]:
-    values = np.full(len(run.times_s), np.nan)
-    error = (run.mean[:, :2] - run.truth)[run.decided]
-    normalised, usable = nees(error, run.cov[run.decided][:, :2, :2])
-    values[np.flatnonzero(run.decided)[usable]] = normalised
-    first = float(run.times_s[np.argmax(run.decided)]) if run.decided.any() else np.inf
-    return run.error_m**2, values, first
+def _scores(run: Walked) -> Scores:
+    error = np.where(run.decided[:, None], run.mean[:, :2] - run.truth, np.nan)
+    return Scores.of(error, run.cov[:, :2, :2])
 
 
-def _figures(work: Work, case: Case) -> Figures:
+def figures_of(work: Work, case: Case) -> Figures:
+    """All seeds of a case."""
     runs = [run for part in work.over_seeds(case.name, _job, case) for run in part]
-    error2 = np.array([run[0] for run in runs])
-    series = [run[1][np.isfinite(run[1])] for run in runs]
-    n_eff = sum(effective_size(s) for s in series if s.size)
-    values = np.concatenate(series)
-    return Figures(
-        runs=len(runs),
-        rmse_m=float(np.sqrt(np.nanmean(error2))),
-        error_max_m=float(np.sqrt(np.nanmax(error2))),
-        nees=MeanTest(mean=float(values.mean()), bounds=chi2_mean_bounds(2, n_eff), n_eff=n_eff),
-        decided_s=float(np.mean([run[2] for run in runs])),
-        lost=int(np.sum(np.nanmax(error2[:, -20:], axis=1) > HIDDEN_M**2)),
-        error2=error2,
+    return Figures.of(rectangle.setup_of(case).times_s, runs)
+
+
+def compared(work: Work, case: Case) -> Compared:
+    """A case by all three. The paper's scheme has no answer to a wrong sector."""
+    wrong = case.trouble.wrong_s is not None
+    return Compared(
+        ours=figures_of(work, case),
+        paper=None if wrong else figures_of(work, paper_s(case)),
+        defaults=figures_of(work, by_default(case)),
     )
 
 
@@ -172,129 +164,158 @@ def _walk(setup: rectangle.Setup) -> Iterator[Row]:
         yield Row(name=f"rectangle: {name}", unit=unit, paper=float(paper), ours=ours, ok=ok)
 
 
-def _pair(long: Figures, short: Figures, long_case: Case, short_case: Case) -> Iterator[Row]:
+def _beside(row: Row, case: Compared, figure: Callable[[Figures], float]) -> Row:
+    """A row with the same figure of the paper's scheme and of the defaults."""
+    paper = None if case.paper is None else figure(case.paper)
+    return row.beside(paper, figure(case.defaults))
+
+
+def _common(name: str, case: Compared) -> Iterator[Row]:
+    """Largest error, consistency, time not scored and lost runs."""
+    ours = case.ours
+    row = shown(f"{name}: largest error", "m", ours.error_max_m)
+    yield _beside(row, case, lambda f: f.error_max_m)
+    row = shown(f"{name}: sector decided after (1 s of standing first)", "s", ours.decided_s[0])
+    yield _beside(row, case, lambda f: f.decided_s[0])
+    row = shown(f"{name}: share of instants not scored", "1", ours.unscored)
+    yield _beside(row, case, lambda f: f.unscored)
+    row = shown(f"{name}: share of runs with an error above 5 m", "1", ours.share_above(FAR_M))
+    yield _beside(row, case, lambda f: f.share_above(FAR_M))
+    row = required(f"{name}: runs lost at their end", "1", ours.lost, ours.lost == 0)
+    yield _beside(row, case, lambda f: f.lost)
+
+
+def _baselines(long: Compared, short: Compared) -> Iterator[Row]:
     """A long and a standard baseline beside each other."""
-    yield at_most(f"{long_case.name}: RMSE", "m", long.rmse_m, RMSE_M)
-    for figures, case in ((long, long_case), (short, short_case)):
-        if figures is short:
-            yield shown(f"{case.name}: RMSE", "m", figures.rmse_m)
-        yield shown(f"{case.name}: largest error", "m", figures.error_max_m)
-        yield shown(f"{case.name}: runs that end in a wrong place", "1", figures.lost)
-        own = case in (LONG, SHORT)
-        ok = figures.nees.mean <= figures.nees.bounds[1]
-        name = f"{case.name}: NEES, mean (expected 2)"
-        yield (
-            required(name, "1", figures.nees.mean, ok)
-            if own
-            else shown(name, "1", figures.nees.mean)
+    row = at_most(f"{LONG.name}: RMSE", "m", long.ours.rmse_m, RMSE_M)
+    yield _beside(row, long, lambda f: f.rmse_m)
+    row = required(
+        f"{LONG.name}: RMSE, aim 0.02 m", "m", long.ours.rmse_m, long.ours.rmse_m <= AIM_M
+    )
+    yield _beside(row, long, lambda f: f.rmse_m)
+    row = shown(f"{SHORT.name}: RMSE", "m", short.ours.rmse_m)
+    yield _beside(row, short, lambda f: f.rmse_m)
+    gains = [
+        None if above is None or below is None else ratio_at_same_instants(above, below)
+        for above, below in (
+            (short.ours, long.ours),
+            (short.paper, long.paper),
+            (short.defaults, long.defaults),
         )
-    scheme = long_case.name.split(",")[0]
-    ratio = short.rmse_m / long.rmse_m
-    yield at_least(f"{scheme}: RMSE of lambda/2 over that of 4 lambda", "1", ratio, RATIO)
+    ]
+    name = "RMSE of lambda/2 over that of 4 lambda, at the same instants"
+    yield at_least(name, "1", gains[0], RATIO).beside(gains[1], gains[2])
+    for case, figures in ((LONG, long), (SHORT, short)):
+        test = figures.ours.nees
+        name = f"{case.name}: NEES, mean (expected 2)"
+        row = required(name, "1", test.mean, test.consistent)
+        yield _beside(row, figures, lambda f: f.nees.mean)
+        yield from _common(case.name, figures)
 
 
-def _beyond(walked: dict[Case, Figures]) -> Iterator[Row]:
+def _beyond(walked: dict[Case, Compared]) -> Iterator[Row]:
     """What the paper does not show."""
-    ours, hidden = walked[LONG], walked[HIDDEN]
-    yield required(f"{LONG.name}: RMSE, aim 0.02 m", "m", ours.rmse_m, ours.rmse_m <= AIM_M)
-    yield shown(f"{LONG.name}: sector decided after (1 s of standing first)", "s", ours.decided_s)
     for case in (LONG, SHORT):
         name = f"{case.name}: bound of who knows when the walk changes"
         setup = rectangle.setup_of(case)
         yield shown(name, "m", known_instants_rmse_m(setup, DECIDED_S))
         bound = known_instants_rmse_m(setup, DECIDED_S, every_step=True)
         yield shown(f"{name}, maybe at every step", "m", bound)
+    hidden = walked[HIDDEN]
+    worst, late = (_largest_hidden(hidden.ours, quantile) for quantile in (1.0, 0.95))
+    row = required(f"{HIDDEN.name}: largest error of all runs then", "m", worst, worst < LOST_M)
+    yield _beside(row, hidden, lambda f: _largest_hidden(f, 1.0))
+    row = shown(f"{HIDDEN.name}: largest error then, 95 % of runs", "m", late)
+    yield _beside(row, hidden, lambda f: _largest_hidden(f, 0.95))
+    yield from _common(HIDDEN.name, hidden)
+
+
+def _largest_hidden(figures: Figures, quantile: float) -> float:
+    """Quantile over the runs of the largest error [m] while the anchor is hidden."""
     times = rectangle.setup_of(HIDDEN).times_s
     gone = (times >= HIDDEN_S[0]) & (times < HIDDEN_S[1])
-    largest = np.sqrt(np.nanmax(hidden.error2[:, gone], axis=1))
-    worst = float(largest.max())
-    yield required(f"{HIDDEN.name}: largest error of all runs", "m", worst, worst < HIDDEN_M)
-    yield shown(
-        f"{HIDDEN.name}: largest error, 95 % of runs", "m", float(np.quantile(largest, 0.95))
-    )
-    yield required(
-        f"{HIDDEN.name}: runs that end in a wrong place", "1", hidden.lost, hidden.lost == 0
-    )
+    largest = np.nanmax(figures.error2[:, gone], axis=1)
+    return float(np.sqrt(np.nanquantile(largest, quantile)))
 
 
-def _troubled(troubled: dict[Case, Figures]) -> Iterator[Row]:
+def _troubled(troubled: dict[Case, Compared]) -> Iterator[Row]:
     """What no one promises: the tracker is not told of these. Errors of decided estimates."""
     for case, figures in troubled.items():
-        error = np.sqrt(figures.error2)
-        yield shown(f"{case.name}: RMSE", "m", figures.rmse_m)
-        worst = np.nanmax(error, axis=1)
-        yield shown(f"{case.name}: largest error, median run", "m", float(np.median(worst)))
-        yield shown(f"{case.name}: NEES, mean (expected 2)", "1", figures.nees.mean)
-        decided = np.isfinite(error)
-        far = float((error[decided] > FAR_M).mean())
-        yield shown(f"{case.name}: decided and more than {FAR_M} m off", "1", far)
-        lost = figures.lost
-        yield required(f"{case.name}: runs that end in a wrong place", "1", lost, lost == 0)
+        name, ours = case.name, figures.ours
+        row = shown(f"{name}: RMSE", "m", ours.rmse_m)
+        yield _beside(row, figures, lambda f: f.rmse_m)
+        row = shown(f"{name}: largest error, median run", "m", _median_largest(ours))
+        yield _beside(row, figures, _median_largest)
+        row = shown(f"{name}: NEES, mean (expected 2)", "1", ours.nees.mean)
+        yield _beside(row, figures, lambda f: f.nees.mean)
+        label = f"{name}: decided and more than {WRONG_M} m off"
+        yield _beside(shown(label, "1", _share_wrong(ours)), figures, _share_wrong)
+        yield from _common(name, figures)
         if case.trouble.wrong_s is not None:
-            repaired = _repair_s(error, rectangle.setup_of(case).times_s)
-            yield shown(f"{case.name}: repaired after, mean", "s", float(repaired.mean()))
+            times = rectangle.setup_of(case).times_s
+            repaired = _repair_s(np.sqrt(ours.error2), times)
+            yield shown(f"{name}: repaired after, mean", "s", float(repaired.mean()))
             late = float(np.quantile(repaired, 0.95))
-            yield shown(f"{case.name}: repaired after, 95 % of runs", "s", late)
+            yield shown(f"{name}: repaired after, 95 % of runs", "s", late)
+
+
+def _median_largest(figures: Figures) -> float:
+    """Median over the runs of the largest error [m]."""
+    largest = np.nanmax(np.nan_to_num(figures.error2), axis=1)
+    return float(np.sqrt(np.median(largest)))
+
+
+def _share_wrong(figures: Figures) -> float:
+    """Share of the scored estimates that are more than ``WRONG_M`` off."""
+    error2 = figures.error2[np.isfinite(figures.error2)]
+    return float((error2 > WRONG_M**2).mean())
 
 
 def _repair_s(error: Array, times_s: Array) -> Array:
     """How long after ``WRONG_S`` the errors (runs, n) are small for good, and decided: (runs,)."""
-    bad = ~(error <= FAR_M)  # NaN, too
+    bad = ~(error <= WRONG_M)  # NaN, too
     bad[:, times_s < WRONG_S] = False
     last = error.shape[1] - 1 - np.argmax(bad[:, ::-1], axis=1)
     after: Array = times_s[np.minimum(last + 1, len(times_s) - 1)] - WRONG_S
     return np.where(bad.any(axis=1), after, 0.0)
 
 
-def _sectors(found: dict[Conditions, Found]) -> Iterator[Row]:
-    target = found[TARGET]
-    name = "sector, L = 4 lambda"
+def _sectors(found: dict[Conditions, Found], known: dict[Conditions, Found]) -> Iterator[Row]:
+    """The paper's scheme decides by one step and keeps to it: its column is its rule on one step.
+
+    known : the same by the library's defaults
+    """
+    target, defaults = found[TARGET], known[TARGET]
+    name, rule = "sector, L = 4 lambda", target.rule_share
     for step, least in RIGHT_AFTER.items():
         share = target.share_right(step)
-        yield required(f"{name}: right after {step} steps", "1", share, share >= least)
-        claimed = float(target.claimed[:, step - 1].mean())
-        yield shown(f"{name}: its own probability after {step} steps", "1", claimed)
-        yield shown(f"{name}: decided after {step} steps", "1", target.share_decided(step))
+        row = required(f"{name}: right after {step} steps", "1", share, share >= least)
+        yield row.beside(rule, defaults.share_right(step))
+        claimed = (float(f.claimed[:, step - 1].mean()) for f in (target, defaults))
+        row = shown(f"{name}: its own probability after {step} steps", "1", next(claimed))
+        yield row.beside(None, next(claimed))
+        row = shown(f"{name}: decided after {step} steps", "1", target.share_decided(step))
+        yield row.beside(1.0, defaults.share_decided(step))
         wrong = target.share_wrong(step)
-        yield required(f"{name}: decided wrongly after {step} steps", "1", wrong, wrong <= 0.001)
-    yield shown(f"{name}: right by the paper's rule on one step", "1", target.rule_share)
-    poor = found[POOR_HEADING]
+        row = required(f"{name}: decided wrongly after {step} steps", "1", wrong, wrong <= 0.001)
+        yield row.beside(1.0 - rule, defaults.share_wrong(step))
+    poor, defaults = found[POOR_HEADING], known[POOR_HEADING]
     for step in RIGHT_AFTER:
         label = f"{name}, heading sd 6 deg: right after {step} steps"
-        yield shown(label, "1", poor.share_right(step))
-    yield shown(
-        f"{name}, heading sd 6 deg: decided wrongly after 5 steps", "1", poor.share_wrong(5)
-    )
+        row = shown(label, "1", poor.share_right(step))
+        yield row.beside(poor.rule_share, defaults.share_right(step))
+    label = f"{name}, heading sd 6 deg: decided wrongly after 5 steps"
+    row = shown(label, "1", poor.share_wrong(5))
+    yield row.beside(1.0 - poor.rule_share, defaults.share_wrong(5))
     for conditions in BY_BASELINE + BY_PHASE:
         result = found[conditions]
-        yield shown(f"{conditions.name}: right after 2 steps", "1", result.share_right(2))
-        yield shown(f"{conditions.name}: right after 5 steps", "1", result.share_right(5))
-        yield shown(f"{conditions.name}: right by the paper's rule", "1", result.rule_share)
-
-
-def _chains(chains: dict[str, list[Chain]]) -> Iterator[Row]:
-    """Gait, IMU, dead reckoning and tracker together; the paper's live experiment is the only
-    figure to compare with."""
-    for scheme, runs in chains.items():
-        error2 = np.concatenate([(run.error[run.tracking] ** 2).sum(axis=1) for run in runs])
-        name = f"whole chain from the IMU, {scheme}"
-        yield at_most(
-            f"{name}: RMSE (paper: live)", "m", float(np.sqrt(error2.mean())), LIVE_RMSE_M
-        )
-        yield shown(f"{name}: largest error", "m", float(np.sqrt(error2.max())))
-        values = [nees(run.error[run.tracking], run.cov[run.tracking])[0] for run in runs]
-        yield shown(f"{name}: NEES, mean (expected 2)", "1", float(np.concatenate(values).mean()))
-    steps = np.array([run.steps_found for run in chains["loose"]])
-    yield required(
-        "whole chain: runs with all 32 steps found",
-        "1",
-        float((steps == rectangle.STEPS).mean()),
-        bool((steps == rectangle.STEPS).all()),
-    )
+        for step in RIGHT_AFTER:
+            label = f"{conditions.name}: right after {step} steps"
+            yield shown(label, "1", result.share_right(step)).beside(result.rule_share)
 
 
 def _draw(
-    seed: int, walked: dict[Case, Figures], found: dict[Conditions, Found], folder: Path
+    seed: int, walked: dict[Case, Compared], found: dict[Conditions, Found], folder: Path
 ) -> list[Path]:
     runs = {case: rectangle.setup_of(case).run(seed) for case in (LONG, SHORT)}
     by_baseline = (*BY_BASELINE[:2], TARGET, *BY_BASELINE[2:])
@@ -305,7 +326,7 @@ def _draw(
         "fig9_errors": pictures.errors(
             rectangle.setup_of(LONG).times_s,
             {case.name: np.sqrt(run.error_m**2) for case, run in runs.items()},
-            {case.name: walked[case].error2 for case in runs},
+            {case.name: walked[case].ours.error2 for case in runs},
         ),
         "sectors": pictures.success(
             [(c, found[c]) for c in by_baseline], [(c, found[c]) for c in by_phase]

@@ -96,7 +96,8 @@ def _draw_track(axes: Axes, sample: Sample) -> None:
 
 
 def _draw_ellipses(axes: Axes, track: Track) -> None:
-    chosen = np.unique(np.linspace(0, len(track.mean) - 1, _ELLIPSES).astype(int))
+    tracked = np.flatnonzero(track.tracked)
+    chosen = np.unique(tracked[np.linspace(0, tracked.size - 1, _ELLIPSES).astype(int)])
     major, minor, angle = ellipse_axes(track.cov[chosen, :2, :2])
     axes.add_collection(
         EllipseCollection(

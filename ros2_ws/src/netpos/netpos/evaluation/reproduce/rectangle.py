@@ -1,7 +1,9 @@
 """petukhov's walk round the rectangle: one seed through simulator and tracker.
 
 Radio is that of the scenario ``pedestrian_rectangle``; the person walks at constant speed in
-steps, as the paper has it, and dead reckoning is its error model (``steps``).
+steps, as the paper has it, and dead reckoning is its error model (``steps``). A step's velocity is
+known during the step, which no system has that must first see the step end: ``waist_chain`` is the
+walk as a system hears it.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from netpos.evaluation.reproduce.steps import (
     velocity_rows,
 )
 from netpos.evaluation.reproduce.troubles import NO_TROUBLE, Trouble, within
+from netpos.evaluation.reproduce.waist_chain import Settings, config_of
 from netpos.filters.measurement import GROUP, VALUE, predict_row
 from netpos.filters.motion import NO_BIAS
 from netpos.messages.values import Array
@@ -57,12 +60,14 @@ _BASELINE = "rsus.units.0.antennas.baseline_wavelengths"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """A way to walk the rectangle: baseline, settings of the tracker over the scenario's own,
-    when the anchor is hidden (from, to) [s], and what else goes wrong."""
+    """A way to walk the rectangle: baseline, settings of the tracker over the scenario's own or,
+    with ``defaults``, over the library's, when the anchor is hidden (from, to) [s], and what else
+    goes wrong."""
 
     name: str
     wavelengths: float
-    tracker: tuple[tuple[str, object], ...] = ()
+    tracker: Settings = ()
+    defaults: bool = False
     hidden_s: tuple[float, float] | None = None
     trouble: Trouble = NO_TROUBLE
 
@@ -95,7 +100,7 @@ class Setup:
         changes = {"devices.0": _DEVICE, _BASELINE: case.wavelengths}
         scenario = load_scenario("pedestrian_rectangle", changes=changes)
         self.simulation = Simulation(scenario)
-        self.config = TrackerConfig.from_mapping({**scenario.tracker, **dict(case.tracker)})
+        self.config = config_of(scenario, case.tracker, case.defaults)
         self._case = case
         self._templates = RowTemplates.of(self.simulation.rsus, self.simulation.fields)
         beacons = self.simulation.beacons(VUE)
@@ -150,7 +155,7 @@ class Setup:
                     start, estimate, rejected = PhaseStart(self.config), None, 0
             last_ns = stamp
             if estimate is not None:
-                mean[k], cov[k], decided[k] = estimate.mean, estimate.cov, estimate.decided
+                mean[k], cov[k], decided[k] = estimate.mean, estimate.cov, not estimate.modes
         return Walked(self.times_s, self.truth, mean, cov, decided, nis, dof)
 
 

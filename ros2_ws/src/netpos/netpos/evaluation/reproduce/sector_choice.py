@@ -18,6 +18,7 @@ from netpos.evaluation.reproduce.steps import (
     reported_velocity,
     velocity_rows,
 )
+from netpos.evaluation.reproduce.waist_chain import SCENARIO, config_of
 from netpos.filters.measurement import GATE_VARIANCE, VALUE, VARIANCE
 from netpos.filters.motion import NO_BIAS
 from netpos.filters.rows import rsu_axes, rsu_rows
@@ -25,7 +26,6 @@ from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.radio.anchor import uwb_wavelength_m
 from netpos.radio.noise import generator
 from netpos.scenario import load_scenario
-from netpos.tracking.config import TrackerConfig
 from netpos.tracking.models import pose_state
 from netpos.tracking.sectors import Sectors
 from netpos.tracking.steadiness import Steadiness
@@ -42,17 +42,20 @@ AREA_M = ((-3.85, 0.5), (3.85, 7.0))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Conditions:
-    """An anchor, and how well range, phase and steps are measured."""
+    """An anchor, and how well range, phase and steps are measured; ``defaults``: the tracker has
+    the library's parameters and the device's height, not the scenario's."""
 
     wavelengths: float = 4.0
     phase_sd_deg: float = 6.0
     range_sd_m: float = 0.03
     heading_sd_deg: float = 3.0
+    defaults: bool = False
 
     @property
     def name(self) -> str:
         """For tables and progress."""
-        return f"L = {self.wavelengths:g} lambda, phase sd {self.phase_sd_deg:g} deg"
+        name = f"L = {self.wavelengths:g} lambda, phase sd {self.phase_sd_deg:g} deg"
+        return f"{name}, defaults" if self.defaults else name
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +93,7 @@ class Setup:
         wavelength_m = uwb_wavelength_m(5)
         self.conditions = conditions
         self.errors = StepErrors(heading_sd_rad=math.radians(conditions.heading_sd_deg))
-        self.config = TrackerConfig.from_mapping(load_scenario("pedestrian_rectangle").tracker)
+        self.config = config_of(load_scenario(SCENARIO), (), conditions.defaults)
         self.info = RsuInfo(
             rsu_id="anchor",
             position=np.array([0.0, 0.0, self.config.device_height_m]),

@@ -20,7 +20,7 @@ def test_levels_are_those_of_the_tracker(
     level is that of the covariance."""
     experiment = Experiment(
         name="past a turn",
-        scenario="metis_madrid",
+        scenario="metis_madrid_strong_signal",
         changes=(
             ("devices.0.beacon_interval_s", interval_s),
             ("measurement.nearest", rsus),

@@ -21,8 +21,8 @@ def test_people_differ_by_10_to_15_percent_either_way() -> None:
 @pytest.fixture(scope="module")
 def walks() -> dict[str, list[person.Walk]]:
     """Four people, with and without states for them."""
-    settings = {"unknown": person.UNKNOWN, "estimated": person.ESTIMATED}
-    return {name: [person.walk(seed, given) for seed in SEEDS] for name, given in settings.items()}
+    variants = {"unknown": person.UNKNOWN, "estimated": person.ESTIMATED}
+    return {name: [person.walk(seed, v) for seed in SEEDS] for name, v in variants.items()}
 
 
 def test_the_bank_finds_factor_and_offset(walks: dict[str, list[person.Walk]]) -> None:
@@ -41,7 +41,8 @@ def test_fifteen_hidden_seconds(walks: dict[str, list[person.Walk]]) -> None:
     rmse, nees = {}, {}
     for name, runs in walks.items():
         assert all(run.times_s[-1] > 24.8 for run in runs)  # hidden up to 25 s
-        rmse[name], nees[name] = person._scores(runs, 15.0, 25.0)
+        rmse[name], test = person.window(runs, 15.0, 25.0)
+        nees[name] = test.mean
     assert rmse["estimated"] < rmse["unknown"] / 3
     assert nees["estimated"] < 3 < nees["unknown"]
 
@@ -49,4 +50,10 @@ def test_fifteen_hidden_seconds(walks: dict[str, list[person.Walk]]) -> None:
 def test_rows_are_named_once() -> None:
     with Work(runs=1, seed=5000, workers=1) as work:
         rows = list(person.rows(work))
-    assert len({row.name for row in rows}) == len(rows) == 10
+    assert len({row.name for row in rows}) == len(rows) == 14
+    judged = [row for row in rows if "NEES" in row.name and row.ok is not None]
+    assert [row.name for row in judged] == [
+        "steps 10 to 15 % off, heading 3 deg, estimated: NEES then, mean (expected 2)"
+    ]
+    assert judged[0].baseline is not None
+    assert judged[0].defaults is not None

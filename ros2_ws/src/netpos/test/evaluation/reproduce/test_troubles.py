@@ -10,6 +10,7 @@ from netpos.evaluation.reproduce import petukhov, rectangle
 from netpos.evaluation.reproduce.frame import Work
 from netpos.evaluation.reproduce.rectangle import Case
 from netpos.evaluation.reproduce.troubles import NO_TROUBLE, Trouble
+from netpos.evaluation.reproduce.walk_figures import Figures
 from netpos.filters.measurement import ROW_WIDTH, VALUE, VARIANCE
 from netpos.messages.values import Array
 
@@ -58,12 +59,12 @@ def test_an_anchor_is_heard_now_and_then() -> None:
 
 
 @pytest.fixture(scope="module")
-def troubled() -> dict[Case, petukhov.Figures]:
+def troubled() -> dict[Case, Figures]:
     with Work(6, SEED, 1) as work:
-        return {case: petukhov._figures(work, case) for case in petukhov.TROUBLES}
+        return {case: petukhov.figures_of(work, case) for case in petukhov.TROUBLES}
 
 
-def test_the_tracker_gets_over_them(troubled: dict[Case, petukhov.Figures]) -> None:
+def test_the_tracker_gets_over_them(troubled: dict[Case, Figures]) -> None:
     reflected, blocked, seldom, poor, wrong = troubled.values()
     assert all(figures.lost == 0 for figures in troubled.values())
     assert reflected.rmse_m < 0.06
@@ -74,7 +75,7 @@ def test_the_tracker_gets_over_them(troubled: dict[Case, petukhov.Figures]) -> N
 
 
 def test_a_wrong_sector_is_repaired_within_seconds(
-    troubled: dict[Case, petukhov.Figures],
+    troubled: dict[Case, Figures],
 ) -> None:
     (case,) = (case for case in troubled if case.trouble.wrong_s is not None)
     times = rectangle.setup_of(case).times_s

@@ -1,0 +1,25 @@
+"""Yardsticks for recordings: least squares of one second, and a plain Kalman filter.
+
+They take the measurements of a bag, know nothing of netpos' filters, and have no parameter chosen
+by a score.
+"""
+
+from netpos.evaluation.baselines.observations import Kind, Observations, ranges, residuals
+from netpos.evaluation.baselines.of_bag import observations_of_bag
+from netpos.evaluation.baselines.plain_ekf import PlainConfig, PlainRun, plain_ekf
+from netpos.evaluation.baselines.snapshot import Fix, Space, snapshot, snapshots
+
+__all__ = [
+    "Fix",
+    "Kind",
+    "Observations",
+    "PlainConfig",
+    "PlainRun",
+    "Space",
+    "observations_of_bag",
+    "plain_ekf",
+    "ranges",
+    "residuals",
+    "snapshot",
+    "snapshots",
+]

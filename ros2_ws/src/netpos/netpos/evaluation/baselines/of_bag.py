@@ -1,0 +1,87 @@
+"""Measurements of a bag as neutral arrays: what the tracker is given, and no more."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from netpos.bags import BagReader, codec
+from netpos.evaluation.baselines.observations import Kind, Observations
+from netpos.messages import topics
+from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
+
+_Row = tuple[Kind, float, float]
+
+
+def observations_of_bag(
+    path: Path,
+    vue_id: str = "vue_1",
+    *,
+    range_sd_m: float | None = None,
+    kinds: Collection[Kind] = tuple(Kind),
+) -> Observations:
+    """Azimuths, elevations and ranges of one device in stamp order.
+
+    The sd holds all that the RSU states, noise and biases, as if it were white noise;
+    ``range_sd_m`` is used in its place for ranges. TOA, phases and position fixes are left out:
+    they need a clock, a sector, or nothing at all.
+
+    Raises
+    ------
+    BagError  not a bag, or one without RSUs or measurements
+    ValueError  no measurement of the device that these kinds take
+    """
+    with BagReader(path) as bag:
+        infos = [codec().rsu_info_from_msg(e.message) for e in bag.messages([topics.RSU_INFO])]
+        heard = [
+            codec().measurement_from_msg(e.message)
+            for e in bag.messages([topics.RSU_MEASUREMENTS])
+        ]
+    known = {info.rsu_id: info for info in infos}
+    axes = {i.rsu_id: Rotation.from_quat(i.quaternion).as_matrix().T for i in infos}
+    rows = [
+        (m, row)
+        for m in sorted(heard, key=lambda m: (m.stamp_ns, m.rsu_id))
+        if m.vue_id == vue_id and m.rsu_id in known
+        for row in _rows(m, known[m.rsu_id], range_sd_m)
+        if row[0] in kinds
+    ]
+    if not rows:
+        raise ValueError(f"{path} has no azimuth, elevation or range of {vue_id!r}")
+    n = len(rows)
+    return Observations(
+        stamp_ns=np.array([m.stamp_ns for m, _ in rows], dtype=np.int64),
+        kind=np.array([row[0] for _, row in rows], dtype=np.int64),
+        value=np.array([row[1] for _, row in rows]),
+        sd=np.array([row[2] for _, row in rows]),
+        rsu=np.array([known[m.rsu_id].position for m, _ in rows]),
+        other=np.zeros((n, 3)),
+        axes=np.array([axes[m.rsu_id] for m, _ in rows]),
+        lever_arm=_lever_arms([m for m, _ in rows]),
+    )
+
+
+def _lever_arms(measured: list[RsuMeasurement]) -> Array:
+    """(n, 3) m; zero where all are of one antenna, whose place is then the device's."""
+    arms = np.array([m.lever_arm for m in measured])
+    return arms if np.ptp(arms, axis=0).any() else np.zeros_like(arms)
+
+
+def _rows(m: RsuMeasurement, info: RsuInfo, range_sd_m: float | None) -> Iterator[_Row]:
+    cone = info.angle_convention is AngleConvention.CONE
+    if m.fields & Field.AZIMUTH and m.azimuth_var > 0:
+        scale = math.cos(m.azimuth_rad) if cone else 1.0
+        sd = math.hypot(math.sqrt(m.azimuth_var), info.azimuth_bias_sd_rad / scale)
+        yield (Kind.AZIMUTH_CONE if cone else Kind.AZIMUTH), m.azimuth_rad, sd
+    if m.fields & Field.ELEVATION and m.elevation_var > 0:
+        scale = math.cos(m.elevation_rad) if cone else 1.0
+        sd = math.hypot(math.sqrt(m.elevation_var), info.elevation_bias_sd_rad / scale)
+        yield Kind.ELEVATION, m.elevation_rad, sd
+    if m.fields & Field.RANGE and m.range_var > 0:
+        biases = math.hypot(info.range_bias_sd_m, info.common_range_bias_sd_m)
+        sd = range_sd_m or math.hypot(math.sqrt(m.range_var), biases)
+        yield Kind.RANGE, m.range_m, sd

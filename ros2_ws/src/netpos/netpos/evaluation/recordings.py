@@ -1,0 +1,139 @@
+"""A real recording beside its yardsticks: netpos, netpos with default parameters, a snapshot and a
+plain Kalman filter, all from the same bag against the same truth."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from netpos.bags import BagReader
+from netpos.evaluation.baselines import (
+    Kind,
+    Observations,
+    Space,
+    observations_of_bag,
+    plain_ekf,
+    snapshots,
+)
+from netpos.evaluation.evaluate import VueEvaluation, evaluate_bag
+from netpos.evaluation.metrics import Figures, Run, score
+from netpos.evaluation.pairing import Stamps, Trajectory
+from netpos.messages.values import TrackStatus
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.replay import replay_bag
+from netpos.tracking.settings import bag_settings
+
+Json = dict[str, Any]
+
+# What a recording is, not how a tracker is set: these stay with default parameters.
+FACTS = frozenset(
+    {"motion_model", "device_height_m", "gravity_mps2", "earth_rate", "latitude_deg", "network"}
+)
+# Figures of an estimate's accuracy, and figures of a whole run.
+ACCURACY = ("n", "rmse_m", "p50_m", "p95_m", "max_m", "nees_mean", "nees_bounds", "share_above_5m")
+WHOLE = (
+    "availability",
+    "nis_mean",
+    "lost_tracks",
+    "unscored_s",
+    "rejected",
+    "rejected_share",
+    "protection_exceeded",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recording:
+    """One row to measure. bag: as imported; space: what the baselines solve for; range_sd_m: their
+    sd of a range, None for what the RSUs state; reference: the authors' RMSE [m]; kinds: what
+    the baselines use."""
+
+    name: str
+    bag: Path
+    space: Space
+    range_sd_m: float | None = None
+    reference: float | None = None
+    kinds: Collection[Kind] = tuple(Kind)
+
+
+def recording_row(recording: Recording, folder: Path) -> Json:
+    """Replay into ``folder`` with the bag's parameters and with default ones, run the baselines,
+    and score all alike.
+
+    ``rmse_m`` and the other figures of accuracy of a baseline are of the tracker's epochs that
+    count; ``own`` holds those of all its epochs but the first 20.
+
+    Raises
+    ------
+    ValueError  the bag has no ground truth, no measurement, or several devices
+    FileExistsError  ``folder`` has a bag of this name
+    """
+    ours = _replayed(recording.bag, folder / recording.name, {})
+    defaults = _replayed(
+        recording.bag, folder / f"{recording.name}_defaults", default_parameters(recording.bag)
+    )
+    seen = observations_of_bag(
+        recording.bag, range_sd_m=recording.range_sd_m, kinds=recording.kinds
+    )
+    counted = ours.scored.counted.estimate.stamp_ns
+    return {
+        "name": recording.name,
+        "reference": recording.reference,
+        **baseline_figures(seen, recording.space, ours.run.truth, counted),
+        "ours": figures_of(ours.scored.figures),
+        "defaults": figures_of(defaults.scored.figures),
+    }
+
+
+def default_parameters(bag: Path) -> Json:
+    """Overrides that give every parameter a bag carries its default again, but for the facts of
+    the recording (``FACTS``)."""
+    with BagReader(bag) as source:
+        carried = bag_settings(source.metadata).parameters
+    usual = TrackerConfig()
+    return {name: getattr(usual, name) for name in carried if name not in FACTS}
+
+
+def _replayed(bag: Path, out: Path, overrides: Json) -> VueEvaluation:
+    replay_bag(bag, out, overrides)
+    vues = evaluate_bag(out).vues
+    if len(vues) != 1:
+        raise ValueError(f"{bag} holds {len(vues)} devices with ground truth; one is needed")
+    (only,) = vues.values()
+    return only
+
+
+def baseline_figures(
+    seen: Observations, space: Space, truth: Trajectory, counted: Stamps | None = None
+) -> dict[str, Json]:
+    """Figures of both baselines; accuracy at the stamps ``counted`` (None: at all of their own)
+    and, as ``own``, at all of their own."""
+    filtered = plain_ekf(seen, space)
+    runs: list[tuple[str, Trajectory, list[TrackStatus]]] = [
+        ("snapshot", snapshots(seen, space), []),
+        ("plain_ekf", filtered.estimate, filtered.statuses),
+    ]
+    rows: dict[str, Json] = {}
+    for name, estimate, statuses in runs:
+        whole = score(Run(truth=truth, estimate=estimate, statuses=statuses)).figures
+        rows[name] = figures_of(whole)
+        if counted is not None:
+            rows[name]["own"] = {key: rows[name][key] for key in ACCURACY}
+            kept = estimate.take(np.isin(estimate.stamp_ns, counted))
+            shared = score(Run(truth=truth, estimate=kept), skip=0).figures.to_json()
+            rows[name] |= {key: shared.get(key) for key in ACCURACY}
+    return rows
+
+
+def figures_of(figures: Figures) -> Json:
+    """The figures of a row; None where one cannot be computed."""
+    found = figures.to_json()
+    return {
+        **{key: found.get(key) for key in (*ACCURACY, *WHOLE)},
+        "nis_expected": found["nis_dof_mean"],
+        "time_to_first_fix_s": found["initial"]["time_to_first_fix_s"],
+    }
