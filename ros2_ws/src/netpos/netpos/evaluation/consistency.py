@@ -10,31 +10,43 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.signal import correlate
 from scipy.stats import chi2
 from scipy.stats import t as student_t
 
+from netpos.evaluation.correlated import mean_square_given_shape
 from netpos.evaluation.pairing import Mask
 from netpos.messages.values import Array
 
 CONFIDENCE = 0.95
 
 
-def nees(error: Array, cov: Array) -> tuple[Array, Mask]:
-    """Normalised estimation error squared ``e' P^-1 e`` of each epoch.
+def whitened(error: Array, cov: Array) -> tuple[Array, Mask]:
+    """Normalised errors ``L^-1 e`` with ``P = L L'``: of a consistent filter they have mean 0,
+    variance 1 and no correlation between the columns.
 
     Parameters
     ----------
     error : (n, m) estimate minus truth
     cov : (n, m, m) covariance claimed by the filter
 
-    Returns the NEES of the epochs that have one, and the (n,) mask of those epochs: a covariance
-    that is not positive definite (zero means unknown) or not finite gives none.
+    Returns the (k, m) normalised errors of the epochs that have one, and the (n,) mask of those
+    epochs: a covariance that is not positive definite (zero means unknown) or not finite gives
+    none.
     """
     usable: Mask = np.asarray(np.isfinite(cov).all(axis=(1, 2)))
     usable[usable] = np.linalg.eigvalsh(cov[usable]).min(axis=1, initial=np.inf) > 0
-    e, P = error[usable], cov[usable]
-    return np.einsum("ni,ni->n", e, np.linalg.solve(P, e[..., None])[..., 0]), usable
+    root = np.linalg.cholesky(cov[usable])
+    return np.linalg.solve(root, error[usable][..., None])[..., 0], usable
+
+
+def nees(error: Array, cov: Array) -> tuple[Array, Mask]:
+    """Normalised estimation error squared ``e' P^-1 e`` of each epoch that has one, and the (n,)
+    mask of those epochs; arguments as for ``whitened``.
+    """
+    errors, usable = whitened(error, cov)
+    return np.einsum("ni,ni->n", errors, errors), usable
 
 
 def effective_size(series: Array) -> float:
@@ -65,8 +77,8 @@ def effective_size(series: Array) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeanTest:
-    """A mean of chi-square values against its two-sided 95 % bounds; ``n_eff`` independent values
-    stand behind it.
+    """A mean of chi-square values against its two-sided 95 % bounds, which are as wide as those of
+    ``n_eff`` independent values.
     """
 
     mean: float
@@ -88,16 +100,41 @@ def chi2_mean_bounds(dof: float, n: float, confidence: float = CONFIDENCE) -> tu
     return float(low), float(high)
 
 
-def nees_test(values: Array, dof: int) -> MeanTest | None:
-    """Test of the mean NEES of one run; None without values.
+def nees_test(errors: Array) -> MeanTest | None:
+    """Test of the mean NEES of one run; None without epochs.
 
-    Errors of neighbouring epochs share the filter's memory, so the bounds are those of
-    ``effective_size`` values, wider than those of n.
+    Parameters
+    ----------
+    errors : (n, m) from ``whitened``, epochs in order of time and equally far apart
+
+    Errors of neighbouring epochs share the filter's memory. The bounds hold the mean NEES of a
+    consistent filter whose errors have this shape (``mean_square_given_shape``); a common factor
+    of a column changes the mean, not the bounds. Columns count as independent. The same errors
+    give the same bounds, to the last bit. ``n_eff``: independent epochs with the same ratio of
+    upper to lower bound.
     """
-    if values.size == 0:
+    n, dof = errors.shape
+    if n == 0:
         return None
-    n_eff = effective_size(values)
-    return MeanTest(mean=float(values.mean()), bounds=chi2_mean_bounds(dof, n_eff), n_eff=n_eff)
+    rng = np.random.default_rng(0)
+    draws = sum(mean_square_given_shape(column, rng) for column in errors.T)
+    tail = (1.0 - CONFIDENCE) / 2.0
+    low, high = np.quantile(draws, [tail, 1.0 - tail]).tolist()
+    mean = float(np.einsum("ni,ni->", errors, errors) / n)
+    return MeanTest(mean=mean, bounds=(low, high), n_eff=_equivalent(dof, n, high / low))
+
+
+def _equivalent(dof: int, n: int, ratio: float) -> float:
+    """Number of independent values, in [0.1, n], whose bounds have this ratio."""
+
+    def excess(log_n: float) -> float:
+        low, high = chi2_mean_bounds(dof, float(np.exp(log_n)))
+        return float(np.log(max(high, 1e-300) / max(low, 1e-300)) - np.log(ratio))
+
+    ends = float(np.log(0.1)), float(np.log(n))
+    if excess(ends[1]) >= 0.0:
+        return float(n)
+    return float(np.exp(brentq(excess, *ends))) if excess(ends[0]) > 0.0 else 0.1
 
 
 def nis_test(values: Array, dof: Array) -> MeanTest | None:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
-from netpos.evaluation.consistency import nees, nees_test, nis_test
+from netpos.evaluation.availability import (
+    availability,
+    lost_tracks,
+    ready_stamps,
+    rejected_share,
+    uncovered_s,
+)
+from netpos.evaluation.consistency import nees_test, nis_test, whitened
 from netpos.evaluation.pairing import (
     MAX_TRUTH_GAP_S,
     Pairs,
@@ -18,10 +25,10 @@ from netpos.evaluation.pairing import (
     pair,
     wrap_angle,
 )
-from netpos.messages.values import Array, ClockState, TrackState, TrackStatus
+from netpos.messages.values import Array, ClockState, TrackStatus
 
 SKIP_EPOCHS = 20
-SLOT_S = 0.2
+LARGE_ERROR_M = 5.0
 MIN_SPEED_FOR_HEADING_MPS = 0.5
 CONVERGED_ERROR_M = 1.0
 CONVERGED_FOR_S = 1.0
@@ -49,18 +56,22 @@ class Figures:
 
     n: estimates scored. initialising: estimates before the first in state TRACKING, 0 where the
     recording has no track status. duration_s: from the first to the last scored. availability:
-    share of the ground truth's span at which the newest ready estimate is at most 0.2 s old (5 Hz,
-    fokin2020's priority passage), convergence included; an estimate is ready in state TRACKING.
-    rmse_m, p50..max: horizontal position error; mean_error_m: mean horizontal error, which
-    fokin2020:eq.34 calls RMSE; rmse_3d_m with the vertical; north, east, down: by axis, as
-    deng2022 does. velocity_rmse_mps: horizontal, map
-    axes. heading_rmse_deg: where the true speed exceeds 0.5 m/s. clock_offset_sd_ns: standard
-    deviation of the clock offset error about its mean; clock_offset_rmse_ns: about zero. nees_*:
-    horizontal position, 2 degrees of freedom, bounds for nees_n_eff independent epochs.
-    nis_mean: mean NIS of epochs with measurements; nis_dof_mean: its expectation. rejected: all
-    measurements rejected up to the end. protection_exceeded: share of the estimates with a
-    horizontal error above the protection level told with them; protection_level_m: its median.
-    bound_ratio: rmse_m over the posterior Cramer-Rao bound.
+    share of the ground truth's span at which the newest ready estimate is at most 0.2 s old (5
+    Hz, fokin2020's priority passage), convergence included; an estimate is ready in state
+    TRACKING. rmse_m, p50..max: horizontal position error; mean_error_m: mean horizontal error,
+    which fokin2020:eq.34 calls RMSE; rmse_3d_m with the vertical; north, east, down: by axis, as
+    deng2022 does. velocity_rmse_mps: horizontal, map axes. heading_rmse_deg: where the true speed
+    exceeds 0.5 m/s. clock_offset_sd_ns: standard deviation of the clock offset error about its
+    mean; clock_offset_rmse_ns: about zero. nees_*: horizontal position, 2 degrees of freedom,
+    bounds for nees_n_eff independent epochs. nis_mean: mean NIS of epochs with measurements;
+    nis_dof_mean: its expectation. rejected: all rejections counted up to the end; rejected_share:
+    of the measurements (no IMU samples, no events such as a lost track) that the track accepted
+    or refused, the share refused. lost_tracks: see ``lost_tracks``, None without track status.
+    unscored_s: seconds of the ground truth's span at which the newest scored estimate is more
+    than 0.2 s old; before the first, all of them. share_above_5m: share of the estimates scored
+    with an error above 5 m. protection_exceeded: share of the estimates with a horizontal error
+    above the protection level told with them; protection_level_m: its median. bound_ratio: rmse_m
+    over the posterior Cramer-Rao bound.
     """
 
     n: int
@@ -82,6 +93,10 @@ class Figures:
     nis_mean: float | None = None
     rejected: int | None = None
     bound_ratio: float | None = None
+    lost_tracks: int | None = None
+    unscored_s: float | None = None
+    share_above_5m: float | None = None
+    rejected_share: float | None = None
     protection_exceeded: float | None = None
     protection_level_m: float | None = None
     rmse_3d_m: float | None = None
@@ -152,31 +167,6 @@ def _percentiles(errors: Array) -> tuple[float | None, ...]:
     return tuple(float(p) for p in np.percentile(errors, [50, 95, 99, 100]))
 
 
-def availability(truth_ns: Stamps, ready_ns: Stamps, slot_s: float = SLOT_S) -> float | None:
-    """Share of the truth's span at which the newest ready estimate is at most ``slot_s`` old;
-    None where the span has no length.
-    """
-    if truth_ns.size < 2:
-        return None
-    begin, end = int(truth_ns[0]), int(truth_ns[-1])
-    starts = np.clip(ready_ns, begin, end)
-    valid_until = np.clip(ready_ns + round(slot_s * NS), begin, end)
-    next_start = np.append(starts[1:], end)
-    covered = np.maximum(np.minimum(valid_until, next_start) - starts, 0)
-    return float(covered.sum() / (end - begin))
-
-
-def ready_stamps(estimate: Trajectory, statuses: Iterable[TrackStatus]) -> Stamps:
-    """Stamps of ready estimates: state TRACKING at that stamp; every estimate where the recording
-    has no track status at all.
-    """
-    states = {status.stamp_ns: status.state for status in statuses}
-    if not states:
-        return estimate.stamp_ns
-    ready = [states.get(int(stamp)) is TrackState.TRACKING for stamp in estimate.stamp_ns]
-    return estimate.stamp_ns[np.array(ready, dtype=np.bool_)]
-
-
 def time_to_converge(
     pairs: Pairs, limit_m: float = CONVERGED_ERROR_M, hold_s: float = CONVERGED_FOR_S
 ) -> int | None:
@@ -235,8 +225,8 @@ def _heading_errors_deg(pairs: Pairs) -> Array:
 
 
 def _consistency(pairs: Pairs, statuses: Sequence[TrackStatus], from_ns: int) -> dict[str, Any]:
-    values, _ = nees(pairs.error[:, :2], pairs.estimate.position_cov[:, :2, :2])
-    errors = nees_test(values, dof=2)
+    normalised, _ = whitened(pairs.error[:, :2], pairs.estimate.position_cov[:, :2, :2])
+    errors = nees_test(normalised)
     evaluated = [
         s for s in statuses if s.nis_dof > 0 and s.stamp_ns >= from_ns and np.isfinite(s.nis)
     ]
@@ -244,7 +234,7 @@ def _consistency(pairs: Pairs, statuses: Sequence[TrackStatus], from_ns: int) ->
         np.array([s.nis for s in evaluated], dtype=np.float64),
         np.array([s.nis_dof for s in evaluated], dtype=np.float64),
     )
-    figures: dict[str, Any] = {"nees_n": values.size}
+    figures: dict[str, Any] = {"nees_n": len(normalised)}
     if errors is not None:
         figures |= {
             "nees_mean": errors.mean,
@@ -290,16 +280,22 @@ def _accuracy(scored: Pairs) -> dict[str, Any]:
         "p95_m": p95,
         "p99_m": p99,
         "max_m": worst,
+        "share_above_5m": float((errors > LARGE_ERROR_M).mean()) if errors.size else None,
         "velocity_rmse_mps": rms(np.linalg.norm(velocity_errors, axis=1)),
         "heading_rmse_deg": rms(_heading_errors_deg(scored)),
     }
 
 
-def _rejections(statuses: Sequence[TrackStatus]) -> dict[str, Any]:
+def _losses(statuses: Sequence[TrackStatus]) -> dict[str, Any]:
     if not statuses:
         return {}
     last = max(statuses, key=lambda status: status.stamp_ns)
-    return {"rejected": sum(last.rejected.values()), "rejected_by_reason": dict(last.rejected)}
+    return {
+        "lost_tracks": lost_tracks(statuses),
+        "rejected": sum(last.rejected.values()),
+        "rejected_by_reason": dict(last.rejected),
+        "rejected_share": rejected_share(last),
+    }
 
 
 def _integrity(pairs: Pairs, statuses: Sequence[TrackStatus]) -> dict[str, Any]:
@@ -342,6 +338,7 @@ def score(
     clock = clock[clock_ns >= from_ns]
     figures = Figures(
         availability=availability(run.truth.stamp_ns, ready_ns),
+        unscored_s=uncovered_s(run.truth.stamp_ns, scored.estimate.stamp_ns),
         clock_offset_sd_ns=float(clock.std()) if clock.size else None,
         clock_offset_rmse_ns=rms(clock),
         speed_max_mps=float(np.linalg.norm(run.truth.velocity[:, :2], axis=1).max()),
@@ -356,7 +353,7 @@ def score(
         **_accuracy(scored),
         **_output(ready_ns),
         **_consistency(scored, run.statuses, from_ns),
-        **_rejections(run.statuses),
+        **_losses(run.statuses),
         **_integrity(scored, run.statuses),
     )
     return Scored(figures=figures, pairs=pairs, counted=scored, from_ns=from_ns)

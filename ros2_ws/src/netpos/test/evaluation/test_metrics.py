@@ -13,8 +13,6 @@ from netpos.evaluation.metrics import (
     Figures,
     Run,
     Scored,
-    availability,
-    ready_stamps,
     score,
     time_to_converge,
 )
@@ -182,38 +180,6 @@ def test_clock_sd_is_about_the_mean_and_rmse_about_zero() -> None:
     kept = np.array(errors_ns[1:])
     assert figures.clock_offset_sd_ns == pytest.approx(kept.std(), rel=1e-6)
     assert figures.clock_offset_rmse_ns == pytest.approx(np.sqrt(np.mean(kept**2)), rel=1e-6)
-
-
-def stamps(*seconds: float) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    return np.array([round(s * S) for s in seconds], dtype=np.int64)
-
-
-@pytest.mark.parametrize(
-    ("ready", "expected"),
-    [
-        ((), 0.0),
-        ((0.0, 0.2, 0.4, 0.6, 0.8), 1.0),
-        ((0.5,), 0.2),
-        ((0.5, 0.6), 0.3),
-        ((0.9,), 0.1),
-        ((-0.1,), 0.1),
-        ((-0.3, 1.1), 0.0),
-    ],
-)
-def test_availability_is_the_covered_share(ready: tuple[float, ...], expected: float) -> None:
-    assert availability(stamps(0.0, 1.0), stamps(*ready)) == pytest.approx(expected)
-
-
-def test_availability_needs_a_span() -> None:
-    assert availability(stamps(0.0), stamps(0.0)) is None
-
-
-def test_only_tracking_is_ready() -> None:
-    estimate = Trajectory.of(straight(4))
-    states = [TrackState.INITIALISING, TrackState.TRACKING, TrackState.COASTING]
-    statuses = [status(0.1 * k, state) for k, state in enumerate(states)]
-    assert ready_stamps(estimate, statuses).tolist() == [S // 10]
-    assert ready_stamps(estimate, []).size == 4
 
 
 def converging(errors: list[float], dt_s: float = 0.25) -> Pairs:
