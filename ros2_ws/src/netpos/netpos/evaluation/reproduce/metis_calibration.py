@@ -70,7 +70,8 @@ CANDIDATES = (
 
 
 def _cell(summary: Summary) -> str:
-    lost = f", {summary.losses} lost" if summary.losses else ""
+    losses = summary.routes.losses
+    lost = f", {losses} lost" if losses else ""
     return f"{summary.rmse_m:.2f} m, {summary.clock_sd_ns:.1f} ns{lost}"
 
 

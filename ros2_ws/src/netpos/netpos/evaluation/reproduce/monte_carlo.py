@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,10 +24,6 @@ DIVERGED_M = 5.0
 LEVEL_MAX_M = 1000.0  # counted of a protection level: where a direction is open it has no end
 BIN_M = 0.002  # of the histogram of errors
 BINS = 10_000
-
-
-class NothingScoredError(ValueError):
-    """No run of an experiment has an estimate that counts."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +55,37 @@ class Tally:
     def astray(self) -> bool:
         """An error above ``DIVERGED_M`` at some time, or no track."""
         return self.losses > 0 or self.error_max > DIVERGED_M
+
+
+class Routes(NamedTuple):
+    """What became of the tracks of an experiment.
+
+    runs; losses: tracks lost in all of them; astray: runs with a loss or an error above 5 m;
+    availability: share of the epochs to be scored that have a track.
+    """
+
+    runs: int
+    losses: int
+    astray: int
+    availability: float
+
+    @classmethod
+    def of(cls, tallies: list[Tally]) -> Routes:
+        """Of the runs of an experiment."""
+        return cls(
+            runs=len(tallies),
+            losses=sum(t.losses for t in tallies),
+            astray=sum(t.astray for t in tallies),
+            availability=sum(t.n for t in tallies) / max(sum(t.epochs for t in tallies), 1),
+        )
+
+
+class NothingScoredError(ValueError):
+    """No run of an experiment has an estimate that counts; ``routes`` says what became of them."""
+
+    def __init__(self, message: str, routes: Routes) -> None:
+        super().__init__(message)
+        self.routes = routes
 
 
 @kernel
@@ -129,7 +157,7 @@ def tally(track: Track, position_sd_max_m: float, histogram: Ints, skip: int) ->
         exceeded=int((track.error_m[scored] > level).sum()),
         level=float(np.minimum(level, LEVEL_MAX_M).sum()),
         bound2=bound2,
-        rate_hz=float((track.tracked.sum() - 1) / elapsed[-1]),
+        rate_hz=float(max(track.tracked.sum() - 1, 0) / elapsed[-1]),
         ready_s=float(elapsed[ready[0]]) if ready.size else None,
         speed_max=float(speed.max()),
         losses=track.losses,
@@ -189,14 +217,13 @@ class Summary:
     about the mean; nees of the position (2 degrees of freedom), tested over runs; exceeded: share
     of estimates whose error is above their protection level, the mean of which is level_m, and
     exceeded_runs the runs that have such, None of an estimator without levels; bound_rmse_m the
-    posterior Cramér-Rao bound of rmse_m; availability: share of the epochs to be scored that have
-    a track; losses: tracks lost in all runs; astray: runs with a loss or an error above 5 m;
-    rate_hz and ready_s of the worst run, ready_s None where a run never got ready; error2, bound2
-    (runs, N) m^2 of all epochs for experiments with one route, error2 NaN where there is no track.
+    posterior Cramér-Rao bound of rmse_m; rate_hz and ready_s of the worst run, ready_s None where
+    a run never got ready; error2, bound2 (runs, N) m^2 of all epochs for experiments with one
+    route, error2 NaN where there is no track.
     """
 
     experiment: Experiment
-    runs: int
+    routes: Routes
     n: int
     rmse_m: float
     mean_error_m: float
@@ -210,15 +237,17 @@ class Summary:
     exceeded_runs: int | None
     level_m: float | None
     bound_rmse_m: float
-    availability: float
-    losses: int
-    astray: int
     rate_hz: float
     ready_s: float | None
     speed_max_mps: float
     histogram: Ints
     error2: Array | None
     bound2: Array | None
+
+    @property
+    def runs(self) -> int:
+        """Number of runs."""
+        return self.routes.runs
 
     @property
     def bound_ratio(self) -> float:
@@ -246,18 +275,17 @@ class Summary:
         """
         kept = list(batches)
         tallies = [t for batch in kept for t in batch.tallies]
-        n = sum(t.n for t in tallies)
+        n, routes = sum(t.n for t in tallies), Routes.of(tallies)
         if n == 0:
-            raise NothingScoredError(f"{experiment.name}: no run has estimates that count")
+            raise NothingScoredError(f"{experiment.name}: no run has estimates that count", routes)
         clock = sum(t.clock for t in tallies) / n
         clock2 = sum(t.clock2 for t in tallies) / n
         headings, dof = sum(t.heading_n for t in tallies), sum(t.dof for t in tallies)
-        epochs = sum(t.epochs for t in tallies)
         levels = experiment.estimator != "paper"
         ready = [t.ready_s for t in tallies]
         return cls(
             experiment=experiment,
-            runs=len(tallies),
+            routes=routes,
             n=n,
             rmse_m=float(np.sqrt(sum(t.error2 for t in tallies) / n)),
             mean_error_m=sum(t.error for t in tallies) / n,
@@ -277,9 +305,6 @@ class Summary:
             level_m=sum(t.level for t in tallies) / n if levels else None,
             nis_over_dof=sum(t.nis for t in tallies) / dof if dof else None,
             bound_rmse_m=float(np.sqrt(sum(t.bound2 for t in tallies) / n)),
-            availability=n / epochs,
-            losses=sum(t.losses for t in tallies),
-            astray=sum(t.astray for t in tallies),
             rate_hz=min(t.rate_hz for t in tallies),
             ready_s=None if None in ready else max(r for r in ready if r is not None),
             speed_max_mps=max(t.speed_max for t in tallies),

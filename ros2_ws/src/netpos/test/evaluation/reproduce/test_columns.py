@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pytest
 from netpos.evaluation.reproduce import columns as columns_module
-from netpos.evaluation.reproduce.columns import Columns, beside, in_columns
+from netpos.evaluation.reproduce.columns import beside, in_columns, track_rows
 from netpos.evaluation.reproduce.experiment import Experiment
 from netpos.evaluation.reproduce.frame import Row, Work, at_most
-from netpos.evaluation.reproduce.monte_carlo import NothingScoredError, Summary, monte_carlo
+from netpos.evaluation.reproduce.monte_carlo import Routes, Summary, monte_carlo
 
 SHORT = Experiment(name="short", scenario="metis_madrid", changes=(("max_duration_s", 5.0),))
 
@@ -50,17 +50,32 @@ def test_defaults_may_have_fewer_routes(monkeypatch: pytest.MonkeyPatch) -> None
     assert (columns.ours.runs, columns.baseline.runs, columns.defaults.runs) == (3, 3, 2)
 
 
-def test_an_estimator_that_loses_all_leaves_its_column_empty(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def fails(work: Work, experiment: Experiment, **more: bool) -> Summary:
-        if experiment.estimator == "paper":
-            raise NothingScoredError("all lost")
-        return monte_carlo(work, experiment, **more)
-
-    monkeypatch.setattr(columns_module, "monte_carlo", fails)
+def test_of_an_estimator_that_loses_all_only_the_loss_is_known() -> None:
+    """Nobody finds the street from 5 km away."""
+    far = replace(SHORT, changes=(*SHORT.changes, ("devices.0.initial_pose_sd_m", 5000.0)))
     with Work(2, 1, 1) as work:
-        columns = in_columns(work, SHORT, defaults=False)
-    assert columns == Columns(ours=columns.ours)
-    row, _ = beside(_row, columns, paper=(0.6,))
-    assert (row.baseline, row.defaults) == (None, None)
+        columns = in_columns(work, far, defaults=False)
+    assert columns.baseline == Routes(runs=2, losses=2, astray=2, availability=0.0)
+    assert columns.defaults is None
+
+    def make(summary: Summary, *paper: float) -> Iterator[Row]:
+        yield from _row(summary, *paper)
+        yield from track_rows(summary.experiment.name, summary.routes)
+
+    rows = {row.name: row for row in beside(make, columns, paper=(0.6,))}
+    assert rows["RMSE"].baseline is None
+    assert rows["short: routes"].baseline == 2.0
+    assert rows["short: tracks lost per route"].baseline == 1.0
+    assert rows["short: availability"].baseline == 0.0
+    assert rows["short: routes with an error above 5 m or lost"].baseline == 1.0
+    assert rows["short: routes"].ours == 2.0
+    assert all(row.defaults is None for row in rows.values())
+
+
+@pytest.mark.parametrize(("astray", "ok"), [(0, True), (1, False)])
+def test_no_route_may_go_astray_where_that_is_judged(astray: int, ok: bool) -> None:
+    routes = Routes(runs=4, losses=2 * astray, astray=astray, availability=0.9)
+    first, *rest = track_rows("x", routes, judged=True)
+    assert (first.ours, first.ok) == (astray / 4, ok)
+    assert [row.ours for row in rest] == [4.0, astray / 2, 0.9]
+    assert next(track_rows("x", routes)).ok is None

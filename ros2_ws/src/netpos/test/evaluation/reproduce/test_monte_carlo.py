@@ -83,7 +83,7 @@ def test_figures_of_two_runs() -> None:
     assert ours.exceeded_runs == 2
     assert ours.level_m == pytest.approx(0.8)
     assert ours.rate_hz == pytest.approx(4.0)
-    assert (ours.astray, ours.losses, ours.availability) == (0, 0, 1.0)
+    assert ours.routes == (2, 0, 0, 1.0)
 
 
 def test_heading_counts_where_the_vehicle_moves() -> None:
@@ -119,7 +119,7 @@ def test_a_run_goes_astray_above_5_m_or_when_lost(
     tracks[0].mean[SKIP - 1, :2] += 100.0  # still converging
     tracks[1] = replace(tracks[1], losses=losses)
     ours = _summary(tracks)
-    assert (ours.astray, ours.losses) == (astray, losses)
+    assert (ours.routes.astray, ours.routes.losses) == (astray, losses)
 
 
 def test_epochs_without_a_track_count_against_availability_only() -> None:
@@ -131,7 +131,7 @@ def test_epochs_without_a_track_count_against_availability_only() -> None:
         array[~track.tracked] = np.nan
     ours = _summary([track])
     error = np.hypot(*(track.mean - track.truth)[SKIP:, :2].T)
-    assert (ours.n, ours.availability) == (30, 0.75)
+    assert (ours.n, ours.routes.availability) == (30, 0.75)
     assert ours.rmse_m == pytest.approx(np.sqrt(np.nanmean(error**2)))
     assert ours.rmse_m != pytest.approx(whole.rmse_m)
     assert ours.histogram.sum() == 30
@@ -240,7 +240,7 @@ def test_metis_routes_keep_the_papers_figures_on_any_number_of_processes() -> No
     assert one.runs == 12
     assert one.rmse_m < 0.6
     assert one.clock_sd_ns < 6.0  # twelve routes; the paper has 4
-    assert one.losses == 0
+    assert one.routes.losses == 0
     assert 0.5 < one.bound_ratio < 1.5
 
 
