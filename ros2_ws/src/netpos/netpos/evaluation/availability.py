@@ -14,6 +14,7 @@ from netpos.messages.values import TrackState, TrackStatus
 SLOT_S = 0.2
 NS = 1e9
 LOSSES = ("track_lost", "diverged")
+STAYS = (TrackState.COASTING, TrackState.AMBIGUOUS)
 EVENTS = (*LOSSES, "sector_corrected")  # counted among the rejections, but no measurements
 
 
@@ -46,31 +47,36 @@ def _covered_ns(truth_ns: Stamps, stamps: Stamps, slot_s: float) -> int:
     return int(np.maximum(np.minimum(valid_until, next_start) - starts, 0).sum())
 
 
-def uncovered_s(truth_ns: Stamps, stamps: Stamps, slot_s: float = SLOT_S) -> float:
-    """Seconds of the truth's span at which the newest of ``stamps`` is more than ``slot_s`` old,
-    or there is none yet.
+def unscored_s(truth_ns: Stamps, scored_ns: Stamps, every_ns: Stamps) -> float:
+    """Seconds of the truth's span at which the newest scored estimate is too old, or there is none
+    yet.
+
+    It is too old after 0.2 s, or after 1.5 times the median interval of all estimates
+    (``every_ns``) where that is longer: of a slow tracker only missing estimates count.
     """
+    slot_s = SLOT_S
+    if every_ns.size > 1:
+        slot_s = max(slot_s, 1.5 * float(np.median(np.diff(every_ns))) / NS)
     span_ns = int(truth_ns[-1] - truth_ns[0])
-    return (span_ns - _covered_ns(truth_ns, stamps, slot_s)) / NS
+    return (span_ns - _covered_ns(truth_ns, scored_ns, slot_s)) / NS
 
 
 def lost_tracks(statuses: Iterable[TrackStatus]) -> int:
     """Number of times a track was lost.
 
-    A track is usable from state TRACKING on, also while it is COASTING after that. A loss is a
-    step from usable to WAITING or INITIALISING, or a loss that the tracker counted (``LOSSES``); a
-    step that was counted too is one loss. Of several statuses with one stamp the last counts.
+    A track is known from state TRACKING on, also while it is COASTING or AMBIGUOUS after that. A
+    loss is a step from there to WAITING or INITIALISING, or a loss that the tracker counted
+    (``LOSSES``); a step that was counted too is one loss. Of several statuses with one stamp the
+    last counts.
     """
     by_stamp = {status.stamp_ns: status for status in statuses}
-    lost, usable, counted = 0, False, 0
+    lost, known, counted = 0, False, 0
     for stamp in sorted(by_stamp):
         status = by_stamp[stamp]
         told = sum(status.rejected.get(reason, 0) for reason in LOSSES)
-        was_usable = usable
-        usable = status.state == TrackState.TRACKING or (
-            usable and status.state == TrackState.COASTING
-        )
-        lost += max(told - counted, int(was_usable and not usable))
+        was_known = known
+        known = status.state == TrackState.TRACKING or (known and status.state in STAYS)
+        lost += max(told - counted, int(was_known and not known))
         counted = told
     return lost
 

@@ -1,8 +1,7 @@
-"""Does the filter know how good it is: NEES, NIS, their bounds and the number of independent
-epochs.
+"""Does the filter know how good it is: NEES, NIS and their bounds.
 
 References: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and
-Navigation*, sec. 5.4; Geyer, *Practical Markov Chain Monte Carlo*, Statistical Science 7 (1992).
+Navigation*, sec. 5.4.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.signal import correlate
 from scipy.stats import chi2
 from scipy.stats import t as student_t
 
@@ -47,32 +45,6 @@ def nees(error: Array, cov: Array) -> tuple[Array, Mask]:
     """
     errors, usable = whitened(error, cov)
     return np.einsum("ni,ni->n", errors, errors), usable
-
-
-def effective_size(series: Array) -> float:
-    """Number of independent samples whose mean is as certain as the mean of this correlated
-    series, in [1, n].
-
-    n divided by the integrated autocorrelation time, summed over Geyer's initial monotone
-    positive sequence, which needs no tuned lag. A constant series counts as one sample.
-
-    Raises
-    ------
-    ValueError  the series is empty
-    """
-    n = series.size
-    if n == 0:
-        raise ValueError("effective_size needs at least one sample, got none")
-    centred = series - series.mean()
-    power = float(centred @ centred)
-    if power <= 1e-24 * max(float(series @ series), 1.0):
-        return 1.0
-    rho = correlate(centred, centred, mode="full", method="fft")[n - 1 :] / power
-    pairs = rho[: n - n % 2].reshape(-1, 2).sum(axis=1)
-    ends = np.flatnonzero(pairs <= 0)
-    positive = pairs[: ends[0]] if ends.size else pairs
-    time = 2.0 * float(np.minimum.accumulate(positive).sum()) - 1.0
-    return float(n / np.clip(time, 1.0, n))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,7 +13,7 @@ from netpos.evaluation.availability import (
     lost_tracks,
     ready_stamps,
     rejected_share,
-    uncovered_s,
+    unscored_s,
 )
 from netpos.evaluation.consistency import nees_test, nis_test, whitened
 from netpos.evaluation.pairing import (
@@ -63,15 +63,15 @@ class Figures:
     deng2022 does. velocity_rmse_mps: horizontal, map axes. heading_rmse_deg: where the true speed
     exceeds 0.5 m/s. clock_offset_sd_ns: standard deviation of the clock offset error about its
     mean; clock_offset_rmse_ns: about zero. nees_*: horizontal position, 2 degrees of freedom,
-    bounds for nees_n_eff independent epochs. nis_mean: mean NIS of epochs with measurements;
-    nis_dof_mean: its expectation. rejected: all rejections counted up to the end; rejected_share:
-    of the measurements (no IMU samples, no events such as a lost track) that the track accepted
-    or refused, the share refused. lost_tracks: see ``lost_tracks``, None without track status.
-    unscored_s: seconds of the ground truth's span at which the newest scored estimate is more
-    than 0.2 s old; before the first, all of them. share_above_5m: share of the estimates scored
-    with an error above 5 m. protection_exceeded: share of the estimates with a horizontal error
-    above the protection level told with them; protection_level_m: its median. bound_ratio: rmse_m
-    over the posterior Cramer-Rao bound.
+    bounds as wide as those of nees_n_eff independent epochs. nis_mean: mean NIS of epochs with
+    measurements; nis_dof_mean: its expectation. rejected: all rejections counted up to the end;
+    rejected_share: of the measurements (no IMU samples, no events such as a lost track) that the
+    track accepted or refused, the share refused. lost_tracks: see ``lost_tracks``, None without
+    track status. unscored_s: seconds of the ground truth's span without a scored estimate
+    (``availability.unscored_s``): before the first one, after a loss, in gaps. share_above_5m:
+    share of the estimates scored with an error above 5 m. protection_exceeded: share of the
+    estimates with a horizontal error above the protection level told with them;
+    protection_level_m: its median. bound_ratio: rmse_m over the posterior Cramer-Rao bound.
     """
 
     n: int
@@ -338,7 +338,7 @@ def score(
     clock = clock[clock_ns >= from_ns]
     figures = Figures(
         availability=availability(run.truth.stamp_ns, ready_ns),
-        unscored_s=uncovered_s(run.truth.stamp_ns, scored.estimate.stamp_ns),
+        unscored_s=unscored_s(run.truth.stamp_ns, scored.estimate.stamp_ns, stamps),
         clock_offset_sd_ns=float(clock.std()) if clock.size else None,
         clock_offset_rmse_ns=rms(clock),
         speed_max_mps=float(np.linalg.norm(run.truth.velocity[:, :2], axis=1).max()),

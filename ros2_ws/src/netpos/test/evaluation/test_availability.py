@@ -9,7 +9,7 @@ from netpos.evaluation.availability import (
     lost_tracks,
     ready_stamps,
     rejected_share,
-    uncovered_s,
+    unscored_s,
 )
 from netpos.evaluation.metrics import Figures, Run, score
 from netpos.evaluation.pairing import Trajectory
@@ -21,6 +21,7 @@ STATES = {
     "I": TrackState.INITIALISING,
     "T": TrackState.TRACKING,
     "C": TrackState.COASTING,
+    "A": TrackState.AMBIGUOUS,
 }
 
 
@@ -74,12 +75,12 @@ def figures_of(letters: str, errors_m: dict[int, float] | None = None, skip: int
 def test_availability_is_the_covered_share(ready: tuple[float, ...], expected: float) -> None:
     truth = stamps(0.0, 1.0)
     assert availability(truth, stamps(*ready)) == pytest.approx(expected)
-    assert uncovered_s(truth, stamps(*ready)) == pytest.approx(1.0 - expected)
+    assert unscored_s(truth, stamps(*ready), stamps()) == pytest.approx(1.0 - expected)
 
 
 def test_a_span_without_length() -> None:
     assert availability(stamps(0.0), stamps(0.0)) is None
-    assert uncovered_s(stamps(0.0), stamps(0.0)) == 0.0
+    assert unscored_s(stamps(0.0), stamps(0.0), stamps(0.0)) == 0.0
 
 
 def test_only_tracking_is_ready() -> None:
@@ -95,7 +96,10 @@ def test_only_tracking_is_ready() -> None:
         ("", 0),
         ("WITTT", 0),
         ("WICIT", 0),  # never TRACKING before
+        ("IAIT", 0),
         ("TTCCTT", 0),
+        ("TCAAT", 0),
+        ("TCAIT", 1),
         ("TTIT", 1),
         ("TTWWIT", 1),
         ("TCCIT", 1),
@@ -120,7 +124,6 @@ def test_a_loss_that_was_counted_is_one(told: tuple[str, dict[str, int]], lost: 
     first, before, second, after = told
     states = [status(0.1, second, rejected=after), status(0.0, first, rejected=before)]
     assert lost_tracks(states) == lost
-    assert lost_tracks([status(0.1, "W"), *states[:0], *states]) == lost
 
 
 def test_refused_measurements_are_a_share_of_all() -> None:
@@ -159,6 +162,18 @@ def test_epochs_after_a_loss_count_against_availability_and_are_scored() -> None
     assert figures.share_above_5m == pytest.approx(4 / 24)
     assert figures.availability == pytest.approx(1.0 - 0.8 / 2.9)
     assert figures.unscored_s == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(
+    ("interval_s", "missed_s"),
+    [(0.1, 0.8), (0.2, 0.7), (0.5, 0.25), (1.0, 0.0)],
+)
+def test_a_slow_tracker_misses_only_what_is_missing(interval_s: float, missed_s: float) -> None:
+    """Estimates at one interval over 20 s with one gap of 1 s."""
+    before = np.arange(0.0, 10.0 + 1e-9, interval_s)
+    after = np.arange(11.0, 20.0 + 1e-9, interval_s)
+    found = stamps(*before, *after)
+    assert unscored_s(stamps(0.0, 20.0), found, found) == pytest.approx(missed_s)
 
 
 def test_a_track_that_never_comes_back_misses_the_rest() -> None:

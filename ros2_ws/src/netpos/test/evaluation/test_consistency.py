@@ -1,4 +1,4 @@
-"""NEES, its bounds and the effective number of epochs against closed forms and simulation."""
+"""NEES, NIS and the bounds of their means against closed forms and simulation."""
 
 from __future__ import annotations
 
@@ -6,25 +6,14 @@ import numpy as np
 import pytest
 from netpos.evaluation.consistency import (
     chi2_mean_bounds,
-    effective_size,
     nees,
     nees_over_runs,
     nis_test,
     whitened,
 )
-from netpos.messages.values import Array
 from scipy.special import gammainc
 from scipy.stats import chi2
 from scipy.stats import t as student_t
-
-
-def autoregressive(rng: np.random.Generator, n: int, phi: float) -> Array:
-    """Unit-variance AR(1) series."""
-    x = np.empty(n)
-    x[0] = rng.normal()
-    for k in range(1, n):
-        x[k] = phi * x[k - 1] + np.sqrt(1 - phi**2) * rng.normal()
-    return x
 
 
 def test_nees_of_a_diagonal_covariance_is_the_sum_of_squared_ratios() -> None:
@@ -71,29 +60,6 @@ def test_bounds_of_one_sample_have_a_closed_form() -> None:
     np.testing.assert_allclose(
         chi2_mean_bounds(2.0, 1), [-2 * np.log(0.975), -2 * np.log(0.025)], rtol=1e-12
     )
-
-
-def test_independent_values_keep_their_number() -> None:
-    values = chi2.rvs(2, size=4000, random_state=5)
-    assert effective_size(values) > 3200
-
-
-@pytest.mark.parametrize("phi", [0.5, 0.9])
-def test_effective_size_of_an_autoregressive_series(phi: float) -> None:
-    """Integrated autocorrelation time of AR(1): (1 + phi) / (1 - phi)."""
-    n = 40_000
-    series = autoregressive(np.random.default_rng(11), n, phi)
-    np.testing.assert_allclose(effective_size(series) / n, (1 - phi) / (1 + phi), rtol=0.15)
-
-
-@pytest.mark.parametrize("series", [[4.0], [4.0, 4.0, 4.0], [0.0, 0.0]])
-def test_a_constant_series_is_one_sample(series: list[float]) -> None:
-    assert effective_size(np.array(series)) == 1.0
-
-
-def test_effective_size_needs_a_sample() -> None:
-    with pytest.raises(ValueError, match="at least one sample"):
-        effective_size(np.zeros(0))
 
 
 def test_nis_of_epochs_with_different_sizes() -> None:
