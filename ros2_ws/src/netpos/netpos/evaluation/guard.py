@@ -73,11 +73,14 @@ class Baseline:
 def pooled(runs: Sequence[Tracked]) -> Pooled:
     """Figures of many runs as one, by name: root mean squares over all estimates, means over all
     estimates, counts and shares over all measurements. None where no run has the figure.
+
+    ``p50_m`` is the mean of the runs' median errors: one bad run rules ``rmse_m``, not this.
     """
     judged = sum(run.judged for run in runs)
     nis, dof = _mean(runs, "nis_mean"), _mean(runs, "nis_dof_mean")
     return {
         "rmse_m": _rms(runs, "rmse_m"),
+        "p50_m": _mean(runs, "p50_m"),
         "velocity_rmse_mps": _rms(runs, "velocity_rmse_mps"),
         "heading_rmse_deg": _rms(runs, "heading_rmse_deg"),
         "clock_offset_sd_ns": _rms(runs, "clock_offset_sd_ns"),
@@ -98,6 +101,7 @@ def _of_value(value: float) -> float:
 # their own; of lost tracks each counts.
 LEAST: dict[str, Callable[[float], float]] = {
     "rmse_m": _of_value,
+    "p50_m": _of_value,
     "velocity_rmse_mps": _of_value,
     "heading_rmse_deg": _of_value,
     "clock_offset_sd_ns": _of_value,

@@ -146,7 +146,7 @@ def test_a_lost_track_is_counted() -> None:
     assert (sound.lost, sound.rejected) == (0, 0)
     assert lost.lost >= 1
     assert lost.rejected >= 10
-    assert sound.judged == 862
+    assert sound.judged > 800
     assert lost.rejected < lost.judged < sound.judged
 
 
