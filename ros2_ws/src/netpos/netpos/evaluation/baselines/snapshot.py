@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from netpos.evaluation.baselines.observations import NS, Observations, Stamps, residuals
+from netpos.evaluation.baselines.observations import NS, Kind, Observations, Stamps, residuals
 from netpos.evaluation.pairing import Trajectory
 from netpos.messages.values import Array
 
@@ -140,7 +140,7 @@ def _grid(seen: Observations, space: Space) -> list[Array]:
     """Starts: the middle of the RSUs, and a ring around it as far as the measurements reach."""
     sites = np.unique(np.vstack([seen.rsu, seen.other[seen.other.any(axis=1)]]), axis=0)
     middle = sites[:, :2].mean(axis=0)
-    far = seen.value[seen.kind == 3]
+    far = seen.value[seen.kind == Kind.RANGE]
     size = float(np.linalg.norm(np.ptp(sites[:, :2], axis=0)))
     reach = max(float(np.median(far)) if far.size else 0.5 * size, 1.0)
     around = np.arange(8) * np.pi / 4
