@@ -81,14 +81,19 @@ def lost_tracks(statuses: Iterable[TrackStatus]) -> int:
     return lost
 
 
-def rejected_share(last: TrackStatus) -> float | None:
-    """Share of the measurements accepted or refused up to the ``last`` status that were refused;
-    None where there were neither. IMU samples and events are no measurements.
-    """
+def refusals(last: TrackStatus) -> tuple[int, int]:
+    """Measurements refused, and measurements accepted or refused, up to the ``last`` status; IMU
+    samples and events are no measurements."""
     refused = sum(
         number
         for reason, number in last.rejected.items()
         if reason not in EVENTS and not reason.startswith("imu_")
     )
-    received = last.accepted + refused
+    return refused, last.accepted + refused
+
+
+def rejected_share(last: TrackStatus) -> float | None:
+    """Share of the measurements accepted or refused up to the ``last`` status that were refused;
+    None where there were neither."""
+    refused, received = refusals(last)
     return refused / received if received else None

@@ -18,6 +18,7 @@ import numpy as np
 from netpos.bags import BagReader, codec
 from netpos.bags.importers import import_ble_aoa, import_uwb_anchors, import_uwb_trolley
 from netpos.bags.importers.common import recordings
+from netpos.evaluation.availability import refusals
 from netpos.evaluation.metrics import Figures, Run, score
 from netpos.evaluation.pairing import Trajectory
 from netpos.messages import topics
@@ -45,7 +46,6 @@ from netpos.tracking.settings import TrackerSettings, bag_settings, settings_fro
 SEEDS = range(9001, 9061)
 FEWEST_RUNS = 8
 ENOUGH_S = 1500.0  # of all runs of a scenario
-_LOST = ("track_lost", "diverged")
 _CLOCK_HZ = 1.0  # nobody listens to /clock here
 
 
@@ -129,17 +129,9 @@ def _scored(material: Material, vue: str, outputs: Sequence[TrackOutput]) -> Tra
         clock=[o.clock for o in mine if o.clock is not None],
         clock_truth=material.clock_truth.get(vue, ()),
     )
-    return Tracked(score(run).figures, *_losses(statuses))
-
-
-def _losses(statuses: Sequence[TrackStatus]) -> tuple[int, int, int]:
-    """Tracks lost, measurements rejected, and measurements rejected or accepted."""
-    if not statuses:
-        return 0, 0, 0
-    last = max(statuses, key=lambda status: status.stamp_ns)
-    lost = sum(last.rejected.get(reason, 0) for reason in _LOST)
-    rejected = sum(last.rejected.values()) - lost
-    return lost, rejected, rejected + last.accepted
+    figures = score(run).figures
+    last = max(statuses, key=lambda status: status.stamp_ns, default=None)
+    return Tracked(figures, figures.lost_tracks or 0, *(refusals(last) if last else (0, 0)))
 
 
 def _simulated(name: str) -> Iterator[Material]:
