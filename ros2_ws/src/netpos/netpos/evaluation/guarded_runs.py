@@ -31,7 +31,6 @@ from netpos.messages.values import (
     RsuInfo,
     RsuMeasurement,
     Step,
-    TrackStatus,
 )
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.load import scenario_names
