@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from ekf_tracker.conversions import diagnostics_to_msg
-from netpos.messages.values import StepCalibration, TrackState, TrackStatus
+from netpos.messages.values import StepCalibration, TrackMode, TrackState, TrackStatus
 from netpos.tracking.health import RsuReport, RsuState
 
 T0 = 1_000_000_000
@@ -51,6 +51,14 @@ def test_diagnostics_of_a_device(state: TrackState, level: bytes) -> None:
         "rejected: late": "2",
     }
     assert (rsus.level, rsus.message) == (DiagnosticStatus.OK, "2 RSUs known")
+
+
+def test_diagnostics_name_the_places_of_an_ambiguous_device() -> None:
+    modes = (TrackMode(weight=0.62, x_m=3.14, y_m=-4.0), TrackMode(weight=0.38, x_m=9.0, y_m=7.0))
+    array = diagnostics_to_msg([replace(status(TrackState.AMBIGUOUS, T0), modes=modes)], 2)
+    assert array.status[0].level == DiagnosticStatus.WARN
+    expected = "ambiguous: 62 % at (3.1, -4.0) m, 38 % at (9.0, 7.0) m"
+    assert array.status[0].message == expected
 
 
 def test_diagnostics_of_what_is_known_of_the_steps() -> None:
