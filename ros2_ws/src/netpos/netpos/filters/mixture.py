@@ -92,26 +92,27 @@ def _own_variance(row: Array, cov: Array, h: Array) -> float:
 
 @kernel
 def is_wide(row: Array, mean: Array, cov: Array, height_m: float) -> bool:
-    """Whether a component is to be split for a row: a range or time of arrival whose tangent does
-    not hold over the component's width."""
+    """Whether a component is to be split for a row: a range or time of arrival that narrows the
+    position, but whose tangent does not hold over the component's width."""
     width2 = cov[0, 0] + cov[1, 1]
     if not _is_ranged(row) or width2 < _NARROW_M * _NARROW_M:
         return False
     h = np.empty(mean.size)
     innovation_row(row, mean, height_m, h)
-    if curvature_variance(row, mean, cov, height_m) > _WIDE * _own_variance(row, cov, h):
+    own = _own_variance(row, cov, h)
+    if own > width2:
+        return False
+    if curvature_variance(row, mean, cov, height_m) > _WIDE * own:
         return True
     dx, dy = mean[0] - row[ORIGIN], mean[1] - row[ORIGIN + 1]
     return bool(_REACH_SD * _REACH_SD * width2 > dx * dx + dy * dy)
 
 
 @kernel
-def widest(rows: Array, mean: Array, cov: Array, height_m: float) -> int:
-    """Index of the first of ``rows`` that ``is_wide``; -1: none is."""
-    for i in range(rows.shape[0]):
-        if is_wide(rows[i], mean, cov, height_m):
-            return i
-    return -1
+def splits(rows: Array, mean: Array, cov: Array, height_m: float) -> bool:
+    """Whether the ``rows`` of one measurement split a component: a range alone that ``is_wide``.
+    An angle measured with it tells where on the ring the device is."""
+    return bool(rows.shape[0] == 1 and is_wide(rows[0], mean, cov, height_m))
 
 
 @kernel
@@ -123,7 +124,15 @@ def will_split(
     moved, P, straight = mean.copy(), cov.copy(), motion.copy()
     straight[Parameter.JUMP_SPEED] = 0.0
     ekf.predict(moved, P, dt, straight, bias)
-    return bool(widest(rows, moved, P, height_m) >= 0)
+    start = 0
+    while start < rows.shape[0]:
+        stop = start + 1
+        while stop < rows.shape[0] and rows[stop, GROUP] == rows[start, GROUP]:
+            stop += 1
+        if splits(rows[start:stop], moved, P, height_m):
+            return True
+        start = stop
+    return False
 
 
 @kernel
@@ -251,20 +260,20 @@ def _update_group(
     measurement was taken by most of the mixture."""
     count, n = means.shape
     size = 0
-    wide = np.empty(count, dtype=np.int64)
+    split = np.empty(count, dtype=np.bool_)
     for k in range(count):
-        wide[k] = widest(rows, means[k], covs[k], height_m)
-        size += 1 if wide[k] < 0 else _RING_MAX + 1
+        split[k] = splits(rows, means[k], covs[k], height_m)
+        size += _RING_MAX + 1 if split[k] else 1
     new_means, new_covs, new_logs = np.empty((size, n)), np.empty((size, n, n)), np.empty(size)
     h = np.empty(n)
     end, taken_weight, refused_weight, nis, best = 0, 0.0, 0.0, 0.0, -math.inf
     top = log_weights.max()
     for k in range(count):
-        first, split_nis = end, 0.0
-        if wide[k] >= 0:
-            row = rows[wide[k]]
+        first = end
+        if split[k]:
+            row = rows[0]
             value = innovation_row(row, means[k], height_m, h)
-            split_nis = (
+            one = (
                 value
                 * value
                 / innovation_variance(row, means[k], covs[k], height_m, row[VARIANCE], h)
@@ -272,27 +281,24 @@ def _update_group(
             ring = split_along_ring(means[k], covs[k], row, height_m)
             end += ring[2].size
             new_means[first:end], new_covs[first:end], new_logs[first:end] = ring
-            new_means[end], new_covs[end], new_logs[end] = means[k], covs[k], _outlier_log(rows)
-            rest = rows[np.arange(rows.shape[0]) != wide[k]]
+            taken = True
         else:
-            new_means[end], new_covs[end], new_logs[end] = means[k], covs[k], 0.0
-            end, rest = end + 1, rows
+            new_means[end], new_covs[end] = means[k], covs[k]
+            new_logs[end], one, taken = _update_component(
+                new_means[end], new_covs[end], rows, height_m, gate_nis
+            )
+            end += 1
         for c in range(first, end):
-            taken, one = True, 0.0
-            if rest.shape[0] > 0:
-                log, one, taken = _update_component(
-                    new_means[c], new_covs[c], rest, height_m, gate_nis
-                )
-                new_logs[c] += log
             new_logs[c] += log_weights[k]
-            if taken:
-                taken_weight += math.exp(new_logs[c] - top)
-                if new_logs[c] > best:
-                    best, nis = new_logs[c], one + split_nis
-            else:
+            if not taken:
                 refused_weight += math.exp(new_logs[c] - top)
-        if wide[k] >= 0:  # the component itself, to which the measurement is an outlier
-            new_logs[end] += log_weights[k]
+                continue
+            taken_weight += math.exp(new_logs[c] - top)
+            if new_logs[c] > best:
+                best, nis = new_logs[c], one
+        if split[k]:  # the component itself, to which the measurement is an outlier
+            new_means[end], new_covs[end] = means[k], covs[k]
+            new_logs[end] = log_weights[k] + _outlier_log(rows)
             refused_weight += math.exp(new_logs[end] - top)
             end += 1
     means, covs, logs = reduced(new_means[:end], new_covs[:end], new_logs[:end])
