@@ -14,7 +14,7 @@ from netpos.messages.values import TrackState, TrackStatus
 SLOT_S = 0.2
 NS = 1e9
 LOSSES = ("track_lost", "diverged")
-STAYS = (TrackState.COASTING, TrackState.AMBIGUOUS)
+STAYS = (TrackState.INITIALISING, TrackState.COASTING, TrackState.AMBIGUOUS)
 EVENTS = (*LOSSES, "sector_corrected")  # counted among the rejections, but no measurements
 
 
@@ -64,10 +64,10 @@ def unscored_s(truth_ns: Stamps, scored_ns: Stamps, every_ns: Stamps) -> float:
 def lost_tracks(statuses: Iterable[TrackStatus]) -> int:
     """Number of times a track was lost.
 
-    A track is known from state TRACKING on, also while it is COASTING or AMBIGUOUS after that. A
-    loss is a step from there to WAITING or INITIALISING, or a loss that the tracker counted
-    (``LOSSES``); a step that was counted too is one loss. Of several statuses with one stamp the
-    last counts.
+    A track is known from state TRACKING on, also while it says afterwards that it is COASTING,
+    AMBIGUOUS or INITIALISING (its sd has grown). A loss is a step from there to WAITING, or a
+    loss that the tracker counted (``LOSSES``); a step that was counted too is one loss. Of several
+    statuses with one stamp the last counts.
     """
     by_stamp = {status.stamp_ns: status for status in statuses}
     lost, known, counted = 0, False, 0

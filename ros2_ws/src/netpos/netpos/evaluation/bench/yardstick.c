@@ -45,12 +45,14 @@ static double linearise(const double *row, const double *x, double (*P)[N], doub
         h[i] = 0.0;
     if (row[KIND] == TOA) {
         const double r2 = rho2 + dz * dz, r = sqrt(r2);
-        const double across = dy * dy * P[0][0] - 2.0 * dx * dy * P[0][1] + dx * dx * P[1][1];
-        const double bend = across / rho2;
+        const double px = P[0][0] * dx + P[0][1] * dy, py = P[0][1] * dx + P[1][1] * dy;
+        const double along = (dx * px + dy * py) / r2;
+        const double square = P[0][0] * P[0][0] + 2.0 * P[0][1] * P[0][1] + P[1][1] * P[1][1];
         h[0] = dx / r;
         h[1] = dy / r;
         h[4] = 1.0;
-        *variance = row[VARIANCE] + 0.5 * bend * bend / r2;
+        *variance = row[VARIANCE] +
+                    0.5 * (square - 2.0 * (px * px + py * py) / r2 + along * along) / r2;
         return row[VALUE] - (r + x[4]);
     }
     const double *A = row + AXES;
