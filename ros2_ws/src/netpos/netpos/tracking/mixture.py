@@ -117,13 +117,15 @@ class MixtureEstimate(OneModel):
 def with_components(
     config: TrackerConfig, estimate: Estimate, stamp_ns: int, rows: Array, bias: Array
 ) -> Estimate:
-    """The estimate as a mixture where, moved to ``stamp_ns``, it is too wide for one of ``rows``;
-    a mixture of one component as an estimate of its own."""
+    """The estimate as a mixture where, after a silence that made it COASTING, it is too wide for
+    one of ``rows``; a mixture of one component as an estimate of its own."""
     if isinstance(estimate, MixtureEstimate):
         return estimate.as_single(config) or estimate
     if not isinstance(estimate, Single):
         return estimate
     dt, height_m = (stamp_ns - estimate.stamp_ns) * 1e-9, config.device_height_m
+    if dt <= config.coast_after_s:
+        return estimate
     known = estimate.mean, estimate.cov, dt, estimate.motion
     if not mixture.will_split(*known, bias, rows, height_m):
         return estimate

@@ -55,7 +55,7 @@ def _stacked(
     sd = np.append(extra_sd, bias[0])
     pairs = [grown(p.mean, p.cov, sd) for p in posteriors]
     stamps = np.array([p.stamp_ns for p in posteriors])
-    motions = np.array([p.motion for p in posteriors[1:]]).reshape(len(posteriors) - 1, -1)
+    motions = np.array([p.motion for p in posteriors[1:]]).reshape(-1, posteriors[0].motion.size)
     means, covs = np.array([m for m, _ in pairs]), np.array([c for _, c in pairs])
     return np.diff(stamps) * 1e-9, means, covs, motions, bias
 
