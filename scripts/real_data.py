@@ -4,7 +4,7 @@
 
 Imports each recording an importer knows, replays it with the bag's parameters and with default
 ones, runs a snapshot least squares and a plain Kalman filter on the same bag
-(netpos.evaluation.baselines), and writes one row per recording. Recordings without an importer
+(netpos.evaluation.yardsticks), and writes one row per recording. Recordings without an importer
 have rows with the baselines alone. --out keeps the bags in a new folder.
 """
 
@@ -33,8 +33,8 @@ from netpos.bags.importers import (
     uwb_trolley,
 )
 from netpos.evaluation import evaluate_bag
-from netpos.evaluation.baselines import Kind, PlainConfig, Space, observations_of_bag
 from netpos.evaluation.recordings import Recording, baseline_figures, recording_row
+from netpos.evaluation.yardsticks import Kind, PlainConfig, Space, observations_of_bag
 from netpos.scenario.recorded_drive import import_car_drive
 
 Json = dict[str, Any]

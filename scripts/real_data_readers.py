@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import scipy.io
-from netpos.evaluation.baselines import Observations, ranges
 from netpos.evaluation.pairing import Trajectory
+from netpos.evaluation.yardsticks import Observations, ranges
 from rosbags.highlevel import AnyReader
 
 NS = 1_000_000_000

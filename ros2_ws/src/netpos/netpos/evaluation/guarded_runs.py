@@ -90,11 +90,9 @@ def cases() -> dict[str, Case]:
     return {**simulated, **recorded}
 
 
-def track(material: Material, changes: Mapping[str, Any] | None = None) -> list[Tracked]:
-    """Run the tracker over a material and score each device that has truth.
-
-    ``changes`` replaces parameters of the tracker.
-    """
+def outputs_of(material: Material, changes: Mapping[str, Any] | None = None) -> list[TrackOutput]:
+    """What the tracker says of a material, in order; ``changes`` replaces parameters of the
+    tracker."""
     parameters = {**material.settings.parameters, **(changes or {})}
     tracker = tracker_of(TrackerConfig.from_mapping(parameters), material.settings)
     for info in material.rsus:
@@ -103,7 +101,13 @@ def track(material: Material, changes: Mapping[str, Any] | None = None) -> list[
     for item in material.items:
         tracker.add(item)
         outputs += tracker.process()
-    outputs += tracker.flush()
+    return outputs + tracker.flush()
+
+
+def track(material: Material, changes: Mapping[str, Any] | None = None) -> list[Tracked]:
+    """Run the tracker over a material and score each device that has truth; ``changes`` as for
+    ``outputs_of``."""
+    outputs = outputs_of(material, changes)
     return [_scored(material, vue, outputs) for vue in sorted(material.truth)]
 
 

@@ -11,7 +11,10 @@ from typing import Any
 import numpy as np
 
 from netpos.bags import BagReader
-from netpos.evaluation.baselines import (
+from netpos.evaluation.evaluate import VueEvaluation, evaluate_bag
+from netpos.evaluation.metrics import Figures, Run, score
+from netpos.evaluation.pairing import Stamps, Trajectory
+from netpos.evaluation.yardsticks import (
     Kind,
     Observations,
     Space,
@@ -19,9 +22,6 @@ from netpos.evaluation.baselines import (
     plain_ekf,
     snapshots,
 )
-from netpos.evaluation.evaluate import VueEvaluation, evaluate_bag
-from netpos.evaluation.metrics import Figures, Run, score
-from netpos.evaluation.pairing import Stamps, Trajectory
 from netpos.messages.values import TrackStatus
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.replay import replay_bag
@@ -48,9 +48,9 @@ WHOLE = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recording:
-    """One row to measure. bag: as imported; space: what the baselines solve for; range_sd_m: their
+    """One row to measure. bag: as imported; space: what the yardsticks solve for; range_sd_m: their
     sd of a range, None for what the RSUs state; reference: the authors' RMSE [m]; kinds: what
-    the baselines use."""
+    the yardsticks use."""
 
     name: str
     bag: Path
@@ -61,7 +61,7 @@ class Recording:
 
 
 def recording_row(recording: Recording, folder: Path) -> Json:
-    """Replay into ``folder`` with the bag's parameters and with default ones, run the baselines,
+    """Replay into ``folder`` with the bag's parameters and with default ones, run the yardsticks,
     and score all alike.
 
     ``rmse_m`` and the other figures of accuracy of a baseline are of the tracker's epochs that
@@ -110,7 +110,7 @@ def _replayed(bag: Path, out: Path, overrides: Json) -> VueEvaluation:
 def baseline_figures(
     seen: Observations, space: Space, truth: Trajectory, counted: Stamps | None = None
 ) -> dict[str, Json]:
-    """Figures of both baselines; accuracy at the stamps ``counted`` (None: at all of their own)
+    """Figures of both yardsticks; accuracy at the stamps ``counted`` (None: at all of their own)
     and, as ``own``, at all of their own."""
     filtered = plain_ekf(seen, space)
     runs: list[tuple[str, Trajectory, list[TrackStatus]]] = [

@@ -191,8 +191,10 @@ def interpolated(truth: list[Odometry], stamp_ns: int) -> Array:
 
 
 def residuals(bag: Path) -> dict[str, Array]:
-    """Per RSU (n, 3): azimuth, elevation, range minus what the truth says, in the RSU's axes, while
-    the device moves: a person who stands repeats one error for a minute."""
+    """Per RSU (n, 3): azimuth, elevation, range minus what the truth says, in the RSU's axes.
+
+    Only while the device moves: a person who stands repeats one error for a minute.
+    """
     infos, measured, truth = values(bag)
     stamps = np.array([t.stamp_ns for t in truth])
     moving = np.array([np.hypot(*t.linear_velocity[:2]) for t in truth]) > 0.1
@@ -200,7 +202,7 @@ def residuals(bag: Path) -> dict[str, Array]:
     rows: dict[str, list[tuple[float, float, float]]] = defaultdict(list)
     for m in measured:
         last = int(np.searchsorted(stamps, m.stamp_ns, side="right")) - 1
-        if 0 <= last and m.stamp_ns <= stamps[-1] and moving[last]:
+        if last >= 0 and m.stamp_ns <= stamps[-1] and moving[last]:
             info = known[m.rsu_id]
             ray = interpolated(truth, m.stamp_ns) - info.position
             x, y, z = Rotation.from_quat(info.quaternion).inv().apply(ray)

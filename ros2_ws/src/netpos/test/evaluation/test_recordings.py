@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from netpos.bags.importers import import_uwb_anchors
 from netpos.bags.importers.uwb_anchors import TAG_HEIGHT_M, TRACKER
-from netpos.evaluation.baselines import Space, observations_of_bag
 from netpos.evaluation.pairing import Trajectory
 from netpos.evaluation.recordings import baseline_figures, default_parameters
+from netpos.evaluation.yardsticks import Space, observations_of_bag
 from netpos.tracking.config import TrackerConfig
 
 ROOT = Path(__file__).resolve().parents[5]

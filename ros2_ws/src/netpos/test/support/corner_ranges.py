@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from netpos.evaluation.baselines import (
+from netpos.evaluation.yardsticks import (
     Observations,
     Space,
     ranges,

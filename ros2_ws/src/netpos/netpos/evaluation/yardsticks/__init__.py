@@ -4,10 +4,10 @@ They take the measurements of a bag, know nothing of netpos' filters, and have n
 by a score.
 """
 
-from netpos.evaluation.baselines.observations import Kind, Observations, ranges, residuals
-from netpos.evaluation.baselines.of_bag import observations_of_bag
-from netpos.evaluation.baselines.plain_ekf import PlainConfig, PlainRun, plain_ekf
-from netpos.evaluation.baselines.snapshot import Fix, Space, snapshot, snapshots
+from netpos.evaluation.yardsticks.observations import Kind, Observations, ranges, residuals
+from netpos.evaluation.yardsticks.of_bag import observations_of_bag
+from netpos.evaluation.yardsticks.plain_ekf import PlainConfig, PlainRun, plain_ekf
+from netpos.evaluation.yardsticks.snapshot import Fix, Space, snapshot, snapshots
 
 __all__ = [
     "Fix",

@@ -1,4 +1,4 @@
-"""Baseline: a plain extended Kalman filter of constant velocity.
+"""Yardstick: a plain extended Kalman filter of constant velocity.
 
     x = [p, v, (heading)];  p' = v, v' = white acceleration, heading' = white turn rate
     Q = q^2 [[dt^3/3, dt^2/2], [dt^2/2, dt]] per axis;  heading: q_h^2 dt
@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from netpos.evaluation.baselines.observations import NS, Observations, residuals
-from netpos.evaluation.baselines.snapshot import WINDOW_S, Fix, Space, snapshot, trajectory_of
 from netpos.evaluation.pairing import Trajectory
+from netpos.evaluation.yardsticks.observations import NS, Observations, residuals
+from netpos.evaluation.yardsticks.snapshot import WINDOW_S, Fix, Space, snapshot, trajectory_of
 from netpos.messages.values import Array, TrackState, TrackStatus
 
 

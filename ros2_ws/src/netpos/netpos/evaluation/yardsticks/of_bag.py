@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from netpos.bags import BagReader, codec
-from netpos.evaluation.baselines.observations import Kind, Observations
+from netpos.evaluation.yardsticks.observations import Kind, Observations
 from netpos.messages import topics
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 

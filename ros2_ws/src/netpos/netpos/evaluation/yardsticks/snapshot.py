@@ -1,4 +1,4 @@
-"""Baseline: least squares of the measurements of the last second, without a motion model.
+"""Yardstick: least squares of the measurements of the last second, without a motion model.
 
 Minimise sum ((z - h(x)) / sd)^2 over the position, and the heading where several antennas were
 measured. Rows beyond 4 sd of the solution are left out and the rest is solved again. The
@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from netpos.evaluation.baselines.observations import NS, Kind, Observations, Stamps, residuals
 from netpos.evaluation.pairing import Trajectory
+from netpos.evaluation.yardsticks.observations import NS, Kind, Observations, Stamps, residuals
 from netpos.messages.values import Array
 
 WINDOW_S = 1.0

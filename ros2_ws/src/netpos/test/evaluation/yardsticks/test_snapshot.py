@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from corner_ranges import LEVEL, SQUARE, S, at_rest
-from netpos.evaluation.baselines import (
+from netpos.evaluation.yardsticks import (
     Kind,
     Space,
     ranges,

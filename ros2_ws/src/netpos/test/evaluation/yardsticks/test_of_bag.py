@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from corner_ranges import S
 from netpos.bags.importers.common import write_recording
-from netpos.evaluation.baselines import (
+from netpos.evaluation.yardsticks import (
     Kind,
     observations_of_bag,
 )
