@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from netpos.evaluation.reproduce.experiment import VUE, Experiment, Setup
-from netpos.messages.values import Beacon, InitialPose
-from netpos.tracking import Tracker
+from netpos.evaluation.reproduce.experiment import Experiment, Setup
+from setup_tracker import tracker_outputs
 
 
 @pytest.mark.parametrize(
@@ -30,18 +29,7 @@ def test_levels_are_those_of_the_tracker(
     )
     setup = Setup(experiment)
     track = setup.run(seed)
-    simulation, tracker = setup.simulation.with_seed(seed), Tracker(setup.config)
-    for info in simulation.rsus:
-        tracker.add_rsu(info)
-    outputs = []
-    for event in simulation.events():
-        items = [event] if isinstance(event, InitialPose) else []
-        if isinstance(event, Beacon) and event.vue_id == VUE:
-            items = list(simulation.measure(event))
-        for item in items:
-            assert tracker.add(item) is None
-        outputs += tracker.process()
-    outputs += tracker.flush()
+    outputs = tracker_outputs(setup, seed)
     levels = {o.status.stamp_ns: o.status.protection_level_m for o in outputs}
     reported = np.array([levels[stamp] for stamp in track.stamps_ns.tolist()])
     assert len(track.level) > 200

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from netpos.evaluation.reproduce.experiment import FACTS, VUE, Experiment, Setup
-from netpos.messages.values import Beacon, InitialPose
-from netpos.tracking import Tracker, TrackerConfig
+from netpos.evaluation.reproduce.experiment import FACTS, Experiment, Setup
+from netpos.tracking import TrackerConfig
+from setup_tracker import tracker_outputs
 
 LOSING = Experiment(
     name="one RSU",
@@ -20,23 +20,11 @@ LOSING = Experiment(
 
 def _of_the_tracker(setup: Setup, seed: int) -> dict[int, tuple[np.ndarray, float] | None]:
     """Position and protection level by stamp; None where the tracker has no track."""
-    simulation, tracker = setup.simulation.with_seed(seed), Tracker(setup.config)
-    for info in simulation.rsus:
-        tracker.add_rsu(info)
-    outputs = []
-    for event in simulation.events():
-        items = [event] if isinstance(event, InitialPose) else []
-        if isinstance(event, Beacon) and event.vue_id == VUE:
-            items = list(simulation.measure(event))
-        for item in items:
-            assert tracker.add(item) is None
-        outputs += tracker.process()
-    outputs += tracker.flush()
     return {
         o.status.stamp_ns: (o.odometry.position[:2], o.status.protection_level_m)
         if o.odometry
         else None
-        for o in outputs
+        for o in tracker_outputs(setup, seed)
     }
 
 
