@@ -22,6 +22,7 @@ from netpos.messages.values import (
     MagneticSample,
     RsuInfo,
     RsuMeasurement,
+    TrackState,
 )
 from netpos_msgs.msg import ClockState, Step, TrackStatus
 from netpos_msgs.msg import RsuMeasurement as RsuMeasurementMessage
@@ -209,6 +210,10 @@ def test_relative_velocities_are_refused_and_counted(walked: Heard) -> None:
     counted = dict(zip(last.rejection_reasons, last.rejection_counts, strict=True))
     assert counted["frame"] >= len(walked.velocities["vue_2"]) - 3
     assert all("step_velocity" not in s.sources for s in walked.status["vue_2"])
-    # The range alone, after a silence: anywhere on its ring, whose mean lies inside.
+    # The range alone, after a silence: anywhere on its ring. The mean lies inside, the level holds
+    # the far side, and nobody calls it TRACKING.
     position = walked.odometry["vue_2"][-1].pose.pose.position
-    assert math.hypot(position.x, position.y) < 6.0
+    from_anchor = math.hypot(position.x, position.y)
+    assert from_anchor < 6.0
+    assert last.state in (TrackState.INITIALISING, TrackState.AMBIGUOUS)
+    assert last.protection_level > from_anchor + 4.0

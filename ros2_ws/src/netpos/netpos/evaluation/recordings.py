@@ -48,9 +48,9 @@ WHOLE = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recording:
-    """One row to measure. bag: as imported; space: what the yardsticks solve for; range_sd_m: their
-    sd of a range, None for what the RSUs state; reference: the authors' RMSE [m]; kinds: what
-    the yardsticks use."""
+    """One row to measure. bag: as imported; space: what the yardsticks solve for; range_sd_m:
+    their sd of a range, None for what the RSUs state; reference: the authors' RMSE [m]; kinds:
+    what the yardsticks use."""
 
     name: str
     bag: Path

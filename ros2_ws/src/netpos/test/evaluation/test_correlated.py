@@ -4,8 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from netpos.evaluation.consistency import MeanTest, chi2_mean_bounds, nees_test, nis_test
+from netpos.evaluation.consistency import (
+    MeanTest,
+    chi2_mean_bounds,
+    nees_test,
+    nis_test,
+    whitened,
+)
 from netpos.evaluation.correlated import DRAWS, cosine_variances, mean_square_given_shape
+from netpos.evaluation.reproduce.experiment import setup_of
+from netpos.evaluation.reproduce.fokin2020 import WANDER
 from netpos.messages.values import Array
 from scipy.fft import dct
 from scipy.linalg import solve_discrete_are, toeplitz
@@ -88,6 +96,22 @@ def test_errors_of_a_kalman_filter_pass_at_the_nominal_rate(n: int, least: float
     model, rng = Filter(1.0, 1.0, 0.7, 10.0), np.random.default_rng(11)
     passed = sum(verdict(model.errors(rng, n)[0]).consistent for _ in range(120))
     assert least <= passed / 120 <= 0.99
+
+
+def test_errors_of_the_tracker_pass_at_the_nominal_rate() -> None:
+    """300 runs of METIS whose motion is drawn from the tracker's own model, cut to several
+    lengths after the 20 epochs that never count."""
+    setup, passed = setup_of(WANDER), {20: 0, 50: 0, 150: 0}
+    for seed in range(1000, 1300):
+        run = setup.run(seed)
+        error, cov = (run.mean - run.truth)[20:, :2], run.cov[20:, :2, :2]
+        normalised, usable = whitened(error, cov)
+        assert usable.all()
+        for length in passed:
+            test = nees_test(normalised[:length])
+            assert test is not None
+            passed[length] += test.consistent
+    assert all(0.93 <= number / 300 <= 0.97 for number in passed.values()), passed
 
 
 def test_innovations_of_a_kalman_filter_pass_at_the_nominal_rate() -> None:

@@ -133,14 +133,14 @@ def plain_ekf(seen: Observations, space: Space, config: PlainConfig | None = Non
     fixes: list[Fix] = []
     velocities: list[Array] = []
     statuses: list[TrackStatus] = []
-    previous_ns, refused = 0, 0
+    previous_ns, accepted, refused = 0, 0, 0
     edges = np.flatnonzero(np.append(True, np.diff(seen.stamp_ns) > 0)).tolist()
     for low, high in zip(edges, [*edges[1:], len(seen)], strict=True):
         stamp, nis, used = int(seen.stamp_ns[low]), 0.0, 0
         if watch.running(stamp):
             ekf.predict((stamp - previous_ns) / NS)
             nis, used = ekf.update(seen.take(slice(low, high)))
-            refused += high - low - used
+            accepted, refused = accepted + used, refused + high - low - used
             watch.recent.append((stamp, used, high - low))
         else:
             watch.started_ns = -1
@@ -149,17 +149,20 @@ def plain_ekf(seen: Observations, space: Space, config: PlainConfig | None = Non
                 continue
             ekf.start(fix)
             watch.start(stamp, high - low)
+            accepted += high - low
         previous_ns = stamp
         stamps.append(stamp)
         fixes.append(ekf.fix())
         velocities.append(ekf.x[space.dimensions : 2 * space.dimensions].copy())
-        statuses.append(_status(stamp, nis, used, refused))
+        statuses.append(_status(stamp, nis, used, (accepted, refused)))
     path = trajectory_of(np.array(stamps, dtype=np.int64), fixes, space)
     path.velocity[:, : space.dimensions] = np.reshape(velocities, (-1, space.dimensions))
     return PlainRun(path, statuses)
 
 
-def _status(stamp_ns: int, nis: float, used: int, refused: int) -> TrackStatus:
+def _status(stamp_ns: int, nis: float, used: int, counts: tuple[int, int]) -> TrackStatus:
+    """Status after one stamp; ``counts``: measurements accepted and refused since the start."""
+    accepted, refused = counts
     return TrackStatus(
         stamp_ns=stamp_ns,
         vue_id="vue_1",
@@ -167,6 +170,6 @@ def _status(stamp_ns: int, nis: float, used: int, refused: int) -> TrackStatus:
         nis=nis,
         nis_dof=used,
         used=used,
-        accepted=used,
+        accepted=accepted,
         rejected={"gate": refused},
     )

@@ -84,6 +84,7 @@ def test_the_gate_of_the_plain_filter_at_its_boundary(off_sd: float, rejected: i
     wrong[-4] += off_sd * math.sqrt(prior * level2 + 0.04)
     after = plain_ekf(replace(seen, value=wrong), LEVEL)
     assert after.statuses[-1].rejected == {"gate": rejected}
+    assert after.statuses[-1].accepted == len(seen) - rejected
 
 
 def test_the_plain_filter_starts_anew_after_a_silence_and_where_all_is_refused() -> None:
