@@ -84,16 +84,17 @@ EQUIVALENT = {
     ("sigma", "_regress", "left out: E[i, n] *= _SHIFT_WEIGHT"),  # is 1
     ("sigma", "_regress", "operator swapped: E[i, n] *= _SHIFT_WEIGHT"),
     ("ekf", "_passes", "operator swapped: stop - start"),
-    ("manoeuvre", "unnoticed_s", "operator swapped: xy += h[0] * h[1] / variance"),  # its mirror
+    # its mirror
+    ("manoeuvre", "unnoticed_s", "operator swapped: xy += h[X.PX] * h[X.PY] / variance"),
     ("error_state", "correct", "left out: posterior = cov"),  # set anew by the first iteration
     *(  # starts lie symmetrically around
         (
             "iteration",
             "refine_used",
-            f"operator swapped: start[{a}] += 1.5 * math.sqrt"
-            f"(prior_cov[{a}, {a}]) * math.{f}(2.0 * math.pi * k / _STARTS)",
+            f"operator swapped: start[X.{a}] += 1.5 * math.sqrt"
+            f"(prior_cov[X.{a}, X.{a}]) * math.{f}(2.0 * math.pi * k / _STARTS)",
         )
-        for a, f in ((0, "cos"), (1, "sin"))
+        for a, f in (("PX", "cos"), ("PY", "sin"))
     ),
     ("iteration", "refine_used", "operator swapped: cost - 0.001"),  # the same place again
     *(

@@ -35,6 +35,7 @@ from netpos.filters.measurement import (
     curvature_variance,
     linearise,
 )
+from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array
 
 _NODES = 64
@@ -100,8 +101,8 @@ def fuse_bearing(mean: Array, cov: Array, row: Array, variance: float) -> bool:
     angle = row[VALUE] + math.atan2(row[AXES + 1], row[AXES])
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     rsu = row[ORIGIN : ORIGIN + 2]
-    P = turn.T @ cov[:2, :2].copy() @ turn
-    a = turn.T @ (mean[:2] - rsu)
+    P = turn.T @ cov[POSITION, POSITION].copy() @ turn
+    a = turn.T @ (mean[POSITION] - rsu)
     rr, slope = P[0, 0], P[0, 1] / P[0, 0]
     v = P[1, 1] - slope * P[0, 1]
     if not (rr > 0.0 and v > 0.0):
@@ -120,10 +121,10 @@ def fuse_bearing(mean: Array, cov: Array, row: Array, variance: float) -> bool:
         low, high = max(r - width, 0.0), r + width
     c_rr += strip * (r - a[0]) ** 2
     C = np.array([[c_rr, c_rc], [c_rc, c_cc]])
-    prior_2d = cov[:2, :2].copy()
-    gain = np.linalg.solve(prior_2d, cov[:2].copy()).T.copy()
+    prior_2d = cov[POSITION, POSITION].copy()
+    gain = np.linalg.solve(prior_2d, cov[POSITION].copy()).T.copy()
     cov += gain @ (turn @ C @ turn.T - prior_2d) @ gain.T
-    mean += gain @ (rsu + turn @ np.array([r, c]) - mean[:2])
+    mean += gain @ (rsu + turn @ np.array([r, c]) - mean[POSITION])
     return True
 
 
@@ -133,8 +134,8 @@ def on_top(mean: Array, cov: Array, rows: Array, work: Array) -> bool:
     for i in range(rows.shape[0]):
         if work[W_USE, i] == 0.0 or not is_plain_bearing(rows[i]):
             continue
-        dx, dy = mean[0] - rows[i, ORIGIN], mean[1] - rows[i, ORIGIN + 1]
-        if dx * dx + dy * dy < 4.0 * (cov[0, 0] + cov[1, 1]):
+        dx, dy = mean[X.PX] - rows[i, ORIGIN], mean[X.PY] - rows[i, ORIGIN + 1]
+        if dx * dx + dy * dy < 4.0 * (cov[X.PX, X.PX] + cov[X.PY, X.PY]):
             return True
     return False
 

@@ -41,13 +41,13 @@ from netpos.filters.measurement import (
     innovation_row,
 )
 from netpos.filters.motion import (
-    N_CORE,
     Model,
     Parameter,
     add_noise,
     propagate,
     transition,
 )
+from netpos.filters.state import N_CORE, X
 from netpos.messages.values import Array
 
 __all__ = [
@@ -92,7 +92,7 @@ def _predict_dense(mean: Array, cov: Array, dt: float, motion: Array, bias: Arra
 @inlined
 def _shear(n: int, P: Array, dt: float) -> None:
     """F P F' of a constant velocity by the few row and column operations F stands for."""
-    for p, v in ((0, 2), (1, 3), (4, 5)):
+    for p, v in ((X.PX, X.VX), (X.PY, X.VY), (X.CLOCK, X.DRIFT)):
         for j in range(n):
             P[p, j] += dt * P[v, j]
         for i in range(n):

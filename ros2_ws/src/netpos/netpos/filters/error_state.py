@@ -31,14 +31,14 @@ from netpos.filters.measurement import (
     VARIANCE,
 )
 from netpos.filters.motion import add_walk
-from netpos.filters.space import CLOCK, SpaceKind, innovation_at, linearise_in_space
+from netpos.filters.space import SpaceKind, innovation_at, linearise_in_space
+from netpos.filters.state import ERR_BIASES, Err, Nav
 from netpos.inertial.strapdown import (
     ACCEL_BIAS,
     ERR,
     GYRO_BIAS,
     NAV,
     QUATERNION,
-    VELOCITY,
     Earth,
     InertialNoise,
     decay_biases,
@@ -232,7 +232,7 @@ def _stands(nav: Array, memory: Array, constraints: Constraints, chunk: Array) -
     weight = 1.0 / max(memory[QUIET], 1.0)
     for i in range(3):
         memory[REST_FORCE + i] += weight * (chunk[3 + i] - memory[REST_FORCE + i])
-    speed = math.sqrt(nav[VELOCITY] ** 2 + nav[VELOCITY + 1] ** 2 + nav[VELOCITY + 2] ** 2)
+    speed = math.sqrt(nav[Nav.VX] ** 2 + nav[Nav.VY] ** 2 + nav[Nav.VZ] ** 2)
     quiet = memory[QUIET] >= _QUIET_CHUNKS and speed < _CREEP_MPS
     return bool(constraints.standstill_sd_mps > 0.0 and quiet)
 
@@ -315,12 +315,13 @@ def _slow_transition(nav: Array, dt: float, slow: SlowErrors, Phi: Array) -> Non
     """Move the slow errors of ``nav`` over ``dt`` [s] and fill in their part of ``Phi``."""
     if nav.size <= NAV:
         return
-    Phi[CLOCK, CLOCK + 1] = dt
-    nav[CLOCK + 1] += dt * nav[CLOCK + 2]
+    Phi[Err.CLOCK, Err.DRIFT] = dt
+    nav[Nav.CLOCK] += dt * nav[Nav.DRIFT]
     for i in range(slow.biases.shape[1]):
         fade = math.exp(-dt / slow.biases[1, i])
-        Phi[CLOCK + 2 + i, CLOCK + 2 + i] = fade
-        nav[CLOCK + 3 + i] *= fade
+        k = ERR_BIASES + i
+        Phi[k, k] = fade
+        nav[k + 1] *= fade
 
 
 @kernel
@@ -328,10 +329,10 @@ def _add_slow_noise(cov: Array, dt: float, slow: SlowErrors) -> None:
     """Add the noise of the slow errors over ``dt`` [s] to ``cov`` (n, n), in place."""
     if cov.shape[0] <= ERR:
         return
-    cov[CLOCK, CLOCK] += slow.clock_white**2 * dt
-    add_walk(CLOCK, CLOCK + 1, dt, slow.clock_walk**2, cov)
+    cov[Err.CLOCK, Err.CLOCK] += slow.clock_white**2 * dt
+    add_walk(Err.CLOCK, Err.DRIFT, dt, slow.clock_walk**2, cov)
     for i in range(slow.biases.shape[1]):
-        k = CLOCK + 2 + i
+        k = ERR_BIASES + i
         cov[k, k] += slow.biases[0, i] ** 2 * (1.0 - math.exp(-2.0 * dt / slow.biases[1, i]))
 
 

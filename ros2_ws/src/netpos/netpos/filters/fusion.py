@@ -8,7 +8,7 @@ import numpy as np
 
 from netpos.filters.compile import inlined, kernel, leaf, local_array
 from netpos.filters.factor import factor
-from netpos.filters.motion import N_CORE
+from netpos.filters.state import N_CORE, X
 from netpos.messages.values import Array
 
 # The workspace: vectors of one entry per row or state, then the prior covariance (n), H (m), P H'
@@ -40,11 +40,14 @@ def _project(
     n: int, P: Array, h: Array, residual: float, step: Array, Ph: Array
 ) -> tuple[float, float]:
     """P h to ``Ph`` (n,); returns h P h' and what the rows before have left of ``residual``."""
-    if n == N_CORE and h[2] == 0.0 and h[3] == 0.0 and h[5] == 0.0:  # position and clock only
+    still = h[X.VX] == 0.0 and h[X.VY] == 0.0 and h[X.DRIFT] == 0.0
+    if n == N_CORE and still:  # position and clock only
         for a in range(n):
-            Ph[a] = P[0, a] * h[0] + P[1, a] * h[1] + P[4, a] * h[4]
-        hPh = h[0] * Ph[0] + h[1] * Ph[1] + h[4] * Ph[4]
-        return hPh, residual - h[0] * step[0] - h[1] * step[1] - h[4] * step[4]
+            Ph[a] = P[X.PX, a] * h[X.PX] + P[X.PY, a] * h[X.PY] + P[X.CLOCK, a] * h[X.CLOCK]
+        hPh = h[X.PX] * Ph[X.PX] + h[X.PY] * Ph[X.PY] + h[X.CLOCK] * Ph[X.CLOCK]
+        residual -= h[X.PX] * step[X.PX]
+        residual -= h[X.PY] * step[X.PY]
+        return hPh, residual - h[X.CLOCK] * step[X.CLOCK]
     for a in range(n):
         Ph[a] = 0.0
     for b in range(n):

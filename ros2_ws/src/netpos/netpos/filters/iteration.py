@@ -11,6 +11,7 @@ from netpos.filters.compile import kernel, leaf
 from netpos.filters.fit import misfit
 from netpos.filters.fusion import W_COV, W_INNOVATION, W_PH, W_PRIOR, W_USE, W_VARIANCE, fuse
 from netpos.filters.measurement import VARIANCE, curvature_variance, innovation_row, linearise
+from netpos.filters.state import X
 from netpos.messages.values import Array
 
 # Iterating ends where the model is straight over the last step to this share of a row's noise sd.
@@ -142,19 +143,23 @@ def refine_used(mean: Array, cov: Array, rows: Array, height_m: float, work: Arr
     kept = rows[work[W_USE, :m] == 1.0]
     variance = kept[:, VARIANCE].copy()
     _, narrowed = iterate(prior, prior_cov, kept, variance, height_m, 1, work)
-    width = prior_cov[0, 0] + prior_cov[1, 1]
-    if narrowed[0, 0] + narrowed[1, 1] > _NARROWS * width:
+    width = prior_cov[X.PX, X.PX] + prior_cov[X.PY, X.PY]
+    if narrowed[X.PX, X.PX] + narrowed[X.PY, X.PY] > _NARROWS * width:
         return
     x, P = iterate_from(mean, prior, prior_cov, kept, variance, height_m, _SEARCH, work)
     cost = misfit(prior, prior_cov, kept, variance, height_m, x)
     rival = math.inf
     for k in range(_STARTS):
         start = prior.copy()
-        start[0] += 1.5 * math.sqrt(prior_cov[0, 0]) * math.cos(2.0 * math.pi * k / _STARTS)
-        start[1] += 1.5 * math.sqrt(prior_cov[1, 1]) * math.sin(2.0 * math.pi * k / _STARTS)
+        start[X.PX] += (
+            1.5 * math.sqrt(prior_cov[X.PX, X.PX]) * math.cos(2.0 * math.pi * k / _STARTS)
+        )
+        start[X.PY] += (
+            1.5 * math.sqrt(prior_cov[X.PY, X.PY]) * math.sin(2.0 * math.pi * k / _STARTS)
+        )
         y, Y = iterate_from(start, prior, prior_cov, kept, variance, height_m, _SEARCH, work)
         other = misfit(prior, prior_cov, kept, variance, height_m, y)
-        apart = math.hypot(y[0] - x[0], y[1] - x[1]) > _APART_M
+        apart = math.hypot(y[X.PX] - x[X.PX], y[X.PY] - x[X.PY]) > _APART_M
         if other < cost - 1e-3:
             if apart:
                 rival = cost

@@ -9,7 +9,7 @@ from netpos.filters.compile import kernel
 from netpos.filters.factor import factor
 from netpos.filters.gate import gate_groups, select_rows
 from netpos.filters.measurement import GATE_VARIANCE, GROUP, KIND, VARIANCE, Kind, linearise
-from netpos.filters.motion import N_CORE
+from netpos.filters.state import X
 from netpos.messages.values import Array
 
 NO_FLOOR = np.zeros(3)
@@ -118,12 +118,12 @@ def _raise_gain(K: Array, h: Array, gain_floor: Array) -> None:
     axis = -1
     for i in range(h.size):
         if h[i] != 0.0:
-            if axis >= 0 or i > 1:
+            if axis >= 0 or i > X.PY:
                 return
             axis = i
     if axis < 0:
         return
     for order in range(3):
-        i = N_CORE + axis if order == 2 else axis + 2 * order
+        i = (X.PX, X.VX, X.AX)[order] + axis
         if i < h.size and gain_floor[order] > 0.0 and K[i] * h[axis] < gain_floor[order]:
             K[i] = gain_floor[order] / h[axis]

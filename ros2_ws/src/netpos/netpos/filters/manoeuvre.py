@@ -14,6 +14,7 @@ from netpos.filters.compile import leaf
 from netpos.filters.factor import eigenvalues
 from netpos.filters.measurement import GATE_VARIANCE, innovation_row, innovation_variance
 from netpos.filters.motion import add_jump
+from netpos.filters.state import X
 from netpos.messages.values import Array
 
 # The filter follows a manoeuvre as long as its gate passes it, so that it is noticed later.
@@ -35,9 +36,9 @@ def unnoticed_s(
         innovation_row(rows[i], mean, height_m, h)
         noise = rows[i, GATE_VARIANCE]
         variance = innovation_variance(rows[i], mean, cov, height_m, noise, h)
-        xx += h[0] * h[0] / variance
-        xy += h[0] * h[1] / variance
-        yy += h[1] * h[1] / variance
+        xx += h[X.PX] * h[X.PX] / variance
+        xy += h[X.PX] * h[X.PY] / variance
+        yy += h[X.PY] * h[X.PY] / variance
     least, _ = eigenvalues(xx, xy, yy)
     typical = math.sqrt(2.0 * gate / (xx + yy)) / speed if xx + yy > 0.0 else math.inf
     longest = math.sqrt(gate / least) / speed if least > 1e-12 * (xx + yy) else math.inf

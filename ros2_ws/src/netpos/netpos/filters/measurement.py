@@ -41,6 +41,7 @@ from enum import IntEnum
 import numpy as np
 
 from netpos.filters.compile import inlined, kernel, leaf
+from netpos.filters.state import N_CORE, X
 from netpos.filters.step_velocity import curvature, reported
 from netpos.messages.values import Array
 
@@ -91,12 +92,12 @@ def is_cyclic(row: Array) -> bool:
 
 @leaf
 def _phase(row: Array, dx: float, dy: float, dz: float, h: Array) -> float:
-    """Phase difference of the offset d from the array's middle; its gradient to h[:2]."""
+    """Phase difference of the offset d from the array's middle; its gradient to h."""
     r = max(math.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
     a = AXES
     value = (row[a] * dx + row[a + 1] * dy + row[a + 2] * dz) / r
-    h[0] = (row[a] - value * dx / r) / r
-    h[1] = (row[a + 1] - value * dy / r) / r
+    h[X.PX] = (row[a] - value * dx / r) / r
+    h[X.PY] = (row[a + 1] - value * dy / r) / r
     return float(value)
 
 
@@ -144,7 +145,7 @@ def _turned_lever(row: Array, mean: Array) -> tuple[float, float]:
 @inlined
 def _from_rsu(row: Array, mean: Array, height_m: float, h: Array) -> float:
     """Quantities of the offset between the RSU and the device's antenna."""
-    x, y = mean[0], mean[1]
+    x, y = mean[X.PX], mean[X.PY]
     heading = int(row[HEADING])
     lx = ly = 0.0
     if heading >= 0:
@@ -155,17 +156,17 @@ def _from_rsu(row: Array, mean: Array, height_m: float, h: Array) -> float:
     kind = int(row[KIND])
     if kind == Kind.TOA or kind == Kind.RANGE:
         value = max(math.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
-        h[0] = dx / value
-        h[1] = dy / value
+        h[X.PX] = dx / value
+        h[X.PY] = dy / value
         if kind == Kind.TOA:
-            h[4] = 1.0
-            value += mean[4]
+            h[X.CLOCK] = 1.0
+            value += mean[X.CLOCK]
     elif kind >= Kind.PHASE:
         value = _phase(row, dx, dy, dz, h)
     else:
-        value, h[0], h[1], _ = direction(row, dx, dy, dz)
+        value, h[X.PX], h[X.PY], _ = direction(row, dx, dy, dz)
     if heading >= 0:
-        h[heading] = h[1] * lx - h[0] * ly
+        h[heading] = h[X.PY] * lx - h[X.PX] * ly
     return float(value)
 
 
@@ -178,20 +179,20 @@ def predict_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
     kind = int(row[KIND])
     value = 0.0
     if kind == Kind.LINEAR:
-        for i in range(6):
+        for i in range(N_CORE):
             h[i] = row[ORIGIN + i]
             value += h[i] * mean[i]
         if row[HEADING] >= 0.0:
             lx, ly = _turned_lever(row, mean)
-            value += h[0] * lx + h[1] * ly
-            h[int(row[HEADING])] = h[1] * lx - h[0] * ly
+            value += h[X.PX] * lx + h[X.PY] * ly
+            h[int(row[HEADING])] = h[X.PY] * lx - h[X.PX] * ly
     elif kind == Kind.STEP_VELOCITY:
         gx, gy = row[ORIGIN + 2], row[ORIGIN + 3]
         return float(reported(gx, gy, mean, int(row[BIAS]), int(row[COMMON]), h))
     elif kind == Kind.SPEED:
-        value = math.sqrt(mean[2] * mean[2] + mean[3] * mean[3])
-        h[2] = mean[2] / max(value, 1e-6)
-        h[3] = mean[3] / max(value, 1e-6)
+        value = math.sqrt(mean[X.VX] * mean[X.VX] + mean[X.VY] * mean[X.VY])
+        h[X.VX] = mean[X.VX] / max(value, 1e-6)
+        h[X.VY] = mean[X.VY] / max(value, 1e-6)
     else:
         value = _from_rsu(row, mean, height_m, h)
     for column in (BIAS, COMMON):
@@ -247,8 +248,8 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
     if kind == Kind.STEP_VELOCITY:
         gx, gy = row[ORIGIN + 2], row[ORIGIN + 3]
         return float(curvature(gx, gy, mean, cov, int(row[BIAS]), int(row[COMMON])))
-    dx = mean[0] - row[ORIGIN]
-    dy = mean[1] - row[ORIGIN + 1]
+    dx = mean[X.PX] - row[ORIGIN]
+    dy = mean[X.PY] - row[ORIGIN + 1]
     if row[HEADING] >= 0.0:
         lx, ly = _turned_lever(row, mean)
         dx += lx
@@ -258,7 +259,7 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
         return float(range_second_order_variance(dx, dy, dz, cov, 2))
     rho2 = dx * dx + dy * dy
     r2 = max(rho2 + dz * dz, 1e-6)
-    square = cov[0, 0] ** 2 + 2.0 * cov[0, 1] ** 2 + cov[1, 1] ** 2
+    square = cov[X.PX, X.PX] ** 2 + 2.0 * cov[X.PX, X.PY] ** 2 + cov[X.PY, X.PY] ** 2
     d2 = max(rho2, 1e-6) if kind == Kind.AZIMUTH else r2
     if kind >= Kind.PHASE:
         a = AXES
@@ -275,10 +276,10 @@ def second_order_variance(row: Array, mean: Array, cov: Array, height_m: float) 
     """
     if int(row[KIND]) != Kind.AZIMUTH or row[HEADING] >= 0.0 or row[AXES + 8] != 1.0:
         return float(curvature_variance(row, mean, cov, height_m))
-    dx, dy = mean[0] - row[ORIGIN], mean[1] - row[ORIGIN + 1]
+    dx, dy = mean[X.PX] - row[ORIGIN], mean[X.PY] - row[ORIGIN + 1]
     rho4 = max(dx * dx + dy * dy, 1e-3) ** 2
     a, b = 2.0 * dx * dy / rho4, (dy * dy - dx * dx) / rho4  # h'' = [[a, b], [b, -a]]
-    xx, xy, yy = cov[0, 0], cov[0, 1], cov[1, 1]
+    xx, xy, yy = cov[X.PX, X.PX], cov[X.PX, X.PY], cov[X.PY, X.PY]
     first, last = a * xx + b * xy, b * xy - a * yy
     return float(0.5 * (first**2 + last**2) + (a * xy + b * yy) * (b * xx - a * xy))
 

@@ -1,6 +1,6 @@
 """Process models f, F and Q: the motion of a device, its two-state clock, slow sensor biases.
 
-Entries of the state beyond the six of ``StateIndex`` belong to the motion model first
+Entries of the state beyond the core (``state.X``) belong to the motion model first
 (``extra_states``), then to the biases, first-order Gauss-Markov processes.
 """
 
@@ -12,23 +12,10 @@ from enum import IntEnum
 import numpy as np
 
 from netpos.filters.compile import inlined, leaf
+from netpos.filters.state import N_CORE, X
 from netpos.messages.values import Array
 
 SPEED_OF_LIGHT_MPS = 299_792_458.0
-
-
-class StateIndex(IntEnum):
-    """Order of the core state."""
-
-    X = 0
-    Y = 1
-    VX = 2
-    VY = 3
-    CLOCK = 4
-    DRIFT = 5
-
-
-N_CORE = len(StateIndex)
 
 
 class Model(IntEnum):
@@ -126,11 +113,11 @@ def _turn(rate: float, dt: float) -> tuple[float, float, float, float]:
 @leaf
 def _inertial_velocity(mean: Array, dt: float, motion: Array) -> tuple[float, float, float]:
     """Rotated velocity w and speed increment a of the INERTIAL model, biases removed."""
-    theta = motion[Parameter.YAW_INCREMENT] - mean[N_CORE] * dt
+    theta = motion[Parameter.YAW_INCREMENT] - mean[X.GYRO_BIAS] * dt
     c, s = math.cos(theta), math.sin(theta)
-    wx = c * mean[2] - s * mean[3]
-    wy = s * mean[2] + c * mean[3]
-    return wx, wy, motion[Parameter.SPEED_INCREMENT] - mean[N_CORE + 1] * dt
+    wx = c * mean[X.VX] - s * mean[X.VY]
+    wy = s * mean[X.VX] + c * mean[X.VY]
+    return wx, wy, motion[Parameter.SPEED_INCREMENT] - mean[X.ACCEL_BIAS] * dt
 
 
 @inlined
@@ -139,39 +126,39 @@ def propagate(mean: Array, dt: float, motion: Array, bias: Array) -> None:
     constant of each bias."""
     model = int(motion[Parameter.MODEL])
     extras = int(motion[Parameter.EXTRAS])
-    vx, vy = mean[2], mean[3]
+    vx, vy = mean[X.VX], mean[X.VY]
     if model == Model.CONSTANT_TURN:
-        along, across, _, _ = _turn(mean[6], dt)
-        angle = mean[6] * dt
+        along, across, _, _ = _turn(mean[X.TURN_RATE], dt)
+        angle = mean[X.TURN_RATE] * dt
         c, s = math.cos(angle), math.sin(angle)
-        mean[0] += along * vx - across * vy
-        mean[1] += across * vx + along * vy
-        mean[2] = c * vx - s * vy
-        mean[3] = s * vx + c * vy
+        mean[X.PX] += along * vx - across * vy
+        mean[X.PY] += across * vx + along * vy
+        mean[X.VX] = c * vx - s * vy
+        mean[X.VY] = s * vx + c * vy
     elif model == Model.STATIONARY:
-        mean[2] = mean[3] = 0.0
+        mean[X.VX] = mean[X.VY] = 0.0
     elif model == Model.INERTIAL:
         wx, wy, gain = _inertial_velocity(mean, dt, motion)
         size = math.sqrt(wx * wx + wy * wy + _CREEP_MPS * _CREEP_MPS)
-        mean[2] = wx * (1.0 + gain / size)
-        mean[3] = wy * (1.0 + gain / size)
-        mean[0] += dt * (vx + mean[2]) / 2.0
-        mean[1] += dt * (vy + mean[3]) / 2.0
+        mean[X.VX] = wx * (1.0 + gain / size)
+        mean[X.VY] = wy * (1.0 + gain / size)
+        mean[X.PX] += dt * (vx + mean[X.VX]) / 2.0
+        mean[X.PY] += dt * (vy + mean[X.VY]) / 2.0
     else:
-        mean[0] += dt * vx
-        mean[1] += dt * vy
+        mean[X.PX] += dt * vx
+        mean[X.PY] += dt * vy
         if model == Model.CONSTANT_ACCELERATION:
             for axis in range(2):
-                mean[axis] += dt * dt / 2.0 * mean[6 + axis]
-                mean[2 + axis] += dt * mean[6 + axis]
+                mean[X.PX + axis] += dt * dt / 2.0 * mean[X.AX + axis]
+                mean[X.VX + axis] += dt * mean[X.AX + axis]
         elif model == Model.RIGID_BODY:
-            mean[6] += dt * mean[7]
+            mean[X.YAW] += dt * mean[X.YAW_RATE]
     if model == Model.CONSTANT_VELOCITY or model == Model.STATIONARY:
-        for i in range(6, 6 + extras):
+        for i in range(N_CORE, N_CORE + extras):
             mean[i] = 0.0
-    mean[4] += dt * mean[5]
+    mean[X.CLOCK] += dt * mean[X.DRIFT]
     for i in range(bias.shape[1]):
-        mean[6 + extras + i] *= math.exp(-dt / bias[1, i])
+        mean[N_CORE + extras + i] *= math.exp(-dt / bias[1, i])
 
 
 @leaf
@@ -183,42 +170,51 @@ def transition(mean: Array, dt: float, motion: Array, bias: Array, F: Array) -> 
     F[:] = 0.0
     for i in range(mean.size):
         F[i, i] = 1.0
-    F[4, 5] = dt
+    F[X.CLOCK, X.DRIFT] = dt
     if model == Model.CONSTANT_TURN:
         _turn_jacobian(mean, dt, F)
     elif model == Model.STATIONARY:
-        F[2, 2] = F[3, 3] = 0.0
+        F[X.VX, X.VX] = F[X.VY, X.VY] = 0.0
     elif model == Model.INERTIAL:
         _inertial_jacobian(mean, dt, motion, F)
     else:
-        F[0, 2] = F[1, 3] = dt
+        F[X.PX, X.VX] = F[X.PY, X.VY] = dt
         if model == Model.CONSTANT_ACCELERATION:
             for axis in range(2):
-                F[axis, 6 + axis] = dt * dt / 2.0
-                F[2 + axis, 6 + axis] = dt
+                F[X.PX + axis, X.AX + axis] = dt * dt / 2.0
+                F[X.VX + axis, X.AX + axis] = dt
         elif model == Model.RIGID_BODY:
-            F[6, 7] = dt
+            F[X.YAW, X.YAW_RATE] = dt
     if model == Model.CONSTANT_VELOCITY or model == Model.STATIONARY:
-        for i in range(6, 6 + extras):
+        for i in range(N_CORE, N_CORE + extras):
             F[i, i] = 0.0
     for i in range(bias.shape[1]):
-        F[6 + extras + i, 6 + extras + i] = math.exp(-dt / bias[1, i])
+        k = N_CORE + extras + i
+        F[k, k] = math.exp(-dt / bias[1, i])
 
 
 @leaf
 def _turn_jacobian(mean: Array, dt: float, F: Array) -> None:
-    vx, vy, rate = mean[2], mean[3], mean[6]
+    vx, vy, rate = mean[X.VX], mean[X.VY], mean[X.TURN_RATE]
     along, across, d_along, d_across = _turn(rate, dt)
     c, s = math.cos(rate * dt), math.sin(rate * dt)
-    F[0, 2], F[0, 3], F[0, 6] = along, -across, d_along * vx - d_across * vy
-    F[1, 2], F[1, 3], F[1, 6] = across, along, d_across * vx + d_along * vy
-    F[2, 2], F[2, 3], F[2, 6] = c, -s, dt * (-s * vx - c * vy)
-    F[3, 2], F[3, 3], F[3, 6] = s, c, dt * (c * vx - s * vy)
+    F[X.PX, X.VX], F[X.PX, X.VY], F[X.PX, X.TURN_RATE] = (
+        along,
+        -across,
+        d_along * vx - d_across * vy,
+    )
+    F[X.PY, X.VX], F[X.PY, X.VY], F[X.PY, X.TURN_RATE] = (
+        across,
+        along,
+        d_across * vx + d_along * vy,
+    )
+    F[X.VX, X.VX], F[X.VX, X.VY], F[X.VX, X.TURN_RATE] = c, -s, dt * (-s * vx - c * vy)
+    F[X.VY, X.VX], F[X.VY, X.VY], F[X.VY, X.TURN_RATE] = s, c, dt * (c * vx - s * vy)
 
 
 @leaf
 def _inertial_jacobian(mean: Array, dt: float, motion: Array, F: Array) -> None:
-    theta = motion[Parameter.YAW_INCREMENT] - mean[N_CORE] * dt
+    theta = motion[Parameter.YAW_INCREMENT] - mean[X.GYRO_BIAS] * dt
     c, s = math.cos(theta), math.sin(theta)
     wx, wy, gain = _inertial_velocity(mean, dt, motion)
     size = math.sqrt(wx * wx + wy * wy + _CREEP_MPS * _CREEP_MPS)
@@ -226,15 +222,19 @@ def _inertial_jacobian(mean: Array, dt: float, motion: Array, F: Array) -> None:
     axx = 1.0 + gain * (1.0 / size - wx * wx / cube)
     ayy = 1.0 + gain * (1.0 / size - wy * wy / cube)
     axy = -gain * wx * wy / cube
-    F[2, 2], F[2, 3] = axx * c + axy * s, -axx * s + axy * c
-    F[3, 2], F[3, 3] = axy * c + ayy * s, -axy * s + ayy * c
-    F[2, 6], F[3, 6] = dt * (axx * wy - axy * wx), dt * (axy * wy - ayy * wx)
-    F[2, 7], F[3, 7] = -dt * wx / size, -dt * wy / size
+    F[X.VX, X.VX], F[X.VX, X.VY] = axx * c + axy * s, -axx * s + axy * c
+    F[X.VY, X.VX], F[X.VY, X.VY] = axy * c + ayy * s, -axy * s + ayy * c
+    F[X.VX, X.GYRO_BIAS], F[X.VY, X.GYRO_BIAS] = (
+        dt * (axx * wy - axy * wx),
+        dt * (axy * wy - ayy * wx),
+    )
+    F[X.VX, X.ACCEL_BIAS], F[X.VY, X.ACCEL_BIAS] = -dt * wx / size, -dt * wy / size
     for axis in range(2):
-        for column in range(2, 8):
-            if column < 4 or column > 5:
-                F[axis, column] = dt / 2.0 * F[2 + axis, column]
-        F[axis, 2 + axis] += dt / 2.0
+        p, v = X.PX + axis, X.VX + axis
+        F[p, X.VX], F[p, X.VY] = dt / 2.0 * F[v, X.VX], dt / 2.0 * F[v, X.VY]
+        F[p, X.GYRO_BIAS] = dt / 2.0 * F[v, X.GYRO_BIAS]
+        F[p, X.ACCEL_BIAS] = dt / 2.0 * F[v, X.ACCEL_BIAS]
+        F[p, v] += dt / 2.0
 
 
 @inlined
@@ -248,10 +248,11 @@ def add_noise(mean: Array, dt: float, motion: Array, bias: Array, cov: Array) ->
     if model == Model.STATIONARY:
         rest = motion[Parameter.REST_SPEED] ** 2
         for p in range(2):
+            v = X.VX + p
             cov[p, p] += rest * dt * dt / 4.0
-            cov[p, p + 2] += rest * dt / 2.0
-            cov[p + 2, p] += rest * dt / 2.0
-            cov[p + 2, p + 2] += rest
+            cov[p, v] += rest * dt / 2.0
+            cov[v, p] += rest * dt / 2.0
+            cov[v, v] += rest
     elif model == Model.CONSTANT_ACCELERATION:
         _add_jerk(dt, motion[Parameter.JERK] ** 2, cov)
     else:
@@ -260,16 +261,16 @@ def add_noise(mean: Array, dt: float, motion: Array, bias: Array, cov: Array) ->
     time_s, spread_m = motion[Parameter.JUMP_TIME], motion[Parameter.JUMP_SPREAD]
     add_jump(motion[Parameter.JUMP_SPEED], time_s, spread_m, cov)
     if model == Model.CONSTANT_TURN:
-        cov[6, 6] += motion[Parameter.TURN_RATE] ** 2 * dt
+        cov[X.TURN_RATE, X.TURN_RATE] += motion[Parameter.TURN_RATE] ** 2 * dt
     elif model == Model.RIGID_BODY:
-        add_walk(6, 7, dt, motion[Parameter.TURN_RATE] ** 2, cov)
+        add_walk(X.YAW, X.YAW_RATE, dt, motion[Parameter.TURN_RATE] ** 2, cov)
     elif model == Model.INERTIAL:
         _add_inertial(mean, dt, motion, cov)
     elif model == Model.CONSTANT_VELOCITY or model == Model.STATIONARY:
-        for i in range(6, 6 + extras):
+        for i in range(N_CORE, N_CORE + extras):
             cov[i, i] += motion[Parameter.TURN_RATE] ** 2 * dt
     for i in range(bias.shape[1]):
-        k = 6 + extras + i
+        k = N_CORE + extras + i
         cov[k, k] += bias[0, i] ** 2 * (1.0 - math.exp(-2.0 * dt / bias[1, i]))
 
 
@@ -280,10 +281,11 @@ def add_jump(sd: float, time_s: float, spread_m: float, cov: Array) -> None:
     if sd == 0.0:
         return
     for p in range(2):
+        v = X.VX + p
         cov[p, p] += (sd * time_s) ** 2 + spread_m**2
-        cov[p, p + 2] += sd * sd * time_s
-        cov[p + 2, p] += sd * sd * time_s
-        cov[p + 2, p + 2] += sd * sd
+        cov[p, v] += sd * sd * time_s
+        cov[v, p] += sd * sd * time_s
+        cov[v, v] += sd * sd
 
 
 @inlined
@@ -294,8 +296,8 @@ def _add_acceleration(dt: float, motion: Array, cov: Array) -> None:
         continuous = True
     elif kind == ProcessNoise.WERNER:
         step = motion[Parameter.VELOCITY_STEP] ** 2
-        cov[2, 2] += step
-        cov[3, 3] += step
+        cov[X.VX, X.VX] += step
+        cov[X.VY, X.VY] += step
         return
     q = motion[Parameter.ACCEL] ** 2
     if continuous:
@@ -303,16 +305,17 @@ def _add_acceleration(dt: float, motion: Array, cov: Array) -> None:
     else:
         pp, pv, vv = q * dt**4 / 4.0, q * dt**3 / 2.0, q * dt**2
     for p in range(2):
+        v = X.VX + p
         cov[p, p] += pp
-        cov[p, p + 2] += pv
-        cov[p + 2, p] += pv
-        cov[p + 2, p + 2] += vv
+        cov[p, v] += pv
+        cov[v, p] += pv
+        cov[v, v] += vv
 
 
 @leaf
 def _add_jerk(dt: float, q: float, cov: Array) -> None:
     for p in range(2):
-        v, a = p + 2, p + 6
+        v, a = X.VX + p, X.AX + p
         cov[p, p] += q * dt**5 / 20.0
         cov[v, v] += q * dt**3 / 3.0
         cov[a, a] += q * dt
@@ -328,10 +331,10 @@ def _add_jerk(dt: float, q: float, cov: Array) -> None:
 @inlined
 def _add_clock(dt: float, motion: Array, cov: Array) -> None:
     if int(motion[Parameter.NOISE]) != ProcessNoise.CONTINUOUS:
-        cov[5, 5] += motion[Parameter.DRIFT_STEP] ** 2
+        cov[X.DRIFT, X.DRIFT] += motion[Parameter.DRIFT_STEP] ** 2
         return
-    cov[4, 4] += motion[Parameter.OFFSET_DENSITY] ** 2 * dt
-    add_walk(4, 5, dt, motion[Parameter.DRIFT_DENSITY] ** 2, cov)
+    cov[X.CLOCK, X.CLOCK] += motion[Parameter.OFFSET_DENSITY] ** 2 * dt
+    add_walk(X.CLOCK, X.DRIFT, dt, motion[Parameter.DRIFT_DENSITY] ** 2, cov)
 
 
 @inlined
@@ -346,12 +349,12 @@ def add_walk(value: int, rate: int, dt: float, q: float, cov: Array) -> None:
 @leaf
 def _add_inertial(mean: Array, dt: float, motion: Array, cov: Array) -> None:
     angle = motion[Parameter.GYRO] ** 2 * dt
-    across = (-mean[3] * dt / 2.0, mean[2] * dt / 2.0, -mean[3], mean[2])
+    across = (-mean[X.VY] * dt / 2.0, mean[X.VX] * dt / 2.0, -mean[X.VY], mean[X.VX])
     for i in range(4):
         for j in range(4):
             cov[i, j] += angle * across[i] * across[j]
-    cov[6, 6] += motion[Parameter.GYRO_BIAS] ** 2 * dt
-    cov[7, 7] += motion[Parameter.ACCEL_BIAS] ** 2 * dt
+    cov[X.GYRO_BIAS, X.GYRO_BIAS] += motion[Parameter.GYRO_BIAS] ** 2 * dt
+    cov[X.ACCEL_BIAS, X.ACCEL_BIAS] += motion[Parameter.ACCEL_BIAS] ** 2 * dt
 
 
 @leaf

@@ -27,6 +27,7 @@ from netpos.filters.measurement import (
     Kind,
 )
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.filters.state import N_CORE
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 
 # Plain integers: arithmetic of flags costs ten times as much.
@@ -201,7 +202,7 @@ def put_measurement(
         *m.lever_arm,
     )
     if fields & _POSITION:
-        fix = linear_rows(m.position[:2], m.position_cov[:2, :2], np.eye(2, 6), group)
+        fix = linear_rows(m.position[:2], m.position_cov[:2, :2], np.eye(2, N_CORE), group)
         fix[:, HEADING:BLOCKED] = heading, *m.lever_arm
         rows[at : at + 2] = fix
         at += 2
@@ -251,7 +252,7 @@ def linear_rows(value: Array, cov: Array, H: Array, group: int) -> Array:
     rows[:, VARIANCE] = rows[:, GATE_VARIANCE] = 1.0
     rows[:, BIAS] = rows[:, COMMON] = rows[:, HEADING] = -1
     rows[:, GROUP] = group
-    rows[:, ORIGIN : ORIGIN + 6] = np.linalg.solve(L, H)
+    rows[:, ORIGIN : ORIGIN + N_CORE] = np.linalg.solve(L, H)
     return rows
 
 

@@ -40,10 +40,10 @@ from netpos.filters.measurement import (
     range_second_order_variance,
     wrap,
 )
+from netpos.filters.state import Err, Nav
 from netpos.inertial.strapdown import (
     ACCEL_BIAS,
     ATTITUDE_ERR,
-    ERR,
     GYRO_BIAS,
     GYRO_BIAS_ERR,
     QUATERNION,
@@ -51,9 +51,6 @@ from netpos.inertial.strapdown import (
     rotation_of,
 )
 from netpos.messages.values import Array
-
-CLOCK = ERR
-"""Index of the clock's offset in an error state that has more than ERR entries."""
 
 
 class SpaceKind(IntEnum):
@@ -109,16 +106,18 @@ def innovation_at(row: Array, nav: Array, C: Array, h: Array) -> float:
     rx = C[0, 0] * row[a] + C[0, 1] * row[a + 1] + C[0, 2] * row[a + 2]
     ry = C[1, 0] * row[a] + C[1, 1] * row[a + 1] + C[1, 2] * row[a + 2]
     rz = C[2, 0] * row[a] + C[2, 1] * row[a + 1] + C[2, 2] * row[a + 2]
-    value, h[0], h[1], h[2] = value_at(row, nav[0] + rx, nav[1] + ry, nav[2] + rz)
-    h[ATTITUDE_ERR] = ry * h[2] - rz * h[1]
-    h[ATTITUDE_ERR + 1] = rz * h[0] - rx * h[2]
-    h[ATTITUDE_ERR + 2] = rx * h[1] - ry * h[0]
-    if kind == Kind.TOA and h.size > CLOCK:
-        h[CLOCK] = 1.0
-        value += nav[CLOCK + 1]
+    x, y, z = nav[Nav.PX] + rx, nav[Nav.PY] + ry, nav[Nav.PZ] + rz
+    value, gx, gy, gz = value_at(row, x, y, z)
+    h[Err.PX], h[Err.PY], h[Err.PZ] = gx, gy, gz
+    h[Err.ROLL] = ry * gz - rz * gy
+    h[Err.PITCH] = rz * gx - rx * gz
+    h[Err.YAW] = rx * gy - ry * gx
+    if kind == Kind.TOA and h.size > Err.CLOCK:
+        h[Err.CLOCK] = 1.0
+        value += nav[Nav.CLOCK]
     for column in (BIAS, COMMON):
         index = int(row[column])
-        if CLOCK < index < h.size:  # a state without clock and biases takes none
+        if Err.CLOCK < index < h.size:  # a state without clock and biases takes none
             h[index] = 1.0
             value += nav[index + 1]
     difference = row[VALUE] - value
@@ -132,9 +131,9 @@ def bend_variance(row: Array, nav: Array, cov: Array) -> float:
     kind = int(row[KIND])
     if kind >= SpaceKind.PLACE:
         return 0.0
-    d0 = nav[0] - row[ORIGIN]
-    d1 = nav[1] - row[ORIGIN + 1]
-    d2 = nav[2] - row[ORIGIN + 2]
+    d0 = nav[Nav.PX] - row[ORIGIN]
+    d1 = nav[Nav.PY] - row[ORIGIN + 1]
+    d2 = nav[Nav.PZ] - row[ORIGIN + 2]
     if kind == Kind.RANGE or kind == Kind.TOA:
         return float(range_second_order_variance(d0, d1, d2, cov, 3))
     rho2 = max(d0 * d0 + d1 * d1, 1e-6)
@@ -144,7 +143,9 @@ def bend_variance(row: Array, nav: Array, cov: Array) -> float:
         for j in range(3):
             square += cov[i, j] * cov[i, j]
     if kind == Kind.AZIMUTH:
-        plane = cov[0, 0] ** 2 + 2.0 * cov[0, 1] ** 2 + cov[1, 1] ** 2
+        plane = (
+            cov[Err.PX, Err.PX] ** 2 + 2.0 * cov[Err.PX, Err.PY] ** 2 + cov[Err.PY, Err.PY] ** 2
+        )
         return float(0.5 * plane / (rho2 * rho2))
     return float(0.5 * square / (r2 * r2))
 

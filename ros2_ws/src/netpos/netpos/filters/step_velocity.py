@@ -14,6 +14,7 @@ import math
 import numpy as np
 
 from netpos.filters.compile import kernel, leaf
+from netpos.filters.state import X
 from netpos.messages.values import Array
 
 
@@ -24,13 +25,13 @@ def _state(mean: Array, index: int) -> float:
 
 @leaf
 def reported(gx: float, gy: float, mean: Array, length: int, heading: int, h: Array) -> float:
-    """g u at ``mean`` (n,), whose entries 2 and 3 are v; its gradient there is added to ``h``
+    """g u at ``mean`` (n,), whose velocity is v; its gradient there is added to ``h``
     (n,). length, heading : state indices of k and a"""
     scale, angle = math.exp(-_state(mean, length)), _state(mean, heading)
     c, s = scale * math.cos(angle), scale * math.sin(angle)
-    h[2] += gx * c - gy * s
-    h[3] += gx * s + gy * c
-    ux, uy = c * mean[2] + s * mean[3], c * mean[3] - s * mean[2]
+    h[X.VX] += gx * c - gy * s
+    h[X.VY] += gx * s + gy * c
+    ux, uy = c * mean[X.VX] + s * mean[X.VY], c * mean[X.VY] - s * mean[X.VX]
     value = gx * ux + gy * uy
     if length >= 0:
         h[length] -= value
@@ -44,10 +45,10 @@ def curvature(gx: float, gy: float, mean: Array, cov: Array, length: int, headin
     """Half the trace of (h'' P)^2 of ``reported`` at ``mean`` (n,) under ``cov`` (n, n)."""
     h = np.zeros(mean.size)
     value = reported(gx, gy, mean, length, heading, h)
-    index = (2, 3, length, heading)
+    index = (X.VX.value, X.VY.value, length, heading)
     second, P = np.zeros((4, 4)), np.zeros((4, 4))
-    second[0, 2], second[1, 2], second[2, 2] = -h[2], -h[3], value
-    second[0, 3], second[1, 3], second[3, 3] = -h[3], h[2], -value
+    second[0, 2], second[1, 2], second[2, 2] = -h[X.VX], -h[X.VY], value
+    second[0, 3], second[1, 3], second[3, 3] = -h[X.VY], h[X.VX], -value
     second[2, 3] = -h[heading] if heading >= 0 else 0.0
     for a in range(4):
         for b in range(4):

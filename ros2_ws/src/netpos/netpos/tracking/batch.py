@@ -9,12 +9,13 @@ import numpy as np
 
 from netpos.filters.measurement import BIAS, COMMON, KIND, ROW_WIDTH, VARIANCE, Kind, linearise
 from netpos.filters.rows import ROWS_MAX, couple, linear_rows, put_measurement, speed_row
+from netpos.filters.state import N_CORE, VELOCITY, X
 from netpos.messages.values import Array, Field, GroundSpeed, RsuMeasurement, Velocity
 from netpos.tracking.rsus import BiasStates, Rsu
 
 Source = RsuMeasurement | Velocity | GroundSpeed
 _TOA = int(Field.TOA)
-_VELOCITY_H = np.eye(2, 6, k=2)
+_VELOCITY_H = np.eye(2, N_CORE, k=X.VX)
 
 
 @dataclass(slots=True)
@@ -34,7 +35,7 @@ class Batch:
         mean = np.zeros(biases.first + len(biases.sd))
         for item in self.items:
             if isinstance(item, Velocity):
-                mean[2:4] = item.velocity  # the faster, the more a factor changes
+                mean[VELOCITY] = item.velocity  # the faster, the more a factor changes
         _, H = linearise(self.rows, mean, 0.0)
         variance: Array = np.square(H[:, biases.first :]) @ np.square(biases.sd)
         return variance

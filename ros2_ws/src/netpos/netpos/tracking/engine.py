@@ -13,6 +13,7 @@ from netpos.filters.compile import kernel, leaf
 from netpos.filters.manoeuvre import add_manoeuvre, unnoticed_s
 from netpos.filters.measurement import GROUP
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS, Parameter, add_jump
+from netpos.filters.state import X
 from netpos.messages.values import Array
 
 GATE_SIZE = 65
@@ -127,7 +128,7 @@ def open_velocity(spread: Array, sd: float, unheard_s: float, options: Array) ->
 def _open_factor(spread: Array, sd: float, unheard_s: float) -> None:
     for p in range(2):
         x = np.zeros(spread.shape[0])
-        x[p], x[p + 2] = sd * unheard_s, sd
+        x[X.PX + p], x[X.VX + p] = sd * unheard_s, sd
         srukf.cholesky_update(spread, x, 1.0)
 
 
@@ -143,7 +144,7 @@ def manoeuvre_s(
         cov = srukf.covariance(spread)
     h, height_m = np.empty(mean.size), options[Option.HEIGHT]
     speed, gate = options[Option.MANOEUVRE_SPEED], options[GATE + 2]
-    if 2.0 * speed * speed <= cov[2, 2] + cov[3, 3]:
+    if 2.0 * speed * speed <= cov[X.VX, X.VX] + cov[X.VY, X.VY]:
         return unheard_s
     typical_s, _ = unnoticed_s(mean, cov, rows, height_m, gate, speed, h)
     return max(unheard_s, typical_s if math.isfinite(typical_s) else 0.0)
@@ -160,7 +161,7 @@ def allow_manoeuvre(spread: Array, within_s: float, options: Array) -> None:
     _open_factor(spread, speed, within_s / 2.0)
     for p in range(2):
         x = np.zeros(spread.shape[0])
-        x[p] = speed * within_s / math.sqrt(12.0)
+        x[X.PX + p] = speed * within_s / math.sqrt(12.0)
         srukf.cholesky_update(spread, x, 1.0)
 
 
@@ -185,11 +186,11 @@ def note_jump(
 def is_sound(mean: Array, cov: Array) -> bool:
     """Whether the state can be a device's: on earth, slower than light, its position and velocity
     covariances definite in whatever axes they are told."""
-    if not (abs(mean[0]) < _FARTHEST_M and abs(mean[1]) < _FARTHEST_M):
+    if not (abs(mean[X.PX]) < _FARTHEST_M and abs(mean[X.PY]) < _FARTHEST_M):
         return False
-    if not math.hypot(mean[2], mean[3]) < SPEED_OF_LIGHT_MPS:
+    if not math.hypot(mean[X.VX], mean[X.VY]) < SPEED_OF_LIGHT_MPS:
         return False
-    for p in (0, 2):
+    for p in (X.PX, X.VX):
         a, b, c = cov[p, p], cov[p, p + 1], cov[p + 1, p + 1]
         if not (a > 0.0 and a * c - b * b > _ROUNDING * (a + c) ** 2):
             return False

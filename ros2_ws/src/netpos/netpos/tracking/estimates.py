@@ -14,6 +14,7 @@ import numpy as np
 from netpos.filters import filterpy_backend, imm
 from netpos.filters.measurement import GROUP
 from netpos.filters.motion import Parameter
+from netpos.filters.state import N_CORE
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking import engine
 from netpos.tracking.config import TrackerConfig
@@ -136,7 +137,7 @@ class Single(OnePlace, OneModel):
         return self._spare[0], cov
 
     def grow(self, sd: Array) -> None:
-        if self.mean.size < 6 + sd.size:
+        if self.mean.size < N_CORE + sd.size:
             mean, cov = grown(self.mean, self.cov, sd)
             self.mean, self._spread = mean, engine.to_spread(cov, self._options)
             self._make_room(self._rows)
@@ -277,7 +278,7 @@ class Interacting(_Looks):
         imm.combine(self._means, self._covs, self.weights, self.mean, self.cov)
 
     def grow(self, sd: Array) -> None:
-        if self.mean.size < 6 + sd.size:
+        if self.mean.size < N_CORE + sd.size:
             pairs = [grown(m, c, sd) for m, c in zip(self._means, self._covs, strict=True)]
             means = np.array([mean for mean, _ in pairs])
             self._set_state((means, np.array([cov for _, cov in pairs]), self.weights))

@@ -14,6 +14,7 @@ from netpos.filters.motion import (
     extra_states,
     motion_parameters,
 )
+from netpos.filters.state import N_CORE, POSITION, X
 from netpos.messages.values import Array
 from netpos.tracking.config import FILTERS, ROBUST, TrackerConfig
 from netpos.tracking.engine import GATE_SIZE, Option
@@ -87,7 +88,7 @@ def motions_of(config: TrackerConfig) -> Array:
 
 def heading_index(config: TrackerConfig) -> int:
     """State index of the heading; -1 where the motion model has none of its own."""
-    return 6 if config.motion_model == "rigid_body" else -1
+    return int(X.YAW) if config.motion_model == "rigid_body" else -1
 
 
 def by_sectors(config: TrackerConfig) -> bool:
@@ -114,19 +115,19 @@ def pose_state(config: TrackerConfig, position: Array, position_cov: Array) -> t
     """Mean (6,) and covariance (6, 6) that a given position (2,) m with covariance (2, 2) starts
     from: fokin2020:eq.32, 33."""
     c = SPEED_OF_LIGHT_MPS
-    mean = np.zeros(6)
-    mean[:2] = position
-    mean[5] = c * config.clock_drift_mean
+    mean = np.zeros(N_CORE)
+    mean[POSITION] = position
+    mean[X.DRIFT] = c * config.clock_drift_mean
     sd = [1.0, 1.0, *([config.initial_speed_sd_mps] * 2)]
     cov = np.diag(np.array([*sd, c * config.clock_offset_sd_s, c * config.clock_drift_sd]) ** 2)
-    cov[:2, :2] = position_cov
+    cov[POSITION, POSITION] = position_cov
     return mean, cov
 
 
 def grown(mean: Array, cov: Array, sd: Array) -> tuple[Array, Array]:
     """Mean and covariance with the last entries of ``sd`` appended as independent states of mean
     0, so that there are as many as 6 + len(sd)."""
-    new = sd[mean.size - 6 :]
+    new = sd[mean.size - N_CORE :]
     if not new.size:
         return mean, cov
     n = mean.size + new.size

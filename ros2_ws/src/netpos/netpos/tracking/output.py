@@ -9,6 +9,7 @@ import numpy as np
 from netpos.filters.compile import leaf
 from netpos.filters.factor import eigenvalues
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array, ClockState, Odometry, TrackState
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.protection import radius_of
@@ -29,7 +30,7 @@ _POSITION, _QUATERNION, _VELOCITY, _RATE, _VECTORS = 0, 3, 7, 10, 13
 @leaf
 def largest_sd(cov: Array) -> float:
     """Standard deviation [m] of the position along its worst horizontal direction."""
-    _, largest = eigenvalues(cov[0, 0], cov[0, 1], cov[1, 1])
+    _, largest = eigenvalues(cov[X.PX, X.PX], cov[X.PX, X.PY], cov[X.PY, X.PY])
     return math.sqrt(max(largest, 0.0))
 
 
@@ -44,11 +45,11 @@ def heading(mean: Array, cov: Array, last: float, index: int = -1) -> tuple[floa
 
 @leaf
 def _course(mean: Array, cov: Array, last: float) -> tuple[float, float]:
-    vx, vy = mean[2], mean[3]
+    vx, vy = mean[X.VX], mean[X.VY]
     speed2 = vx * vx + vy * vy
     if speed2 < 1e-12:
         return last, _YAW_VAR_MAX
-    xx, xy, yy = cov[2, 2], cov[2, 3], cov[3, 3]
+    xx, xy, yy = cov[X.VX, X.VX], cov[X.VX, X.VY], cov[X.VY, X.VY]
     variance = (vy * vy * xx - 2.0 * vx * vy * xy + vx * vx * yy) / (speed2 * speed2)
     if variance > _YAW_VAR_MAX / 4.0:
         return last, _YAW_VAR_MAX
@@ -61,9 +62,9 @@ def _fill(
 ) -> None:
     """Vectors and covariances of an odometry, all but its height, from what is not estimated."""
     cos, sin = math.cos(yaw), math.sin(yaw)
-    vx, vy = mean[2], mean[3]
-    xx, xy, yy = cov[2, 2], cov[2, 3], cov[3, 3]
-    vectors[_POSITION], vectors[_POSITION + 1] = mean[0], mean[1]
+    vx, vy = mean[X.VX], mean[X.VY]
+    xx, xy, yy = cov[X.VX, X.VX], cov[X.VX, X.VY], cov[X.VY, X.VY]
+    vectors[_POSITION], vectors[_POSITION + 1] = mean[X.PX], mean[X.PY]
     vectors[_VELOCITY], vectors[_VELOCITY + 1] = cos * vx + sin * vy, cos * vy - sin * vx
     vectors[_QUATERNION + 2] = math.sin(yaw / 2.0)
     vectors[_QUATERNION + 3] = math.cos(yaw / 2.0)
@@ -95,7 +96,9 @@ def _describe(
     _fill(mean, cov, yaw, yaw_var, vectors, covs)
     for a in range(2):
         for b in range(2):
-            clock_cov[a, b] = cov[4 + a, 4 + b] / (SPEED_OF_LIGHT_MPS * SPEED_OF_LIGHT_MPS)
+            clock_cov[a, b] = cov[X.CLOCK + a, X.CLOCK + b] / (
+                SPEED_OF_LIGHT_MPS * SPEED_OF_LIGHT_MPS
+            )
     return yaw, largest_sd(cov), radius_of(cov, risk)
 
 
@@ -121,12 +124,12 @@ def describe(
         yaw, yaw_var = heading(mean, cov, last_yaw, heading_index)
     yaw, sd_m, radius_m = _describe(mean, cov, yaw, yaw_var, risk, vectors, covs, clock_cov)
     if math.isnan(radius_m):
-        raise ValueError(f"the position's covariance is none: {cov[:2, :2].tolist()}")
+        raise ValueError(f"the position's covariance is none: {cov[POSITION, POSITION].tolist()}")
     clock = ClockState(
         stamp_ns=stamp_ns,
         vue_id=vue_id,
-        offset_s=mean.item(4) / SPEED_OF_LIGHT_MPS,
-        drift=mean.item(5) / SPEED_OF_LIGHT_MPS,
+        offset_s=mean.item(X.CLOCK) / SPEED_OF_LIGHT_MPS,
+        drift=mean.item(X.DRIFT) / SPEED_OF_LIGHT_MPS,
         cov=clock_cov,
     )
     told = _odometry(stamp_ns, vue_id, vectors, covs, height_m)
@@ -171,7 +174,7 @@ def with_yaw_rate(odometry: Odometry, mean: Array, cov: Array, heading: int) -> 
     rate = heading + 1
     odometry.angular_velocity[2] = mean[rate]
     odometry.twist_cov[5, 5] = cov[rate, rate]
-    odometry.pose_cov[:2, 5] = odometry.pose_cov[5, :2] = cov[:2, heading]
+    odometry.pose_cov[:2, 5] = odometry.pose_cov[5, :2] = cov[POSITION, heading]
     return odometry
 
 

@@ -23,6 +23,7 @@ from netpos.filters.measurement import (
     Kind,
     predict_row,
 )
+from netpos.filters.state import N_CORE, X
 from netpos.messages.values import Array
 
 TWO_PI = 2.0 * math.pi
@@ -86,11 +87,11 @@ def place(
     x, y = s * d, math.sqrt(y2)
     point[0] = phase[ORIGIN] + x * ux - y * uy
     point[1] = phase[ORIGIN + 1] + x * uy + y * ux
-    state, by_range, by_phase = np.zeros(6), np.zeros(6), np.zeros(6)
-    state[0], state[1] = point[0], point[1]
+    state, by_range, by_phase = np.zeros(N_CORE), np.zeros(N_CORE), np.zeros(N_CORE)
+    state[X.PX], state[X.PY] = point[0], point[1]
     _level_gradient(ranged, state, height_m, by_range)
     _level_gradient(phase, state, height_m, by_phase)
-    det = by_range[0] * by_phase[1] - by_range[1] * by_phase[0]
+    det = by_range[X.PX] * by_phase[X.PY] - by_range[X.PY] * by_phase[X.PX]
     if det == 0.0:
         return False
     for i in range(2):
@@ -131,12 +132,13 @@ def spawn(
     point, square = np.empty(2), np.empty((2, 2))
     if not place(ranged, phase, turns, height_m, point, square):
         return -math.inf
-    for i in range(4):
+    for i in range(X.CLOCK):  # position and velocity
         for j in range(mean.size):
             cov[i, j] = cov[j, i] = 0.0
     for i in range(2):
-        mean[i], mean[2 + i] = point[i], 0.0
-        cov[2 + i, 2 + i] = speed_sd * speed_sd
+        v = X.VX + i
+        mean[i], mean[v] = point[i], 0.0
+        cov[v, v] = speed_sd * speed_sd
         for j in range(2):
             cov[i, j] = square[i, j]
     return 0.5 * math.log(square[0, 0] * square[1, 1] - square[0, 1] * square[1, 0])

@@ -18,6 +18,7 @@ from netpos.filters.factor import eigenvalues
 from netpos.filters.fusion import W_GAIN, fuse
 from netpos.filters.manoeuvre import add_manoeuvre, unnoticed_s
 from netpos.filters.measurement import GROUP, VARIANCE, curvature_variance, innovation_row
+from netpos.filters.state import X
 from netpos.messages.values import Array
 from netpos.tracking.engine import GATE, Option
 
@@ -117,16 +118,18 @@ def mixture_radius(means: Array, covs: Array, weights: Array, centre: Array, ris
     Of a component at distance d at most the tail of its own error beyond radius - d lies outside.
     """
     low, high = 0.0, 0.0
-    away = np.hypot(means[:, 0] - centre[0], means[:, 1] - centre[1])
+    away = np.hypot(means[:, X.PX] - centre[0], means[:, X.PY] - centre[1])
     for k in range(weights.size):
         P = covs[k]
-        high = max(high, away[k] + gaussian_radius(P[0, 0], P[0, 1], P[1, 1], risk))
+        high = max(
+            high, away[k] + gaussian_radius(P[X.PX, X.PX], P[X.PX, X.PY], P[X.PY, X.PY], risk)
+        )
     while high - low > 1e-4 * high:
         middle = 0.5 * (low + high)
         outside = 0.0
         for k in range(weights.size):
             P = covs[k]
-            tail = gaussian_tail(P[0, 0], P[0, 1], P[1, 1], middle - away[k])
+            tail = gaussian_tail(P[X.PX, X.PX], P[X.PX, X.PY], P[X.PY, X.PY], middle - away[k])
             outside += weights[k] * tail
         if outside > risk:
             low = middle
@@ -248,8 +251,8 @@ def level_in(
             wide[a, b] = prior_cov[a, b]
     add_manoeuvre(speed, max(unheard_s, longest_s), wide)
     apply_about(x, P, prior_mean, wide, rows, accepted, height_m, scratch)
-    apart = math.hypot(x[0] - mean[0], x[1] - mean[1])
-    return float(apart + gaussian_radius(P[0, 0], P[0, 1], P[1, 1], risk))
+    apart = math.hypot(x[X.PX] - mean[X.PX], x[X.PY] - mean[X.PY])
+    return float(apart + gaussian_radius(P[X.PX, X.PX], P[X.PX, X.PY], P[X.PY, X.PY], risk))
 
 
 @leaf

@@ -25,6 +25,7 @@ from netpos.filters.gate import accepted_rows
 from netpos.filters.manoeuvre import add_manoeuvre, unnoticed_s
 from netpos.filters.measurement import GROUP
 from netpos.filters.motion import Model, Parameter
+from netpos.filters.state import X
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.engine import GATE, GATE_SIZE, Option, is_sound
@@ -231,8 +232,8 @@ def _dismiss(level: float, mean: Array, risk: float, rivals: State) -> None:
     means, covs, odds, _ = rivals
     for k in range(odds.size):
         x, P = means[k], covs[k]
-        apart = math.hypot(x[0] - mean[0], x[1] - mean[1])
-        if apart + gaussian_radius(P[0, 0], P[0, 1], P[1, 1], risk) <= level:
+        apart = math.hypot(x[X.PX] - mean[X.PX], x[X.PY] - mean[X.PY])
+        if apart + gaussian_radius(P[X.PX, X.PX], P[X.PX, X.PY], P[X.PY, X.PY], risk) <= level:
             odds[k] = -math.inf
 
 
@@ -255,14 +256,17 @@ def _reach(level: float, mean: Array, risk: float, rivals: State) -> float:
     rival but the share that its odds leave of ``risk``."""
     means, covs, odds, marks = rivals
     middle = mean if marks[LEADER] < 0 else means[marks[LEADER]]
-    radius = level + math.hypot(mean[0] - middle[0], mean[1] - middle[1])
+    radius = level + math.hypot(mean[X.PX] - middle[X.PX], mean[X.PY] - middle[X.PY])
     for k in range(odds.size):
         share = risk * math.exp(-min(odds[k], 0.0))
         if share < 0.5:
             P, x = covs[k], means[k]
-            apart = math.hypot(x[0] - middle[0], x[1] - middle[1])
-            if apart + radius_limit(P[0, 0], P[0, 1], P[1, 1], share) > radius:
-                radius = max(radius, apart + gaussian_radius(P[0, 0], P[0, 1], P[1, 1], share))
+            apart = math.hypot(x[X.PX] - middle[X.PX], x[X.PY] - middle[X.PY])
+            if apart + radius_limit(P[X.PX, X.PX], P[X.PX, X.PY], P[X.PY, X.PY], share) > radius:
+                radius = max(
+                    radius,
+                    apart + gaussian_radius(P[X.PX, X.PX], P[X.PX, X.PY], P[X.PY, X.PY], share),
+                )
     return float(radius)
 
 

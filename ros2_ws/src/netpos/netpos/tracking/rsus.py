@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from netpos.filters.measurement import Kind
-from netpos.filters.motion import N_CORE
 from netpos.filters.rows import UNCOUPLED, Coupling, rsu_axes, rsu_place, scalar_kinds
+from netpos.filters.state import N_CORE
 from netpos.messages.values import (
     AngleConvention,
     Array,

@@ -9,6 +9,7 @@ import numpy as np
 
 from netpos.filters.compile import leaf
 from netpos.filters.measurement import BIAS, COMMON, GROUP, KIND, Kind
+from netpos.filters.state import N_CORE, POSITION, X
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking import engine, sector_bank
 from netpos.tracking.config import TrackerConfig
@@ -118,8 +119,8 @@ class Sectors(OneModel):
         return tuple(
             TrackMode(
                 weight=float(weights[s]),
-                x_m=float(self._means[s, 0]),
-                y_m=float(self._means[s, 1]),
+                x_m=float(self._means[s, X.PX]),
+                y_m=float(self._means[s, X.PY]),
             )
             for s in np.argsort(-weights, kind="stable").tolist()
             if weights[s] > risk
@@ -173,18 +174,18 @@ class Sectors(OneModel):
         risk = self._config.integrity_risk
         order = np.argsort(self._weights)
         left = risk / 2.0
-        radius, centre = level_m, self.mean[:2]
+        radius, centre = level_m, self.mean[POSITION]
         for s in order[:-1].tolist():
             weight = math.exp(self._weights[s])
             left -= weight
             if left < 0.0:
-                cov = engine.to_cov(self._spreads[s], self._options)[:2, :2]
-                apart = math.hypot(*(self._means[s, :2] - centre))
+                cov = engine.to_cov(self._spreads[s], self._options)[POSITION, POSITION]
+                apart = math.hypot(*(self._means[s, POSITION] - centre))
                 radius = max(radius, apart + protection_level(cov, risk))
         return radius
 
     def grow(self, sd: Array) -> None:
-        n = 6 + sd.size
+        n = N_CORE + sd.size
         if self._means.shape[1] >= n:
             return
         means, spreads = np.zeros((self._weights.size, n)), np.zeros((self._weights.size, n, n))

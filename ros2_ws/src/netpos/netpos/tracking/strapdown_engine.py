@@ -19,6 +19,7 @@ from netpos.filters.error_state import (
 from netpos.filters.measurement import GROUP, KIND, ORIGIN, ROW_WIDTH, VALUE, VARIANCE
 from netpos.filters.position_fix import fix_position, start_of
 from netpos.filters.space import SpaceKind
+from netpos.filters.state import Nav
 from netpos.inertial.strapdown import ERR, NAV
 from netpos.messages.values import Array
 
@@ -105,7 +106,7 @@ def fix_each(epochs: Epochs, height_m: float, height_sd_m: float) -> Fixes:
 def compile_kernels(sensors: Sensors) -> None:
     """Compile, or load, what a track calls epoch by epoch, before its first measurement."""
     nav, cov, memory = np.zeros(NAV), np.eye(ERR), np.zeros(MEMORY)
-    nav[9] = 1.0
+    nav[Nav.QW] = 1.0
     imu = Imu(np.array([10_000_000], dtype=np.int64), np.zeros((1, 6)))
     advance(nav, cov, memory, 0, 10_000_000, imu, sensors)
     rows = np.zeros((3, ROW_WIDTH))

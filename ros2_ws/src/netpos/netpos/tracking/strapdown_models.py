@@ -9,13 +9,20 @@ from scipy.linalg import block_diag
 
 from netpos.filters.error_state import Constraints, Sensors, SlowErrors
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
-from netpos.filters.space import CLOCK
+from netpos.filters.state import (
+    ERR_ACCEL_BIAS,
+    ERR_BIASES,
+    ERR_GYRO_BIAS,
+    ERR_POSITION,
+    ERR_VELOCITY,
+    NAV_POSITION,
+    NAV_QUATERNION,
+    NAV_VELOCITY,
+    Err,
+)
 from netpos.inertial.strapdown import (
     ERR,
     NAV,
-    POSITION,
-    QUATERNION,
-    VELOCITY,
     Earth,
     InertialNoise,
     earth_at,
@@ -54,8 +61,7 @@ def sensors_of(config: TrackerConfig) -> Sensors:
 def nav_of(position: Array, velocity: Array, quaternion: Array) -> Array:
     """Navigation state (NAV,) of a pose and a velocity (3,) in map, without biases."""
     nav = np.zeros(NAV)
-    nav[POSITION:VELOCITY], nav[VELOCITY:QUATERNION] = position, velocity
-    nav[QUATERNION : QUATERNION + 4] = quaternion
+    nav[NAV_POSITION], nav[NAV_VELOCITY], nav[NAV_QUATERNION] = position, velocity, quaternion
     return nav
 
 
@@ -69,7 +75,7 @@ def with_clock(config: TrackerConfig, nav: Array, cov: Array) -> tuple[Array, Ar
 def grown_in_space(nav: Array, cov: Array, sd: Array) -> tuple[Array, Array]:
     """State with a clock, nav (n + 1,), cov (n, n), and those of the biases of standard deviations
     ``sd`` (k,), in the order of the states, that it lacks."""
-    new = sd[len(cov) - CLOCK - 2 :]
+    new = sd[len(cov) - ERR_BIASES :]
     if not new.size:
         return nav, cov
     return np.append(nav, np.zeros(new.size)), block_diag(cov, np.diag(new**2))
@@ -81,6 +87,7 @@ def start_sd(
     """Standard deviations (ERR,) of a start: per axis of position and velocity, of roll and
     pitch, of the heading [rad], and the biases of the sensors."""
     sd = np.empty(ERR)
-    sd[:3], sd[3:6], sd[6:8], sd[8] = position_m, velocity_mps, tilt, heading
-    sd[9:12], sd[12:] = config.accel_bias_sd_mps2, config.gyro_bias_sd_radps
+    sd[ERR_POSITION], sd[ERR_VELOCITY] = position_m, velocity_mps
+    sd[Err.ROLL], sd[Err.PITCH], sd[Err.YAW] = tilt, tilt, heading
+    sd[ERR_ACCEL_BIAS], sd[ERR_GYRO_BIAS] = config.accel_bias_sd_mps2, config.gyro_bias_sd_radps
     return sd

@@ -28,7 +28,7 @@ from netpos.filters.error_state import (
 )
 from netpos.filters.factor import factor, solve_factored
 from netpos.filters.measurement import GROUP
-from netpos.filters.space import CLOCK
+from netpos.filters.state import ERR_BIASES
 from netpos.inertial.strapdown import ACCEL_BIAS, ATTITUDE_ERR, QUATERNION, inject
 from netpos.messages.values import Array
 from netpos.tracking.strapdown_engine import Epochs
@@ -125,7 +125,7 @@ def _step_back(instant: Instant, later: Instant, nav_s: Array, cov_s: Array, sd:
     assert later.predicted is not None
     nav_p, cov_p, Phi = later.predicted
     instant.nav, instant.cov = grown_in_space(
-        instant.nav, instant.cov, sd[: len(cov_p) - CLOCK - 2]
+        instant.nav, instant.cov, sd[: len(cov_p) - ERR_BIASES]
     )
     gain_t = Phi @ instant.cov
     solve_factored(factor(cov_p.copy()), gain_t)

@@ -15,8 +15,9 @@ from netpos.filters.chi_square import chi_square_bound
 from netpos.filters.measurement import BIAS, COMMON, GROUP, KIND, LEVER, VARIANCE, Kind
 from netpos.filters.position_fix import FixStatus, fix_position, start_of
 from netpos.filters.space import linearise_in_space
+from netpos.filters.state import NAV_POSITION, Err, Nav
 from netpos.inertial.alignment import fit_course, way_of
-from netpos.inertial.strapdown import ERR, NAV, QUATERNION
+from netpos.inertial.strapdown import ERR, NAV
 from netpos.messages.values import Array, ImuSample
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.strapdown_models import nav_of, start_sd
@@ -135,15 +136,16 @@ class StrapdownStart:
     def _covariance(self, course: Array, speed: float, ahead: Array, height_var: float) -> Array:
         """(ERR, ERR) of a start: course (4, 4) is that of east, north, heading and speed."""
         cov = np.diag(start_sd(self.config, 1.0, 0.1, _TILT_SD, _TILT_SD) ** 2)
-        J = np.zeros((15, 4))
-        J[0, 0] = J[1, 1] = J[8, 2] = 1.0
-        J[3:5, 3] = ahead[:2]
-        J[3:5, 2] = speed * np.array([-ahead[1], ahead[0]])
-        known = [0, 1, 3, 4, 8]
+        J = np.zeros((ERR, 4))
+        J[Err.PX, 0] = J[Err.PY, 1] = J[Err.YAW, 2] = 1.0
+        horizontal = [Err.VX, Err.VY]
+        J[horizontal, 3] = ahead[:2]
+        J[horizontal, 2] = speed * np.array([-ahead[1], ahead[0]])
+        known = [Err.PX, Err.PY, Err.VX, Err.VY, Err.YAW]
         cov[known, known] = 0.0
         cov += J @ course @ J.T
-        cov[[0, 1, 3, 4, 8], [0, 1, 3, 4, 8]] += [0.01, 0.01, 0.25, 0.25, 1e-3]
-        cov[2, 2] = max(height_var, 0.25)
+        cov[known, known] += [0.01, 0.01, 0.25, 0.25, 1e-3]
+        cov[Err.PZ, Err.PZ] = max(height_var, 0.25)
         return cov
 
 
@@ -175,7 +177,7 @@ def _misfit(rows: Array, position: Array) -> tuple[float, float, int]:
     """Sum of squared residuals over their variances, what a true fix stays below but for one in a
     thousand, and the degrees of freedom."""
     nav, at = np.zeros(NAV), rows.copy()
-    nav[:3], nav[QUATERNION + 3] = position, 1.0
+    nav[NAV_POSITION], nav[Nav.QW] = position, 1.0
     at[:, LEVER : LEVER + 3] = 0.0  # the fix is the antenna's
     at[:, [BIAS, COMMON]] = -1.0
     residual, _, _ = linearise_in_space(at, nav, np.zeros((ERR, ERR)))

@@ -17,8 +17,9 @@ import numpy as np
 
 from netpos.filters.error_state import MEMORY, Imu, Sensors, advance, correct, doubt_standstill
 from netpos.filters.measurement import GROUP, KIND, VARIANCE, Kind
-from netpos.filters.space import CLOCK, SpaceKind, place_rows
+from netpos.filters.space import SpaceKind, place_rows
 from netpos.filters.space_conditioning import condition_in_space
+from netpos.filters.state import ERR_BIASES, ERR_CLOCK_DRIFT, NAV_CLOCK_DRIFT, POSITION
 from netpos.inertial.strapdown import ERR, NAV
 from netpos.messages.values import Array, InitialPose, Odometry, RsuMeasurement
 from netpos.tracking import output
@@ -43,7 +44,6 @@ from netpos.tracking.strapdown_start import SampleBuffer, StrapdownStart
 
 _POSE_VAR_MIN = 1e-4  # an initial pose may leave the height's variance at 0
 _RATE_WINDOW_NS = 50_000_000
-_FIRST_BIAS = CLOCK + 2
 
 
 @dataclass(slots=True)
@@ -63,7 +63,7 @@ class _State:
 
     start: StrapdownStart
     blockage: Blockage
-    biases: BiasStates = field(default_factory=lambda: BiasStates(_FIRST_BIAS))
+    biases: BiasStates = field(default_factory=lambda: BiasStates(ERR_BIASES))
     estimate: _Estimate | None = None
     posed: bool = False
     has_clock: bool = False
@@ -363,7 +363,7 @@ class StrapdownTrack:
             heard_ns = state.last_accepted_ns
             position_sd = output.largest_sd(estimate.cov)
             risk, inflation = self._config.integrity_risk, state.nis_window.inflation()
-            level = protection_level(estimate.cov[:2, :2], risk, inflation)
+            level = protection_level(estimate.cov[POSITION, POSITION], risk, inflation)
             odometry = odometry_of(
                 stamp_ns,
                 self._vue_id,
@@ -373,8 +373,8 @@ class StrapdownTrack:
                 self._gyro,
             )
             if state.has_clock:
-                there = slice(CLOCK, CLOCK + 2)
-                mean, cov = estimate.nav[CLOCK + 1 : CLOCK + 3], estimate.cov[there, there]
+                mean = estimate.nav[NAV_CLOCK_DRIFT]
+                cov = estimate.cov[ERR_CLOCK_DRIFT, ERR_CLOCK_DRIFT]
                 clock = output.clock_state(stamp_ns, self._vue_id, mean, cov)
         status = track_status(
             self._config,

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from netpos.filters.measurement import VARIANCE
+from netpos.filters.state import N_CORE
 from netpos.messages.values import Array, InitialPose, Odometry, RsuMeasurement, Velocity
 from netpos.tracking import estimates, output
 from netpos.tracking.batch import Batch, Source, batch_of, mostly_accepted, velocity_inflation
@@ -77,7 +78,7 @@ class Track:
 
     def _fresh(self) -> TrackMemory:
         return TrackMemory(
-            BiasStates(6 + self._extra_sd.size, self._config.step_errors),
+            BiasStates(N_CORE + self._extra_sd.size, self._config.step_errors),
             Initialiser(self._config),
             Blockage.of(self._config),
             PhaseStart(self._config),

@@ -12,6 +12,7 @@ from netpos.evaluation.bench import filters, stone_soup, yardstick
 from netpos.evaluation.bench.common import LeftOut, Row, Unavailable
 from netpos.evaluation.bench.problem import DT_S, HEIGHT_M, ROWS, Problem, model, problem
 from netpos.evaluation.bench.yardstick import Yardstick
+from netpos.filters.state import POSITION
 from netpos.messages.values import Array
 
 EPOCHS = 200
@@ -80,9 +81,11 @@ def test_a_run_does_not_use_up_its_problem() -> None:
 def test_the_filter_follows_the_walk(walk: Problem) -> None:
     """The measurements are of the walk: 1 m/s east from 40 m, so 20 m on after 200 epochs."""
     mean, cov = filters.compiled_ekf(walk)
-    error = mean[:2] - [60.0, 0.0]
-    assert error @ np.linalg.solve(cov[:2, :2], error) < 13.8  # chi-square 0.999, 2 dof
-    assert np.sqrt(np.trace(cov[:2, :2])) < 2.0
+    error = mean[POSITION] - [60.0, 0.0]
+    assert (
+        error @ np.linalg.solve(cov[POSITION, POSITION], error) < 13.8
+    )  # chi-square 0.999, 2 dof
+    assert np.sqrt(np.trace(cov[POSITION, POSITION])) < 2.0
 
 
 def test_the_numpy_jacobian_is_the_derivative(walk: Problem) -> None:

@@ -8,6 +8,7 @@ from netpos.evaluation.bounds import bound_covariances, bound_rmse, run_bound
 from netpos.filters.measurement import KIND, ROW_WIDTH, VARIANCE, Kind
 from netpos.filters.motion import NO_BIAS, ProcessNoise, motion_parameters
 from netpos.filters.rows import linear_rows, rsu_axes, rsu_rows, speed_row
+from netpos.filters.state import POSITION, VELOCITY, X
 from netpos.messages.values import Field, RsuInfo, RsuMeasurement
 from scipy.linalg import solve_discrete_are
 
@@ -24,7 +25,7 @@ PRIOR = np.diag([25.0, 16.0, 9.0, 4.0, 1e4, 100.0])
 def _model() -> tuple[np.ndarray, np.ndarray]:
     """F and Q of fokin2020:eq.35, 36, written out."""
     F = np.eye(6)
-    F[0, 2] = F[1, 3] = F[4, 5] = T_S
+    F[X.PX, X.VX] = F[X.PY, X.VY] = F[X.CLOCK, X.DRIFT] = T_S
     G = np.zeros((6, 2))
     G[0, 0] = G[1, 1] = T_S**2 / 2
     G[2, 0] = G[3, 1] = T_S
@@ -109,15 +110,15 @@ def _information_recursion(
         if i:
             J = np.linalg.inv(Q + F @ np.linalg.inv(J) @ F.T)
         for row in rows:
-            dx, dy, dz = x[0] - row[7], x[1] - row[8], height - row[9]
+            dx, dy, dz = x[X.PX] - row[7], x[X.PY] - row[8], height - row[9]
             h = np.zeros(6)
             if row[KIND] == Kind.SPEED:
-                h[2:4] = x[2:4] / np.hypot(*x[2:4])
+                h[VELOCITY] = x[VELOCITY] / np.hypot(*x[VELOCITY])
             elif row[KIND] == Kind.AZIMUTH:
-                h[:2] = np.array([-dy, dx]) / (dx * dx + dy * dy)
+                h[POSITION] = np.array([-dy, dx]) / (dx * dx + dy * dy)
             else:
-                h[:2] = np.array([dx, dy]) / np.sqrt(dx * dx + dy * dy + dz * dz)
-                h[4] = 1.0
+                h[POSITION] = np.array([dx, dy]) / np.sqrt(dx * dx + dy * dy + dz * dz)
+                h[X.CLOCK] = 1.0
             J = J + np.outer(h, h) / row[VARIANCE]
         out.append(np.linalg.inv(J))
     return out

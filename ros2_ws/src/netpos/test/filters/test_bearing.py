@@ -12,6 +12,7 @@ from netpos.filters.bearing import fuse_around, fuse_bearing, is_plain_bearing, 
 from netpos.filters.fusion import W_COV, W_PRIOR, W_USE
 from netpos.filters.measurement import BIAS, HEADING, VARIANCE, Kind, curvature_variance, linearise
 from netpos.filters.rows import rsu_axes, rsu_rows
+from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 
 RSU = np.array([3.0, -2.0])
@@ -57,27 +58,27 @@ def _integrated(mean: Array, cov: Array, azimuth: float) -> tuple[Array, Array]:
     )
     along = np.array([math.cos(azimuth), math.sin(azimuth)])
     across = np.array([-along[1], along[0]])
-    long, skew = along @ cov[:2, :2] @ along, across @ cov[:2, :2] @ along
-    strip = max(2.0 - np.trace(cov[:2, :2]) / long, 0.0)
+    long, skew = along @ cov[POSITION, POSITION] @ along, across @ cov[POSITION, POSITION] @ along
+    strip = max(2.0 - np.trace(cov[POSITION, POSITION]) / long, 0.0)
     reach = place @ along - RSU @ along
-    start = (mean[:2] - RSU) @ along
-    variance = across @ cov[:2, :2] @ across - skew**2 / long
+    start = (mean[POSITION] - RSU) @ along
+    variance = across @ cov[POSITION, POSITION] @ across - skew**2 / long
     variance *= 1.0 - strip + strip * reach**2 / (start**2 + long)
-    aside = (place - mean[:2]) @ across - skew / long * (reach - start)
+    aside = (place - mean[POSITION]) @ across - skew / long * (reach - start)
     log = -0.5 * ((reach - start) ** 2 / long + aside**2 / variance + np.log(variance))
     log -= 0.5 * np.repeat(((angle - azimuth) / SD) ** 2, r.size)
     weight = np.tile(r, angle.size) * np.exp(log - log.max())
     weight /= weight.sum()
     center = weight @ place
     C = (place - center).T @ ((place - center) * weight[:, None])
-    C += strip * (along @ (center - mean[:2])) ** 2 * np.outer(along, along)
+    C += strip * (along @ (center - mean[POSITION])) ** 2 * np.outer(along, along)
     information = np.linalg.inv(cov)
     rest = np.linalg.inv(information[2:, 2:])
     slope = -rest @ information[2:, :2]
     joint = np.vstack([np.eye(2), slope])
     expected = joint @ C @ joint.T
     expected[2:, 2:] += rest
-    return mean + joint @ (center - mean[:2]), expected
+    return mean + joint @ (center - mean[POSITION]), expected
 
 
 @pytest.mark.parametrize(
@@ -109,12 +110,12 @@ def test_moments_are_those_of_the_plane(
 def test_a_bearing_that_contradicts_is_weighed_like_any(aside: float, rel: float) -> None:
     """A narrow prior 100 m away: across the bearing two normals, half a metre or 60 m apart."""
     mean, cov = np.array([*RSU, 0.0, 0.0, 0.0, 0.0]), np.eye(6)
-    mean[:2] += 100.0, aside
-    cov[0, 0] = 1e-4
+    mean[POSITION] += 100.0, aside
+    cov[X.PX, X.PX] = 1e-4
     assert fuse_bearing(mean, cov, _row(0.0), 0.01**2)
-    assert mean[1] - RSU[1] == pytest.approx(aside / 2.0, rel=rel)
-    assert cov[1, 1] == pytest.approx(0.5, rel=rel)
-    assert mean[0] - RSU[0] == pytest.approx(100.0, abs=0.1)
+    assert mean[X.PY] - RSU[1] == pytest.approx(aside / 2.0, rel=rel)
+    assert cov[X.PY, X.PY] == pytest.approx(0.5, rel=rel)
+    assert mean[X.PX] - RSU[0] == pytest.approx(100.0, abs=0.1)
 
 
 def test_other_rows_follow_at_the_result() -> None:
@@ -154,26 +155,26 @@ def test_far_away_it_is_the_linear_update() -> None:
     assert fuse_bearing(x, P, row, 1e-6)
     d = np.array([900.0, 200.0])
     h = np.zeros(6)
-    h[:2] = np.array([-d[1], d[0]]) / (d @ d)
+    h[POSITION] = np.array([-d[1], d[0]]) / (d @ d)
     s = h @ cov @ h + 1e-6
     np.testing.assert_allclose(x, mean + cov @ h * 0.002 / s, atol=0.03)
     np.testing.assert_allclose(P, cov - np.outer(cov @ h, cov @ h) / s, atol=0.02 * 400.0)
-    assert abs(P[0, 0] / (cov - np.outer(cov @ h, cov @ h) / s)[0, 0] - 1) < 0.01
+    assert abs(P[X.PX, X.PX] / (cov - np.outer(cov @ h, cov @ h) / s)[0, 0] - 1) < 0.01
 
 
 def test_a_strip_across_a_far_bearing_is_cut_where_it_is() -> None:
     """A kilometre long and some centimetres wide, 1.3 km away: the linear update, on a piece of
     the bearing that is a ten thousandth of what the prior leaves open."""
     mean, cov = np.array([*RSU, 1.0, -1.0, 5.0, 0.2]), np.eye(6)
-    mean[:2] += 1200.0, 500.0
+    mean[POSITION] += 1200.0, 500.0
     turn = np.array([[12.0, -5.0], [5.0, 12.0]]) / 13.0  # along and across the bearing
     strip = 200.0**2 * np.array([[1.0, 1.0], [1.0, 1.0 + 1e-8]])
-    cov[:2, :2] = turn @ strip @ turn.T
+    cov[POSITION, POSITION] = turn @ strip @ turn.T
     row = _row(math.atan2(5.0, 12.0))
     x, P = mean.copy(), cov.copy()
     assert fuse_bearing(x, P, row, 1e-10)
     h = np.zeros(6)
-    h[:2] = turn[:, 1] / 1300.0
+    h[POSITION] = turn[:, 1] / 1300.0
     gain = cov @ h / (h @ cov @ h + 1e-10)
     expected = cov - np.outer(gain, h @ cov)
     sd = np.sqrt(np.diag(expected))
@@ -209,10 +210,10 @@ def test_the_same_bearing_again_tells_the_side_and_no_distance() -> None:
     """A strip along the bearing, cut in its middle: the range has the mean of a half-normal and
     keeps its second moment, which is that of the normal."""
     mean, cov = np.array([*RSU, 0.0, 0.0, 0.0, 0.0]), np.eye(6)
-    cov[0, 0], cov[1, 1] = 36.0, 1e-4
+    cov[X.PX, X.PX], cov[X.PY, X.PY] = 36.0, 1e-4
     assert fuse_bearing(mean, cov, _row(0.0), SD**2)
-    assert mean[0] - RSU[0] == pytest.approx(6.0 * math.sqrt(2.0 / math.pi), rel=0.03)
-    assert cov[0, 0] == pytest.approx(36.0, rel=0.03)
+    assert mean[X.PX] - RSU[0] == pytest.approx(6.0 * math.sqrt(2.0 / math.pi), rel=0.03)
+    assert cov[X.PX, X.PX] == pytest.approx(36.0, rel=0.03)
     np.testing.assert_array_equal(cov[2:, 2:], np.eye(4))
 
 
@@ -220,31 +221,31 @@ def test_bearings_of_a_strip_do_not_push_it_away() -> None:
     """Twenty bearings of a strip that they keep narrow: there is more plane farther away, and each
     would say so again."""
     mean, cov = np.zeros(6), np.eye(6)
-    mean[:2] = RSU[0] + 12.0, RSU[1]
-    cov[0, 0] = 4.0**2
+    mean[POSITION] = RSU[0] + 12.0, RSU[1]
+    cov[X.PX, X.PX] = 4.0**2
     for _ in range(20):
-        cov[1, 1] = 0.7**2  # the device has moved
+        cov[X.PY, X.PY] = 0.7**2  # the device has moved
         assert fuse_bearing(mean, cov, _row(0.0), SD**2)
-    assert 12.0 < mean[0] - RSU[0] < 13.5
-    assert 3.0**2 < cov[0, 0] < 4.0**2
+    assert 12.0 < mean[X.PX] - RSU[0] < 13.5
+    assert 3.0**2 < cov[X.PX, X.PX] < 4.0**2
 
 
 def test_bearings_cut_at_the_rsu_do_not_make_sure() -> None:
     """The prior passes the RSU while the device, 20 m before it, goes on being seen there."""
     mean, cov = np.array([RSU[0] - 3.0, RSU[1], 0.0, 0.0, 0.0, 0.0]), np.eye(6)
-    cov[0, 0], cov[1, 1] = 64.0, 0.04
+    cov[X.PX, X.PX], cov[X.PY, X.PY] = 64.0, 0.04
     rows, gate, work = _row(0.0)[None], np.array([0.0, np.inf]), ekf.workspace(6, 1)
     for _ in range(60):
         ekf.update(mean, cov, rows, 0.0, gate, 8, np.zeros(1), work)
-    error = RSU[0] + 20.0 - mean[0]
-    assert error**2 < 12.0 * cov[0, 0]
+    error = RSU[0] + 20.0 - mean[X.PX]
+    assert error**2 < 12.0 * cov[X.PX, X.PX]
 
 
 @pytest.mark.parametrize(("distance", "near"), [(3.99, True), (4.01, False)])
 def test_an_rsu_is_near_within_two_sd(distance: float, near: bool) -> None:
     rows, work = _row(0.0)[None], ekf.workspace(6, 1)
     cov, mean = np.diag([1.5, 2.5, 1.0, 1.0, 1.0, 1.0]), np.zeros(6)
-    mean[:2] = RSU + distance * np.array([0.6, -0.8])
+    mean[POSITION] = RSU + distance * np.array([0.6, -0.8])
     work[W_USE, 0] = 1.0
     assert on_top(mean, cov, rows, work) is near
     work[W_USE, 0] = 0.0

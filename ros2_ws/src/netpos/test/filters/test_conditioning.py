@@ -24,6 +24,7 @@ from netpos.filters.measurement import (
     Kind,
     curvature_variance,
 )
+from netpos.filters.state import X
 from netpos.messages.values import Array
 from scipy.integrate import quad
 
@@ -80,7 +81,7 @@ def innovations(mean: Array, rows: Array) -> tuple[Array, Array]:
     """Of ``mixed_groups``, written out (device on the ground)."""
     nu, H = np.empty(len(rows)), np.zeros((len(rows), 6))
     for i, r in enumerate(rows):
-        dx, dy, dz = mean[0] - r[ORIGIN], mean[1] - r[ORIGIN + 1], -r[ORIGIN + 2]
+        dx, dy, dz = mean[X.PX] - r[ORIGIN], mean[X.PY] - r[ORIGIN + 1], -r[ORIGIN + 2]
         if r[KIND] == Kind.LINEAR:
             H[i] = r[ORIGIN : ORIGIN + 6]
             nu[i] = r[VALUE] - H[i] @ mean

@@ -13,6 +13,7 @@ from netpos.filters.measurement import (
     GROUP,
     VALUE,
 )
+from netpos.filters.state import X
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -81,7 +82,7 @@ def test_first_update_of_an_unknown_clock_is_exact(seed: int) -> None:
     """100 us of clock (3e4 m) against a TOA of 1 cm: 13 orders of magnitude, to rounding."""
     rng = np.random.default_rng(seed)
     F = np.eye(6)
-    F[0, 2] = F[1, 3] = F[4, 5] = 0.1
+    F[X.PX, X.VX] = F[X.PY, X.VY] = F[X.CLOCK, X.DRIFT] = 0.1
     P = F @ np.diag([25.0, 25.0, 25.0, 25.0, 9e8, 8.1e7]) @ F.T
     P = (P + P.T) / 2
     H = np.zeros((4, 6))
@@ -157,7 +158,7 @@ def test_what_is_known_exactly_stays_so(iterations: int) -> None:
 def test_a_covariance_is_definite_up_to_a_correlation_of_one() -> None:
     P, work = np.diag([4.0, 9.0, 1.0]), ekf.workspace(3, 2)
     for value, definite in ((5.999, True), (6.0 + 1e-9, False), (-5.999, True), (-6.1, False)):
-        P[0, 1] = P[1, 0] = value
+        P[X.PX, X.PY] = P[X.PY, X.PX] = value
         before = P.copy()
         assert fusion.is_definite(P, work) is definite
         np.testing.assert_array_equal(P, before)
@@ -207,8 +208,8 @@ def test_joseph_form_survives_where_the_short_form_fails() -> None:
     H = np.array([[1.0, 0, 0, 0, 0, 0]])
     for _ in range(10):
         x, P, _ = fused(x, P, np.array([1.0]) - H @ x, H, np.array([1e-9]))
-    assert P[0, 0] == pytest.approx(1e-10, rel=1e-6)
-    assert x[0] == pytest.approx(1.0, rel=1e-12)
+    assert P[X.PX, X.PX] == pytest.approx(1e-10, rel=1e-6)
+    assert x[X.PX] == pytest.approx(1.0, rel=1e-12)
 
 
 def test_group_nis_is_the_full_mahalanobis_distance() -> None:

@@ -18,6 +18,7 @@ from netpos.filters.measurement import (
     Kind,
     linearise,
 )
+from netpos.filters.state import X
 from netpos.messages.values import Array
 from scipy.optimize import brentq
 from scipy.stats import chi2
@@ -57,7 +58,7 @@ def test_curved_group_passes_by_its_most_probable_state_only_when_iterating() ->
 def test_gate_threshold_itself_is_inside_and_one_iteration_decides_by_the_tangent() -> None:
     """y 0.5 m, range 36 m with 2 m sd: 8.7 by the tangent, 4.9 at the state the EKF ends in."""
     mean, cov, rows = curved_group()
-    mean[1], rows[0, VALUE], rows[0, VARIANCE], rows[0, GATE_VARIANCE] = 0.5, 36.0, 4.0, 4.0
+    mean[X.PY], rows[0, VALUE], rows[0, VARIANCE], rows[0, GATE_VARIANCE] = 0.5, 36.0, 4.0, 4.0
     innovation, H = linearise(rows, mean, 0.0)
     # As the kernel rounds it: the last bit decides here.
     nis = innovation[0] ** 2 / (4.0 + (H @ (H @ cov).T).item())
@@ -108,7 +109,7 @@ def slightly_bent(kind: Kind, share: float, variance: float, side: int) -> tuple
     """One row whose value at the state the EKF ends in is ``share`` of an sd off the tangent at
     the prior: a state that moves along and across the line of sight."""
     mean, cov = np.array([10.0, 0, 3.0, 0, 0, 0]), np.eye(6)
-    cov[0, 1] = cov[1, 0] = cov[2, 3] = cov[3, 2] = 0.9 * side
+    cov[X.PX, X.PY] = cov[X.PY, X.PX] = cov[X.VX, X.VY] = cov[X.VY, X.VX] = 0.9 * side
     rows = np.array([row(kind, 0.0, variance, 0, np.zeros(3))])
     rows[0, GATE_VARIANCE] = variance / 2.0
     rows[0, VALUE] -= linearise(rows, mean, 0.0)[0][0]
@@ -204,7 +205,7 @@ def nearly_singular(seed: int) -> tuple[Array, Array, Array]:
     H, R, x = rng.normal(size=(3, 6)), 10.0 ** rng.uniform(-6, -2, 3), rng.normal(size=6)
     truth = x + np.linalg.cholesky(P) @ rng.normal(size=6)
     rows = [linear_row(h, h @ truth, r, 0) for h, r in zip(H, R, strict=True)]
-    speed = row(Kind.SPEED, math.hypot(truth[2], truth[3]), 0.01)
+    speed = row(Kind.SPEED, math.hypot(truth[X.VX], truth[X.VY]), 0.01)
     return x, P, np.array([*rows, speed])
 
 

@@ -16,6 +16,7 @@ from netpos.filters.measurement import (
     VALUE,
     VARIANCE,
 )
+from netpos.filters.state import X
 from netpos.messages.values import Array
 from scipy.stats import chi2
 
@@ -38,7 +39,7 @@ def test_gate_at_its_boundary(dof: int, factor: float, accepted: bool, iteration
     assert used == (dof if accepted else 0)
     if accepted:
         assert nis == pytest.approx(gate[dof])
-        assert x[0] > 0.0
+        assert x[X.PX] > 0.0
     else:
         assert nis == 0.0
         np.testing.assert_array_equal(x, mean)
@@ -72,8 +73,8 @@ def test_gate_looks_at_the_gate_variance_and_the_update_at_the_variance() -> Non
     x, P, taken, nis, _ = updated(mean, cov, one[None], 0.0, gate, 1)
     assert taken.tolist() == [1.0]
     assert nis == pytest.approx(16 / 4)
-    assert x[0] == pytest.approx(4.0 / 100)
-    assert P[0, 0] == pytest.approx(99 / 100)
+    assert x[X.PX] == pytest.approx(4.0 / 100)
+    assert P[X.PX, X.PX] == pytest.approx(99 / 100)
     gate[1] = 3.999
     assert updated(mean, cov, one[None], 0.0, gate, 8)[2].tolist() == [0.0]
 
@@ -107,7 +108,7 @@ def _renumbered(rows: Array) -> Array:
 
 def test_groups_may_differ_in_size_and_their_order_does_not_matter() -> None:
     mean, cov = two_states()
-    cov[0, 1] = cov[1, 0] = 2.0
+    cov[X.PX, X.PY] = cov[X.PY, X.PX] = 2.0
     a = [linear_row(np.eye(6)[0], 1.0, 0.5, 0)]
     b = [linear_row(np.eye(6)[1], v, 0.7, 1) for v in (-0.5, 0.3, 0.4)]
     forward = updated(mean, cov, np.array(a + b), 0.0, NO_GATE, 1)

@@ -20,6 +20,7 @@ from netpos.filters.measurement import (
     curvature_variance,
     linearise,
 )
+from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array
 from scipy.optimize import brentq, least_squares
 
@@ -38,7 +39,7 @@ def ranges(place: tuple[float, float], rsus: list[tuple[float, float]], sd_m: fl
 
 def wide(x: float, y: float, sd_m: float = 10.0) -> tuple[Array, Array]:
     cov = np.diag([sd_m**2, 1.44 * sd_m**2, 1.0, 1.0, 1.0, 1.0])
-    cov[0, 2] = cov[2, 0] = 0.5 * sd_m
+    cov[X.PX, X.VX] = cov[X.VX, X.PX] = 0.5 * sd_m
     return np.array([x, y, 1.0, 0.0, 0.0, 0.0]), cov
 
 
@@ -57,9 +58,9 @@ def places(
     sd = np.sqrt(np.diag(cov))
     for dx, dy in product(starts, starts):
         start = mean.copy()
-        start[:2] += dx * sd[0], dy * sd[1]
+        start[POSITION] += dx * sd[0], dy * sd[1]
         fit = least_squares(residuals, start, xtol=1e-14, ftol=1e-14, gtol=1e-14)
-        if all(math.dist(fit.x[:2], x[:2]) > 1e-3 for _, x, _ in found):
+        if all(math.dist(fit.x[:2], x[POSITION]) > 1e-3 for _, x, _ in found):
             found.append((2.0 * fit.cost, fit.x, np.linalg.inv(fit.jac.T @ fit.jac)))
     return sorted(found, key=lambda one: one[0])
 
@@ -101,8 +102,8 @@ def test_the_only_place_left_is_taken(place: tuple[float, float]) -> None:
     rows = ranges(place, TRIANGLE, 0.1)
     assert is_refined(mean, cov, rows)
     x, P, _, nis, used = updated(mean, cov, rows, 0.0, NO_GATE, 8)
-    assert math.dist(x[:2], place) < 0.05
-    assert P[0, 0] < 0.02 < 0.05 * cautious(mean, cov, rows)[1][0, 0]
+    assert math.dist(x[POSITION], place) < 0.05
+    assert P[X.PX, X.PX] < 0.02 < 0.05 * cautious(mean, cov, rows)[1][0, 0]
     assert (nis, used) == updated(mean, cov, rows, 0.0, NO_GATE, 1)[3:]  # those of the prior
     innovation, H = linearise(rows, mean, 0.0)
     plain = fused(mean, cov, innovation, H, two_variances(mean, cov, rows))
@@ -132,7 +133,7 @@ def test_another_place_must_be_ruled_out(odds: float, taken: bool) -> None:
 
     def advantage(y: float) -> float:
         (best, here, _), (other, there, _) = places(*wide(0.0, y), rows)[:2]
-        assert math.dist(here[:2], there[:2]) > 60.0
+        assert math.dist(here[POSITION], there[POSITION]) > 60.0
         return other - best
 
     y = brentq(lambda y: advantage(y) - odds, 10.0, 17.5, xtol=1e-4)
@@ -176,7 +177,7 @@ def test_the_model_must_be_straight_over_what_is_left(share: float, taken: bool)
 def test_the_rows_must_narrow_the_prior(left: float, taken: bool) -> None:
     """To a quarter of the position's variance, by the tangent and without the curvature."""
     mean, cov = wide(0.0, 0.0)
-    mean[1] = 12.0
+    mean[X.PY] = 12.0
 
     def problem(sd_m: float) -> Array:
         rows = ranges((3.0, 14.0), [(-200.0, 0.0), (15.0, 260.0)], 1.0)
@@ -187,7 +188,7 @@ def test_the_rows_must_narrow_the_prior(left: float, taken: bool) -> None:
         rows = problem(sd_m)
         innovation, H = linearise(rows, mean, 0.0)
         _, P, _ = fused(mean, cov, innovation, H, rows[:, VARIANCE].copy())
-        return float((P[0, 0] + P[1, 1]) / (cov[0, 0] + cov[1, 1]))
+        return float((P[X.PX, X.PX] + P[X.PY, X.PY]) / (cov[X.PX, X.PX] + cov[X.PY, X.PY]))
 
     sd_m = brentq(lambda s: share(s) - left, 0.1, 100.0, xtol=1e-9)
     assert is_refined(mean, cov, problem(sd_m)) is taken
@@ -208,21 +209,25 @@ def test_a_prior_is_wide_by_the_curvature_of_a_row_used(share: float, is_so: boo
 def search_by_the_rule(mean: Array, cov: Array, rows: Array) -> tuple[Array, Array] | None:
     """The best place from the cautious one and from eight around the prior, or None; what the
     starts find is that of ``iterate_from``."""
-    variance, width = rows[:, VARIANCE].copy(), cov[0, 0] + cov[1, 1]
+    variance, width = rows[:, VARIANCE].copy(), cov[X.PX, X.PX] + cov[X.PY, X.PY]
     innovation, H = linearise(rows, mean, 0.0)
     narrowed = fused(mean, cov, innovation, H, variance)[1]
-    if narrowed[0, 0] + narrowed[1, 1] > 0.25 * width:
+    if narrowed[X.PX, X.PX] + narrowed[X.PY, X.PY] > 0.25 * width:
         return None
     circle = np.exp(2j * np.pi * np.arange(8) / 8)
     starts = [cautious(mean, cov, rows)[0], *(mean.copy() for _ in circle)]
     for start, way in zip(starts[1:], circle, strict=True):
-        start[:2] += 1.5 * np.sqrt(np.diag(cov)[:2]) * (way.real, way.imag)
+        start[POSITION] += 1.5 * np.sqrt(np.diag(cov)[:2]) * (way.real, way.imag)
     work = scratch(6, len(rows))
     ends = [ekf.iterate_from(s, mean, cov, rows, variance, 0.0, 30, work) for s in starts]
     costs = [log_posterior_cost(rows, mean, cov, 0.0, x) for x, _ in ends]
     best = int(np.argmin(costs))
     x, P = ends[best]
-    apart = [c for c, (y, _) in zip(costs, ends, strict=True) if math.dist(y[:2], x[:2]) > 0.1]
+    apart = [
+        c
+        for c, (y, _) in zip(costs, ends, strict=True)
+        if math.dist(y[POSITION], x[POSITION]) > 0.1
+    ]
     bends = [curvature_variance(r, x, P, 0.0) > 0.1 * r[VARIANCE] for r in rows]
     if min(apart, default=math.inf) - costs[best] < 15.0 or costs[best] > 8.0 * len(rows):
         return None
@@ -231,7 +236,7 @@ def search_by_the_rule(mean: Array, cov: Array, rows: Array) -> tuple[Array, Arr
 
 def random_ranges(rng: np.random.Generator, mean: Array, cov: Array, sds_m: Array) -> Array:
     """Ranges of RSUs in the midst of the prior to a place drawn from it."""
-    x, y = rng.multivariate_normal(mean[:2], cov[:2, :2])
+    x, y = rng.multivariate_normal(mean[POSITION], cov[POSITION, POSITION])
     rows = ranges((x, y), [tuple(rng.uniform(-12, 12, 2)) for _ in sds_m], 1.0)
     rows[:, VARIANCE] = sds_m**2
     rows[:, VALUE] += rng.normal(0.0, sds_m)
@@ -272,7 +277,7 @@ def test_a_better_place_than_the_cautious_one_is_found() -> None:
         rows = random_ranges(rng, mean, cov, np.array([0.2, 0.2, rng.uniform(0.5, 4.0)]))
         if assert_follows_the_rule(mean, cov, rows):
             x, *_ = updated(mean, cov, rows, 0.0, NO_GATE, 8)
-            misled += math.dist(x[:2], cautious(mean, cov, rows)[0][:2]) > 4.0
+            misled += math.dist(x[POSITION], cautious(mean, cov, rows)[0][:2]) > 4.0
     assert misled >= 2
 
 
@@ -283,7 +288,7 @@ def test_a_rival_that_is_left_for_a_better_place_still_counts(
     """Turned so that no start after the one that finds the better place comes upon the rival."""
     rng = np.random.default_rng(seed)
     mean, cov = np.array([0.0, 0, 1, 0, 0, 0]), np.diag([100.0, 100, 1, 1, 1, 1])
-    place = rng.multivariate_normal(mean[:2], cov[:2, :2])
+    place = rng.multivariate_normal(mean[POSITION], cov[POSITION, POSITION])
     rsus = rng.uniform(-12, 12, (3, 2))
     sds = np.array([0.2, 0.2, rng.uniform(0.5, 4.0)])
     noise = rng.normal(0.0, sds)
@@ -295,5 +300,5 @@ def test_a_rival_that_is_left_for_a_better_place_still_counts(
     rows[:, VARIANCE] = (sds * [1.0, 1.0, loose]) ** 2
     (best, there, _), (rival, _, _) = places(mean, cov, rows)[:2]
     assert rival - best < 15.0
-    assert math.dist(there[:2], cautious(mean, cov, rows)[0][:2]) > 4.0
+    assert math.dist(there[POSITION], cautious(mean, cov, rows)[0][:2]) > 4.0
     assert not is_refined(mean, cov, rows)

@@ -19,6 +19,7 @@ from netpos.filters.error_state import (
 )
 from netpos.filters.measurement import VARIANCE, Kind
 from netpos.filters.space import SpaceKind, bend_variance, direction_rows, place_rows
+from netpos.filters.state import ERR_POSITION, NAV_POSITION, NAV_QUATERNION, NAV_VELOCITY, Err, Nav
 from netpos.inertial.strapdown import ERR, GYRO_BIAS, NAV, InertialNoise, inject, still_earth
 from netpos.messages.values import Array
 from scipy.optimize import minimize
@@ -30,7 +31,7 @@ G = 9.80665
 def start(yaw: float = 0.4) -> Array:
     nav = np.zeros(NAV)
     nav[:6] = 5.0, -3.0, 1.0, 2.0, 1.0, 0.0
-    nav[6:10] = Rotation.from_euler("ZYX", [yaw, 0.02, -0.03]).as_quat()
+    nav[NAV_QUATERNION] = Rotation.from_euler("ZYX", [yaw, 0.02, -0.03]).as_quat()
     return nav
 
 
@@ -64,7 +65,7 @@ def test_a_row_outside_the_gate_changes_nothing() -> None:
     rng = np.random.default_rng(2)
     nav, cov = start(), spd(rng)
     before, P = nav.copy(), cov.copy()
-    rows = place_rows(nav[:3] + 100.0, np.eye(3), LEVER_ARM)
+    rows = place_rows(nav[NAV_POSITION] + 100.0, np.eye(3), LEVER_ARM)
     accepted = np.ones(1)
     gate = np.array([0.0, 10.0, 13.0, 16.0])
     assert correct(nav, cov, rows, gate, accepted) == (0.0, 0)
@@ -77,22 +78,22 @@ def test_groups_are_gated_apart() -> None:
     rng = np.random.default_rng(3)
     nav, cov = start(), spd(rng)
     good, bad = (
-        place_rows(nav[:3] + shift, np.eye(3), (0.0, 0.0, 0.0), group)
+        place_rows(nav[NAV_POSITION] + shift, np.eye(3), (0.0, 0.0, 0.0), group)
         for group, shift in enumerate((0.1, 50.0))
     )
     accepted = np.zeros(2)
     _, used = correct(nav, cov, np.vstack([good, bad]), np.full(4, 16.0), accepted)
     assert used == 3
     assert accepted.tolist() == [1.0, 0.0]
-    assert np.abs(nav[:3] - start()[:3]).max() < 0.2
+    assert np.abs(nav[NAV_POSITION] - start()[NAV_POSITION]).max() < 0.2
 
 
 def test_a_bearing_is_iterated_to_the_most_probable_place() -> None:
     """20 m from the station, 2 m and 5 m uncertain, half a radian off: one linearisation leaves
     the distance as it was, the iterated update ends where the cost is smallest."""
     nav, cov = moving(0.0), 1e-9 * np.eye(ERR)
-    nav[0] = 20.0
-    cov[:3, :3] = np.diag([4.0, 25.0, 0.01])
+    nav[Nav.PX] = 20.0
+    cov[ERR_POSITION, ERR_POSITION] = np.diag([4.0, 25.0, 0.01])
     bearing = row(Kind.AZIMUTH, 0.5, 0.01)
     variance = 0.01 + bend_variance(bearing, nav, cov)
 
@@ -140,7 +141,7 @@ def test_a_hole_of_the_imu_is_counted_and_opens_the_covariance(missing: str) -> 
         nav, cov = moving(5.0), 1e-8 * np.eye(ERR)
         blind = driven(nav, cov, Imu(stamps[mask], rates[mask]), 3.0)
         np.testing.assert_allclose(nav[:6], [15.0, 0, 0, 5.0, 0, 0], atol=1e-6)
-        sds.append((blind, np.sqrt(cov[3, 3])))
+        sds.append((blind, np.sqrt(cov[Err.VX, Err.VX])))
     (whole, sure), (blind, unsure) = sds
     assert whole == 0.0
     assert blind == pytest.approx(3.0 if missing == "all" else 1.0, abs=0.02)
@@ -151,11 +152,11 @@ def test_a_vehicle_does_not_slip() -> None:
     """A wrong heading shows as sideways speed and is found, with the sideways velocity."""
     stamps, rates = level(1000)
     nav, cov = moving(10.0), np.diag([0.01] * 6 + [1e-4, 1e-4, 0.01] + [1e-6] * 6)
-    nav[6:10] = Rotation.from_euler("z", 0.1).as_quat()
+    nav[NAV_QUATERNION] = Rotation.from_euler("z", 0.1).as_quat()
     held = Constraints(0.1, 0.1, 0.0, 0.0, 0.0)
     driven(nav, cov, Imu(stamps, rates), 10.0, held)
-    C = Rotation.from_quat(nav[6:10])
-    assert abs(C.inv().apply(nav[3:6])[1]) < 0.02
+    C = Rotation.from_quat(nav[NAV_QUATERNION])
+    assert abs(C.inv().apply(nav[NAV_VELOCITY])[1]) < 0.02
     assert abs(C.as_euler("ZYX")[0]) < 0.02
 
 
@@ -173,7 +174,7 @@ def test_standstill_shows_the_gyro_bias(quiet: bool, standing: bool) -> None:
     driven(nav, cov, Imu(stamps, rates), 10.0, rest, noise)
     known = np.abs(nav[GYRO_BIAS:] - [0.002, -0.001, 0.003]).max() < 5e-4
     assert known is np.bool_(standing)
-    assert (np.sqrt(cov[3, 3]) < 0.01) is np.bool_(standing)
+    assert (np.sqrt(cov[Err.VX, Err.VX]) < 0.01) is np.bool_(standing)
 
 
 @pytest.mark.parametrize("sd", [0.1, 20.0])
@@ -183,7 +184,7 @@ def test_a_quiet_cruise_is_no_standstill(sd: float) -> None:
     nav, cov = moving(15.0), np.diag([0.01] * 3 + [sd**2] * 3 + [1e-8] * 9)
     rest = Constraints(0.0, 0.0, 0.02, 0.5, 0.1)
     driven(nav, cov, Imu(stamps, rates), 5.0, rest)
-    assert nav[3] == pytest.approx(15.0, abs=1e-6)
+    assert nav[Nav.VX] == pytest.approx(15.0, abs=1e-6)
 
 
 def test_setting_off_gently_ends_a_standstill() -> None:
@@ -193,7 +194,7 @@ def test_setting_off_gently_ends_a_standstill() -> None:
     nav, cov = moving(0.0), np.diag([0.01] * 3 + [1.0] * 3 + [1e-8] * 9)
     rest = Constraints(0.0, 0.0, 0.02, 0.2, 0.05)
     driven(nav, cov, Imu(stamps, rates), 7.0, rest)
-    assert nav[3] == pytest.approx(0.6, abs=0.05)
+    assert nav[Nav.VX] == pytest.approx(0.6, abs=0.05)
 
 
 def test_a_doubted_standstill_is_not_held() -> None:
@@ -204,7 +205,7 @@ def test_a_doubted_standstill_is_not_held() -> None:
         if doubted:
             doubt_standstill(memory)
         driven(nav, cov, Imu(stamps, rates), 8.0, rest, memory=memory)
-        sds.append(np.sqrt(cov[3, 3]))
+        sds.append(np.sqrt(cov[Err.VX, Err.VX]))
     assert sds[0] < 0.02
     assert sds[1] > 0.9
 
@@ -232,7 +233,7 @@ def test_constraint_rows_follow_their_covariance() -> None:
     nav, cov = moving(0.0), np.diag([1.0] * 3 + [4.0] * 3 + [1e-9] * 9)
     rows = direction_rows(SpaceKind.BODY_VELOCITY, np.eye(3), np.ones(3), np.ones(3), 0)
     correct(nav, cov, rows, OPEN, np.zeros(1))
-    np.testing.assert_allclose(nav[3:6], 4.0 / 5.0, rtol=1e-6)
+    np.testing.assert_allclose(nav[NAV_VELOCITY], 4.0 / 5.0, rtol=1e-6)
     np.testing.assert_allclose(np.diag(cov)[3:6], 4.0 / 5.0, rtol=1e-6)
 
 

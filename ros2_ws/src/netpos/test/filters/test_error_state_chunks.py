@@ -17,6 +17,7 @@ from netpos.filters.error_state import (
     advance,
     predict_chunk,
 )
+from netpos.filters.state import NAV_POSITION, NAV_QUATERNION, NAV_VELOCITY, Err
 from netpos.inertial.strapdown import (
     ACCEL_BIAS,
     ERR,
@@ -36,7 +37,7 @@ MS = 1_000_000
 def resting() -> Array:
     nav = np.zeros(NAV)
     nav[:6] = 1.0, 2.0, 3.0, 4.0, -2.0, 0.5
-    nav[6:10] = Rotation.from_euler("ZYX", [0.7, 0.2, -0.3]).as_quat()
+    nav[NAV_QUATERNION] = Rotation.from_euler("ZYX", [0.7, 0.2, -0.3]).as_quat()
     nav[10:] = 0.02, -0.01, 0.03, 1e-3, -2e-3, 1e-3
     return nav
 
@@ -107,7 +108,7 @@ def test_what_was_measured_before_a_hole_says_nothing_after_it() -> None:
 def test_without_samples_a_tilted_vehicle_goes_on_as_it_was(samples: int) -> None:
     """Its attitude turns by what the last sample says, here by nothing."""
     nav = resting()
-    before, C = nav.copy(), Rotation.from_quat(nav[6:10])
+    before, C = nav.copy(), Rotation.from_quat(nav[NAV_QUATERNION])
     level = np.concatenate(
         [nav[GYRO_BIAS:NAV], nav[ACCEL_BIAS:GYRO_BIAS] + C.inv().apply([0, 0, 9.80665])]
     )
@@ -115,7 +116,9 @@ def test_without_samples_a_tilted_vehicle_goes_on_as_it_was(samples: int) -> Non
     quiet = Sensors(NOISE._replace(bias_correlation_time_s=1e12), still_earth(), UNCONSTRAINED)
     blind_s = advance(nav, np.eye(ERR), np.zeros(MEMORY), 0, 2 * 10**9, imu, quiet)
     assert blind_s == pytest.approx(2.0, rel=1e-12)
-    np.testing.assert_allclose(nav[:3], before[:3] + 2.0 * before[3:6], atol=1e-6)
+    np.testing.assert_allclose(
+        nav[NAV_POSITION], before[NAV_POSITION] + 2.0 * before[NAV_VELOCITY], atol=1e-6
+    )
     np.testing.assert_allclose(nav[3:], before[3:], atol=1e-6)
 
 
@@ -140,7 +143,7 @@ def test_nothing_is_held_in_a_hole() -> None:
         nav, cov = moving(10.0), np.diag([1.0] * 6 + [1e-6] * 9)
         imu = Imu(stamps, np.tile([0, 0, 0, 0, 0, 9.80665], (count, 1)))
         driven(nav, cov, imu, 3.0, held)
-        sds.append(np.sqrt(cov[4, 4]))
+        sds.append(np.sqrt(cov[Err.VY, Err.VY]))
     assert sds[0] < 0.1
     assert sds[1] > 1.0
 

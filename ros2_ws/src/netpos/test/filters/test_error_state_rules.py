@@ -18,6 +18,7 @@ from netpos.filters.error_state import (
 )
 from netpos.filters.measurement import GATE_VARIANCE, GROUP, VALUE, VARIANCE, Kind
 from netpos.filters.space import SpaceKind, bend_variance, direction_rows, place_rows
+from netpos.filters.state import NAV_POSITION, NAV_VELOCITY
 from netpos.inertial.strapdown import ERR, GYRO_BIAS, NAV, inject, still_earth
 from netpos.messages.values import Array
 
@@ -94,7 +95,9 @@ def test_iterating_ends_with_the_place() -> None:
     velocity = direction_rows(
         SpaceKind.BODY_VELOCITY, np.eye(3)[1:], np.array([2.0, 0.5]), np.full(2, 1e-4), 1
     )
-    rows = np.vstack([place_rows(nav[:3] + 1.0, 0.01 * np.eye(3), (0.0, 0.0, 0.0)), velocity])
+    rows = np.vstack(
+        [place_rows(nav[NAV_POSITION] + 1.0, 0.01 * np.eye(3), (0.0, 0.0, 0.0)), velocity]
+    )
     cov[:3, 3:] = cov[3:, :3] = 0.0
     expected, _, _, count = correct_by_the_rule(nav, cov, rows)
     assert count == 2
@@ -164,7 +167,7 @@ def held(quiet: float, speed: float, sensors: Sensors) -> tuple[Array, Array, Ar
     """State and covariance before and after a quiet chunk of 0.08 s."""
     rng = np.random.default_rng(2)
     nav, cov = vehicle(rng)
-    nav[3:6] = speed * np.array([0.6, 0.64, 0.48])
+    nav[NAV_VELOCITY] = speed * np.array([0.6, 0.64, 0.48])
     nav[GYRO_BIAS:NAV] = 0.002, -0.003, 0.001
     before = nav.copy(), cov.copy()
     memory = np.zeros(MEMORY)

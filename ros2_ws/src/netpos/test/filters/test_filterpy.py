@@ -18,6 +18,7 @@ from netpos.filters.motion import (
     transition,
 )
 from netpos.filters.rows import rsu_axes, rsu_rows
+from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 
 T = 0.1
@@ -33,7 +34,7 @@ DOA_SD, TOA_SD = math.radians(2.0), 50e-9
 def measurements(rng: np.random.Generator, x: Array) -> list[RsuMeasurement]:
     out = []
     for rsu in RSUS:
-        d = x[:2] - rsu.position[:2]
+        d = x[POSITION] - rsu.position[:2]
         out.append(
             RsuMeasurement(
                 stamp_ns=1,
@@ -42,7 +43,7 @@ def measurements(rng: np.random.Generator, x: Array) -> list[RsuMeasurement]:
                 fields=Field.AZIMUTH | Field.TOA,
                 azimuth_rad=math.atan2(d[1], d[0]) + rng.normal() * DOA_SD,
                 azimuth_var=DOA_SD**2,
-                toa_s=(math.hypot(*d) + x[4]) / SPEED_OF_LIGHT_MPS + rng.normal() * TOA_SD,
+                toa_s=(math.hypot(*d) + x[X.CLOCK]) / SPEED_OF_LIGHT_MPS + rng.normal() * TOA_SD,
                 toa_var=TOA_SD**2,
             )
         )
@@ -53,8 +54,8 @@ def h_of(x: Array) -> Array:
     """Rows in the order DOA 1, TOA 1, DOA 2, TOA 2: fokin2020:eq.41-42."""
     out = []
     for rsu in RSUS:
-        d = x[:2, 0] - rsu.position[:2]
-        out += [math.atan2(d[1], d[0]), math.hypot(*d) + x[4, 0]]
+        d = x[POSITION, 0] - rsu.position[:2]
+        out += [math.atan2(d[1], d[0]), math.hypot(*d) + x[X.CLOCK, 0]]
     return np.array(out)[:, None]
 
 
@@ -62,7 +63,7 @@ def jacobian_of(x: Array) -> Array:
     """fokin2020:eq.44."""
     H = np.zeros((4, 6))
     for i, rsu in enumerate(RSUS):
-        dx, dy = x[:2, 0] - rsu.position[:2]
+        dx, dy = x[POSITION, 0] - rsu.position[:2]
         d2 = dx * dx + dy * dy
         H[2 * i, :2] = -dy / d2, dx / d2
         H[2 * i + 1, :2] = np.array([dx, dy]) / math.sqrt(d2)

@@ -11,6 +11,7 @@ from netpos.filters import ekf, sigma, ukf
 from netpos.filters import filterpy_backend as reference
 from netpos.filters.measurement import Kind
 from netpos.filters.motion import Model, motion_parameters
+from netpos.filters.state import X
 from netpos.messages.values import Array
 from scipy.stats import chi2
 
@@ -82,7 +83,7 @@ def test_whole_track_equals_the_compiled_one(name: str, seed: int, row: Maker) -
         seam.add(bool(rows[0, 1] > 0.0))
     assert 10 < rejected < 60
     assert seam == {True, False}
-    assert math.hypot(mean[0] + 10.0, mean[1]) == pytest.approx(40.0, abs=2.0)
+    assert math.hypot(mean[X.PX] + 10.0, mean[X.PY]) == pytest.approx(40.0, abs=2.0)
 
 
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
@@ -98,7 +99,7 @@ def test_seam(name: str, value: float, row: Maker) -> None:
     assert result == (pytest.approx(nis, rel=1e-9), 1)
     np.testing.assert_allclose(mean, other, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(cov, other_cov, rtol=1e-9, atol=1e-12)
-    assert 0.0 < math.copysign(1.0, value) * mean[1] < 0.25
+    assert 0.0 < math.copysign(1.0, value) * mean[X.PY] < 0.25
 
 
 @pytest.mark.parametrize("name", ["ekf", "ukf"])

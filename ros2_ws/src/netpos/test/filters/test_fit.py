@@ -24,6 +24,7 @@ from netpos.filters.measurement import (
     curvature_variance,
     linearise,
 )
+from netpos.filters.state import POSITION
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -88,10 +89,12 @@ def test_a_bearing_does_not_bend_along_itself() -> None:
     e, hessian = 1e-4 * np.eye(2), np.empty((2, 2))
     for i, j in np.ndindex(2, 2):
         corners = [
-            a * b * azimuth(*(mean[:2] + a * e[i] + b * e[j])) for a in (1, -1) for b in (1, -1)
+            a * b * azimuth(*(mean[POSITION] + a * e[i] + b * e[j]))
+            for a in (1, -1)
+            for b in (1, -1)
         ]
         hessian[i, j] = sum(corners) / 4e-8
-    bent = hessian @ cov[:2, :2]
+    bent = hessian @ cov[POSITION, POSITION]
     _, gradient = linearise(row, mean, 0.0)
     S = gradient[0] @ cov @ gradient[0] + 1e-4 + 0.5 * np.trace(bent @ bent)
     innovation = -0.6 - azimuth(4.0, -3.0)

@@ -11,6 +11,7 @@ from filterpy.kalman import IMMEstimator, KalmanFilter
 from netpos.filters import ekf, imm
 from netpos.filters.measurement import Kind
 from netpos.filters.motion import NO_BIAS, Model, Parameter, motion_parameters, noise, transition
+from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array
 from scipy.linalg import expm
 from scipy.stats import multivariate_normal
@@ -145,16 +146,16 @@ def test_a_model_left_for_long_comes_back() -> None:
         imm.mix(means, covs, weights, transition)
     assert weights[1] == pytest.approx(1e-12, rel=1e-9)
     assert weights.sum() == pytest.approx(1.0, abs=1e-15)
-    assert means[1, 0] == 8.0
-    assert means[0, 0] == pytest.approx(4.0)
-    assert covs[0, 0, 0] == pytest.approx(17.0)
+    assert means[1, X.PX] == 8.0
+    assert means[0, X.PX] == pytest.approx(4.0)
+    assert covs[0, X.PX, X.PX] == pytest.approx(17.0)
 
 
 def test_one_decision_for_all_models(row: Maker) -> None:
     """Rejected by each model alone, accepted by their mixture: its spread counts. Rejected by the
     mixture: nobody moves."""
     means, covs = np.zeros((2, 6)), np.array([np.eye(6)] * 2)
-    means[:, 0] = -10.0, 10.0
+    means[:, X.PX] = -10.0, 10.0
     rows = np.array(
         [
             row(Kind.LINEAR, 0.0, 1.0, 0, h=[1, 0, 0, 0, 0, 0]),
@@ -167,7 +168,7 @@ def test_one_decision_for_all_models(row: Maker) -> None:
     nis, dof = imm.update(means, covs, weights, rows, 0.0, gate_nis, 1, accepted, work)
     assert accepted.tolist() == [1.0, 0.0]
     assert (nis, dof) == (pytest.approx(0.0, abs=1e-12), 1)
-    np.testing.assert_allclose(means[:, 0], [-5.0, 5.0], rtol=1e-12)
+    np.testing.assert_allclose(means[:, X.PX], [-5.0, 5.0], rtol=1e-12)
     assert (means[:, 1:] == before[:, 1:]).all()
     before, before_covs = means.copy(), covs.copy()
     result = imm.update(means, covs, weights, rows[1:], 0.0, gate_nis, 1, accepted, work)
@@ -254,7 +255,7 @@ def test_stop_straight_turn(seed: int, row: Maker) -> None:
         imm.predict(means, covs, weights, DT, motions, sojourn_s, NO_BIAS)
         imm.update(means, covs, weights, rows, 0.0, OPEN, 1, accepted, work)
         imm.combine(means, covs, weights, mean, cov)
-        errors.append(np.sum((mean[:2] - p) ** 2))
+        errors.append(np.sum((mean[POSITION] - p) ** 2))
         leader.append(int(np.argmax(weights)))
     single = min(constant_velocity(epochs, truth, accel) for accel in (0.5, 1.0, 2.0, 3.0))
     assert math.sqrt(np.mean(errors)) < 0.93 * single
@@ -272,5 +273,5 @@ def constant_velocity(epochs: list[Array], truth: Array, accel: float) -> float:
     for rows, p in zip(epochs, truth, strict=True):
         ekf.predict(mean, cov, DT, motion, NO_BIAS)
         ekf.update(mean, cov, rows, 0.0, OPEN, 1, np.zeros(1), work)
-        errors.append(np.sum((mean[:2] - p) ** 2))
+        errors.append(np.sum((mean[POSITION] - p) ** 2))
     return math.sqrt(np.mean(errors))

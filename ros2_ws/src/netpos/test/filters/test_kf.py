@@ -9,6 +9,7 @@ import pytest
 from netpos.filters import ekf, kf
 from netpos.filters.measurement import Kind
 from netpos.filters.motion import NO_BIAS, Model, motion_parameters
+from netpos.filters.state import X
 from netpos.messages.values import Array
 
 Maker = Callable[..., Array]
@@ -130,7 +131,7 @@ def test_floor_is_compared_with_the_gain_per_metre(
     rows = np.array([row(Kind.LINEAR, 2.0 * scale, 9.0 * scale**2, h=scale * np.eye(6)[0])])
     floor = np.array([share * gain, 0.0, 0.0])
     kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), floor)
-    assert mean[0] == pytest.approx(2.0 * gain * (share if raised else 1.0), rel=1e-12)
+    assert mean[X.PX] == pytest.approx(2.0 * gain * (share if raised else 1.0), rel=1e-12)
 
 
 def test_floor_needs_one_position_alone(row: Maker) -> None:
@@ -153,7 +154,7 @@ def test_dvornikovs_filter(row: Maker) -> None:
     rng = np.random.default_rng(1)
     motion = motion_parameters(Model.CONSTANT_ACCELERATION)
     mean, cov = np.zeros(8), 1e3 * np.eye(8)
-    mean[0] = 10_680.0
+    mean[X.PX] = 10_680.0
     h, errors, gains = np.array([1.0, 0, 0, 0, 0, 0]), [], []
     for step in range(360):
         t = 0.5 * step
@@ -165,7 +166,7 @@ def test_dvornikovs_filter(row: Maker) -> None:
         rows = np.array([row(Kind.LINEAR, value, 100.0, h=h)])
         kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), kf.DVORNIKOV_FLOOR)
         gains.append((mean - prior)[[0, 2, 6]] / (value - prior[0]))
-        errors.append(mean[0] - truth)
+        errors.append(mean[X.PX] - truth)
     assert gains[0][0] == pytest.approx(1000.0 / 1100.0)
     np.testing.assert_allclose(gains[-1], [0.0926, 0.008, 0.0003], rtol=1e-6)
     assert np.sqrt(np.mean(np.square(errors[60:]))) < 5.0

@@ -29,6 +29,7 @@ from netpos.filters.measurement import (
     wrap,
 )
 from netpos.filters.rows import rsu_axes, rsu_rows
+from netpos.filters.state import POSITION, VELOCITY
 from netpos.messages.values import Field, RsuInfo, RsuMeasurement
 
 ANGLE_KINDS = (Kind.AZIMUTH, Kind.ELEVATION)
@@ -72,7 +73,7 @@ def test_jacobian_matches_central_differences(kind: Kind, seed: int, heading: in
 def test_a_direction_changes_with_height_too(kind: Kind, seed: int) -> None:
     rng = np.random.default_rng(200 + seed)
     row, x, height, eps = random_row(rng, kind), random_state(rng), rng.uniform(-3, 3), 1e-5
-    d = np.append(x[:2], height + row[LEVER + 2]) - row[ORIGIN:AXES]
+    d = np.append(x[POSITION], height + row[LEVER + 2]) - row[ORIGIN:AXES]
     change = closed_form(row, x, height + eps) - closed_form(row, x, height - eps)
     slope = math.remainder(change, 2 * math.pi) / (2 * eps)
     assert direction(row, *d)[3] == pytest.approx(slope, rel=1e-6, abs=2e-8)
@@ -150,9 +151,9 @@ def test_floors_at_the_rsu_and_at_rest() -> None:
     np.testing.assert_array_equal(h, 0.0)
     # 1e-6 m/s floor of the speed, in both components.
     predict_row(row, np.array([0, 0, 1e-7, 2e-7, 0, 0]), 0.0, h)
-    np.testing.assert_allclose(h[2:4], [0.1, 0.2], rtol=1e-9)
+    np.testing.assert_allclose(h[VELOCITY], [0.1, 0.2], rtol=1e-9)
     predict_row(row, np.array([0, 0, 0.3, -0.4, 0, 0]), 0.0, h)
-    np.testing.assert_allclose(h[2:4], [0.6, -0.8], rtol=1e-14)
+    np.testing.assert_allclose(h[VELOCITY], [0.6, -0.8], rtol=1e-14)
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from netpos.filters.measurement import (
     innovation_row,
     innovation_variance,
 )
+from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array
 from scipy.spatial.transform import Rotation
 
@@ -44,7 +45,7 @@ def hessian(row: Array, x: Array, height_m: float) -> Array:
 
 def half_trace(row: Array, x: Array, cov: Array, height_m: float) -> float:
     """Variance of the second-order term of a Gaussian prior."""
-    product = hessian(row, x, height_m) @ cov[:2, :2]
+    product = hessian(row, x, height_m) @ cov[POSITION, POSITION]
     return 0.5 * float(np.trace(product @ product))
 
 
@@ -114,7 +115,7 @@ def test_a_range_from_above_bends_along_the_ground_too(
 ) -> None:
     """An RSU 8.5 m above. Straight below it h'' is 1/8.5 in both directions."""
     row, x = level_row(Kind.RANGE, np.array([0.0, 0.0, 8.5])), np.zeros(9)
-    x[0] = aside_m
+    x[X.PX] = aside_m
     cov = np.diag([4.0, 4.0, *np.ones(7)])
     if expected is None:
         expected = half_trace(row, x, cov, 0.0)
@@ -133,7 +134,7 @@ def test_curvature_of_angles_is_exact_for_an_equal_spread_where_they_bend_most(
     kind: Kind, target: tuple[float, float, float]
 ) -> None:
     row, x = level_row(kind, np.array([1.0, 1.0, 1.0])), np.zeros(9)
-    x[:2] = target[0] + 1.0, target[1] + 1.0
+    x[POSITION] = target[0] + 1.0, target[1] + 1.0
     cov, height = 0.3 * np.eye(9), target[2] + 1.0
     assert curvature_variance(row, x, cov, height) == pytest.approx(
         half_trace(row, x, cov, height), rel=1e-4
@@ -145,9 +146,9 @@ def test_curvature_of_azimuth_bounds_the_second_order_term(seed: int) -> None:
     rng = np.random.default_rng(seed)
     row, x, A = level_row(Kind.AZIMUTH, np.zeros(3)), random_state(rng), rng.normal(size=(9, 9))
     cov = A @ A.T
-    d2 = x[0] ** 2 + x[1] ** 2
+    d2 = x[X.PX] ** 2 + x[X.PY] ** 2
     assert curvature_variance(row, x, cov, 2.0) >= half_trace(row, x, cov, 2.0) * (1 - 1e-4)
-    frobenius2 = np.linalg.norm(cov[:2, :2]) ** 2
+    frobenius2 = np.linalg.norm(cov[POSITION, POSITION]) ** 2
     assert curvature_variance(row, x, cov, 2.0) == pytest.approx(frobenius2 / 2 / d2**2)
     slant2 = d2 + 4.0
     for kind in (Kind.ELEVATION, Kind.COSINE_Y, Kind.COSINE_Z):

@@ -19,6 +19,7 @@ from netpos.filters.measurement import (
     predict_row,
 )
 from netpos.filters.rows import array_direction, rsu_axes, rsu_rows
+from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from scipy.spatial.transform import Rotation
 
@@ -67,11 +68,11 @@ def test_range_and_toa_count_from_the_master(seed: int) -> None:
     info = anchor(rng)
     master, _ = antennas(info)
     rows, x = rows_by_kind(info), rng.normal(size=6) * 5.0
-    distance = np.linalg.norm([*x[:2], HEIGHT + 0.1] - master)
+    distance = np.linalg.norm([*x[POSITION], HEIGHT + 0.1] - master)
     h = np.empty(6)
     assert predict_row(rows[Kind.RANGE], x, HEIGHT, h) == pytest.approx(distance, abs=1e-12)
     toa = predict_row(rows[Kind.TOA], x, HEIGHT, h)
-    assert toa == pytest.approx(distance + x[4], abs=1e-12)
+    assert toa == pytest.approx(distance + x[X.CLOCK], abs=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -81,7 +82,7 @@ def test_far_away_the_phase_is_the_path_difference(seed: int) -> None:
     info = anchor(rng)
     master, slave = antennas(info)
     x = np.append(rng.normal(size=2) * 400.0, np.zeros(4))
-    there = np.array([*x[:2], HEIGHT + 0.1])
+    there = np.array([*x[POSITION], HEIGHT + 0.1])
     path = np.linalg.norm(there - slave) - np.linalg.norm(there - master)
     phase = predict_row(rows_by_kind(info)[Kind.PHASE], x, HEIGHT, np.empty(6))
     assert phase == pytest.approx(2 * math.pi * path / WAVELENGTH, abs=1e-3)
@@ -155,7 +156,7 @@ def test_the_curvature_bounds_the_second_derivative() -> None:
             predict_row(row, x + e, HEIGHT, up)
             predict_row(row, x - e, HEIGHT, down)
             second[axis] = (up - down)[:2] / 2e-5
-        hp = second @ P[:2, :2]
+        hp = second @ P[POSITION, POSITION]
         true = 0.5 * float(np.trace(hp @ hp))
         bound = curvature_variance(row, x, P, HEIGHT)
         assert bound >= true / 1.34  # its largest curvature is up to 1.155 over r^2

@@ -34,6 +34,7 @@ from netpos.filters.rows import (
     scalar_kinds,
     speed_row,
 )
+from netpos.filters.state import X
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
@@ -81,7 +82,7 @@ def full_measurement(info: RsuInfo, target: Array, clock_m: float) -> RsuMeasure
 def test_noise_free_measurement_has_no_innovation(convention: AngleConvention, seed: int) -> None:
     rng = np.random.default_rng(seed)
     info, x = random_info(rng, convention), random_state(rng, 6)
-    m = full_measurement(info, np.array([x[0], x[1], 1.5]), x[4])
+    m = full_measurement(info, np.array([x[X.PX], x[X.PY], 1.5]), x[X.CLOCK])
     rows = rsu_rows(m, info, rsu_axes(info), 3)
     innovation, _ = linearise(rows, x, 1.5)
     np.testing.assert_allclose(innovation, 0.0, atol=2e-6)

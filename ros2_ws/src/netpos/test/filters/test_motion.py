@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 from netpos.filters import ekf, motion
 from netpos.filters.motion import (
-    N_CORE,
     SPEED_OF_LIGHT_MPS,
     Model,
     Parameter,
     ProcessNoise,
-    StateIndex,
     extra_states,
     motion_parameters,
 )
+from netpos.filters.state import X
 from netpos.messages.values import Array
 from scipy.constants import speed_of_light
 from scipy.linalg import expm
@@ -83,9 +82,6 @@ def continuous(dt: float, sd: np.ndarray = NO_BIAS, tau: np.ndarray = NO_BIAS) -
 
 
 def test_names() -> None:
-    assert [s.name for s in StateIndex] == ["X", "Y", "VX", "VY", "CLOCK", "DRIFT"]
-    assert [s.value for s in StateIndex] == list(range(N_CORE))
-    assert N_CORE == 6
     assert speed_of_light == SPEED_OF_LIGHT_MPS
     assert {p.name.lower(): p.value for p in ProcessNoise} == {
         "continuous": 0,
@@ -262,7 +258,7 @@ def test_predict_with_constant_velocity(biases: int, kind: ProcessNoise, seed: i
         motion_parameters(noise=kind, **NOISE),
     )
     F, Q = np.eye(n), np.empty((n, n))
-    F[0, 2] = F[1, 3] = F[4, 5] = dt
+    F[X.PX, X.VX] = F[X.PY, X.VY] = F[X.CLOCK, X.DRIFT] = dt
     F[range(6, n), range(6, n)] = np.exp(-dt / bias[1])
     motion.noise(x, dt, parameters, bias, Q)
     mean, cov = predicted(x, P, dt, parameters, bias)
@@ -308,17 +304,20 @@ STILL = [
 @pytest.mark.parametrize(("model", "extras"), STILL)
 def test_predict_symmetrises_what_rounding_made_unsymmetric(model: Model, extras: int) -> None:
     P = 2.0 * np.eye(6 + extras)
-    P[2, 5], P[5, 2] = 1.0 + 1e-9, 1.0 - 1e-9  # a velocity and the drift: F leaves them alone
+    P[X.VX, X.DRIFT], P[X.DRIFT, X.VX] = (
+        1.0 + 1e-9,
+        1.0 - 1e-9,
+    )  # a velocity and the drift: F leaves them alone
     _, cov = predicted(np.zeros(6 + extras), P, 0.5, motion_parameters(model, extras=extras))
-    np.testing.assert_allclose([cov[2, 5], cov[5, 2]], 1.0, rtol=1e-15)
+    np.testing.assert_allclose([cov[X.VX, X.DRIFT], cov[X.DRIFT, X.VX]], 1.0, rtol=1e-15)
     np.testing.assert_array_equal(cov, cov.T)
 
 
 def test_predict_symmetrises_beside_biases() -> None:
     P = 2.0 * np.eye(6 + BIASES.shape[1])
-    P[2, 5], P[5, 2] = 1.0 + 1e-9, 1.0 - 1e-9
+    P[X.VX, X.DRIFT], P[X.DRIFT, X.VX] = 1.0 + 1e-9, 1.0 - 1e-9
     _, cov = predicted(np.zeros(len(P)), P, 0.5, motion_parameters(), BIASES)
-    np.testing.assert_allclose([cov[2, 5], cov[5, 2]], 1.0, rtol=1e-15)
+    np.testing.assert_allclose([cov[X.VX, X.DRIFT], cov[X.DRIFT, X.VX]], 1.0, rtol=1e-15)
     np.testing.assert_array_equal(cov, cov.T)
 
 

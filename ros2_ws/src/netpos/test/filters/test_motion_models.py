@@ -20,6 +20,7 @@ from netpos.filters.motion import (
     propagate,
     transition,
 )
+from netpos.filters.state import POSITION, VELOCITY, X
 from netpos.messages.values import Array
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
@@ -53,7 +54,7 @@ def test_jacobian_by_differences(model: Model, seed: int) -> None:
     motion = motion_parameters(model, yaw_increment=0.2, speed_increment=0.7)
     mean = state_of(model, extra_states(model), rng)
     if seed == 3:
-        mean[2:4] *= 0.01  # creeping
+        mean[VELOCITY] *= 0.01  # creeping
     F, step = matrix(transition, mean, 0.3, motion, BIAS), 1e-5
     for j in range(mean.size):
         e = step * np.eye(mean.size)[j]
@@ -203,7 +204,7 @@ def test_stationary_noise_is_a_slow_creep() -> None:
     for axis in range(2):
         at = np.ix_([axis, axis + 2], [axis, axis + 2])
         np.testing.assert_allclose(Q[at], np.outer(w, w), rtol=1e-14)
-    assert Q[0, 1] == Q[0, 3] == Q[2, 3] == 0.0
+    assert Q[X.PX, X.PY] == Q[X.PX, X.VY] == Q[X.VX, X.VY] == 0.0
 
 
 @pytest.mark.parametrize("dt", [0.0, -1.0])
@@ -246,9 +247,9 @@ def test_inertial_on_a_circle() -> None:
             circle = np.array(
                 [1.0 + radius * math.sin(angle), 2.0 + radius * (1 - math.cos(angle))]
             )
-            furthest = max(furthest, float(np.abs(mean[:2] - circle).max()))
-        np.testing.assert_allclose(mean[:2], [1.0, 2.0], rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(mean[2:4], [6.0, 0.0], rtol=1e-9, atol=1e-9)
+            furthest = max(furthest, float(np.abs(mean[POSITION] - circle).max()))
+        np.testing.assert_allclose(mean[POSITION], [1.0, 2.0], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(mean[VELOCITY], [6.0, 0.0], rtol=1e-9, atol=1e-9)
         ends.append(furthest)
     assert ends[0] < 0.04
     assert ends[1] == pytest.approx(ends[0] / 4.0, rel=0.02)
@@ -283,7 +284,7 @@ def test_inertial_noise_is_per_second() -> None:
         motion = motion_parameters(Model.INERTIAL, kind, drift_step=0.2, **values)
         Q = matrix(noise, states, 0.5, motion, NO_BIAS)
         np.testing.assert_allclose(Q[:4, :4], plain[:4, :4], rtol=1e-14)
-        assert Q[5, 5] == pytest.approx(0.04)
+        assert Q[X.DRIFT, X.DRIFT] == pytest.approx(0.04)
     np.testing.assert_allclose(
         plain[::2, ::2][:2, :2], 0.49 * np.array([[1 / 24, 1 / 8], [1 / 8, 0.5]])
     )

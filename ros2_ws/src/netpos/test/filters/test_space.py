@@ -19,7 +19,6 @@ from netpos.filters.measurement import (
 )
 from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.filters.space import (
-    CLOCK,
     SpaceKind,
     bend_variance,
     direction_rows,
@@ -28,6 +27,7 @@ from netpos.filters.space import (
     place_rows,
     value_at,
 )
+from netpos.filters.state import ERR_BIASES, NAV_POSITION, NAV_QUATERNION, NAV_VELOCITY, Nav
 from netpos.inertial.strapdown import ERR, GYRO_BIAS, NAV, inject, rotation_of
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 from scipy.spatial.transform import Rotation
@@ -38,7 +38,7 @@ LEVER_ARM = (0.4, -0.3, 1.2)
 def state(rng: np.random.Generator) -> Array:
     nav = np.zeros(NAV)
     nav[:6] = 10.0 * rng.normal(size=6)
-    nav[6:10] = Rotation.random(rng=rng).as_quat()
+    nav[NAV_QUATERNION] = Rotation.random(rng=rng).as_quat()
     nav[10:] = 0.1 * rng.normal(size=6)
     return nav
 
@@ -80,7 +80,7 @@ def all_rows(rng: np.random.Generator) -> Array:
 
 def innovation(row: Array, nav: Array) -> tuple[float, Array]:
     C, h = np.empty((3, 3)), np.empty(nav.size - 1)
-    rotation_of(nav[6:10], C)
+    rotation_of(nav[NAV_QUATERNION], C)
     return innovation_at(row, nav, C, h), h
 
 
@@ -122,7 +122,7 @@ def test_clock_and_biases_are_states_of_their_own() -> None:
     for row in all_rows(rng):
         row[[BIAS, COMMON]] = 0, 1
         plain = innovation(row, nav[:NAV])[0]
-        row[[BIAS, COMMON]] = CLOCK + 2, CLOCK + 3
+        row[[BIAS, COMMON]] = ERR_BIASES, ERR_BIASES + 1
         value, h = innovation(row, nav)
         from_rsu = int(row[KIND]) not in (SpaceKind.BODY_VELOCITY, SpaceKind.BODY_RATE)
         clock = slow[0] if row[KIND] == Kind.TOA else 0.0
@@ -136,12 +136,12 @@ def test_clock_and_biases_are_states_of_their_own() -> None:
 def test_values_are_those_of_the_geometry() -> None:
     rng = np.random.default_rng(5)
     nav = state(rng)
-    antenna = nav[:3] + Rotation.from_quat(nav[6:10]).apply(LEVER_ARM)
+    antenna = nav[NAV_POSITION] + Rotation.from_quat(nav[NAV_QUATERNION]).apply(LEVER_ARM)
     for row in all_rows(rng):
         kind, predicted = int(row[KIND]), row[VALUE] - innovation(row, nav)[0]
         u = row[10:19].reshape(3, 3) @ (antenna - row[ORIGIN : ORIGIN + 3])
         r = max(float(np.linalg.norm(u)), 1e-9)  # rows of a direction have no origin
-        body = Rotation.from_quat(nav[6:10]).inv().apply(nav[3:6])
+        body = Rotation.from_quat(nav[NAV_QUATERNION]).inv().apply(nav[NAV_VELOCITY])
         expected = {
             Kind.AZIMUTH: math.atan2(u[1], u[0]),
             Kind.ELEVATION: math.asin(u[2] / r),
@@ -167,7 +167,7 @@ def test_an_angle_across_the_back_is_a_small_residual() -> None:
         azimuth_var=1.0,
     )  # fmt: skip
     nav = np.zeros(NAV)
-    nav[:2], nav[9] = (-10.0, -0.1), 1.0
+    nav[:2], nav[Nav.QW] = (-10.0, -0.1), 1.0
     value, _ = innovation(rsu_rows(m, info, rsu_axes(info), 0)[0], nav)
     assert value == pytest.approx(-0.02, abs=1e-4)
 
@@ -198,7 +198,7 @@ def test_bend_variance_of_each_kind(seed: int) -> None:
     rng = np.random.default_rng(seed)
     nav, A = state(rng), rng.normal(size=(ERR, ERR))
     cov, origin = A @ A.T, rng.normal(0.0, 20.0, 3)
-    d, P = nav[:3] - origin, cov[:3, :3]
+    d, P = nav[NAV_POSITION] - origin, cov[:3, :3]
     r2, rho2 = d @ d, d[:2] @ d[:2]
     bent = (np.eye(3) - np.outer(d, d) / r2) @ P
     ranged = np.trace(bent @ bent) / r2
@@ -231,13 +231,13 @@ def test_bend_variance_covers_what_linearising_leaves_out(kind: Kind) -> None:
     """Monte Carlo: no smaller than the variance of the remainder, and no ten times larger."""
     rng = np.random.default_rng(9)
     row, nav = filter_rows.row(kind, 0.0, 1.0), moving(0.0)
-    nav[:3] = 12.0, 9.0, -6.0
+    nav[NAV_POSITION] = 12.0, 9.0, -6.0
     A = rng.normal(size=(3, 3))
     cov = np.zeros((ERR, ERR))
     cov[:3, :3] = 0.3 * (A @ A.T)
-    value, *g = value_at(row, *nav[:3])
+    value, *g = value_at(row, *nav[NAV_POSITION])
     offsets = rng.multivariate_normal(np.zeros(3), cov[:3, :3], 20000)
-    exact = np.array([value_at(row, *(nav[:3] + d))[0] for d in offsets])
+    exact = np.array([value_at(row, *(nav[NAV_POSITION] + d))[0] for d in offsets])
     remainder = exact - value - offsets @ np.array(g)
     claimed = bend_variance(row, nav, cov)
     assert np.mean(remainder**2) < 3.0 * claimed

@@ -7,8 +7,8 @@ import pytest
 from netpos.filters import ekf
 from netpos.filters.conditioning import Robust, condition
 from netpos.filters.measurement import AXES, BLOCKED, GROUP, HEADING, KIND, ROW_WIDTH, VALUE, Kind
-from netpos.filters.space import CLOCK
 from netpos.filters.space_conditioning import condition_in_space
+from netpos.filters.state import ERR_BIASES, Err, Nav, X
 from netpos.inertial.strapdown import NAV
 from netpos.messages.values import Array
 
@@ -37,12 +37,12 @@ def test_in_the_plane_it_is_the_planar_one(weights: Robust, late: tuple[float, f
     A = 0.3 * rng.normal(size=(4, 4))
     P = A @ A.T + 0.2 * np.eye(4)  # place, offset, drift
     mean, cov = np.zeros(6), np.eye(6)
-    mean[4] = 55.0
-    place = np.ix_([0, 1, 4, 5], [0, 1, 4, 5])
+    mean[X.CLOCK] = 55.0
+    place = np.ix_(*[[X.PX, X.PY, X.CLOCK, X.DRIFT]] * 2)
     cov[place] = P
-    nav, wide = np.zeros(NAV + 2), np.zeros((CLOCK + 2, CLOCK + 2))
-    nav[9], nav[NAV] = 1.0, 55.0
-    there = np.ix_([0, 1, CLOCK, CLOCK + 1], [0, 1, CLOCK, CLOCK + 1])
+    nav, wide = np.zeros(NAV + 2), np.zeros((ERR_BIASES, ERR_BIASES))
+    nav[Nav.QW], nav[Nav.CLOCK] = 1.0, 55.0
+    there = np.ix_(*[[Err.PX, Err.PY, Err.CLOCK, Err.DRIFT]] * 2)
     wide[there] = P
     rows = rows_of(
         [(Kind.RANGE, 0.1), (Kind.TOA, 9.0), (Kind.RANGE, 4.0), (Kind.AZIMUTH, 0.2)], 55.0

@@ -11,6 +11,7 @@ import pytest
 from netpos.filters import sigma, srukf, ukf
 from netpos.filters.measurement import Kind
 from netpos.filters.motion import NO_BIAS, Model, Parameter, ProcessNoise, motion_parameters
+from netpos.filters.state import POSITION
 from netpos.messages.values import Array
 
 Maker = Callable[..., Array]
@@ -215,7 +216,7 @@ def test_ten_thousand_steps(row: Maker) -> None:
     np.testing.assert_allclose(L @ L.T, cov, rtol=1e-9, atol=1e-8)
     assert is_lower_factor(L)
     assert (np.diag(L) > 1e-4).all()
-    assert np.hypot(*(mean[:2] - p)) < 2.0
+    assert np.hypot(*(mean[POSITION] - p)) < 2.0
 
 
 def test_an_epoch_without_rows(row: Maker) -> None:

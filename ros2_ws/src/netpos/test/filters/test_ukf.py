@@ -10,6 +10,7 @@ import pytest
 from netpos.filters import sigma, ukf
 from netpos.filters.measurement import BIAS, KIND, ORIGIN, VALUE, Kind
 from netpos.filters.motion import NO_BIAS, Model, motion_parameters, noise, propagate
+from netpos.filters.state import X
 from netpos.messages.values import Array
 
 Maker = Callable[..., Array]
@@ -31,13 +32,13 @@ def textbook_points(mean: Array, cov: Array) -> tuple[Array, Array, Array]:
 
 def value_of(row: Array, x: Array) -> float:
     """Azimuth and range from unrotated RSUs, with the row's own bias."""
-    d = np.array([x[0], x[1], HEIGHT]) - row[ORIGIN : ORIGIN + 3]
+    d = np.array([x[X.PX], x[X.PY], HEIGHT]) - row[ORIGIN : ORIGIN + 3]
     kind = int(row[KIND])
     if kind == Kind.LINEAR:
         return float(row[ORIGIN : ORIGIN + 6] @ x[:6])
     value = math.atan2(d[1], d[0]) if kind == Kind.AZIMUTH else math.sqrt(d @ d)
     if kind == Kind.TOA:
-        value += x[4]
+        value += x[X.CLOCK]
     return value + (x[int(row[BIAS])] if row[BIAS] >= 0 else 0.0)
 
 
@@ -212,17 +213,17 @@ def test_what_is_known_exactly_stays(row: Maker) -> None:
     mean, cov = np.array([3.0, 4.0, 0, 0, 7, 0]), np.diag([4.0, 0, 1, 1, 0, 1])
     rows = np.array([row(Kind.RANGE, 6.0, 1.0)])
     ukf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1))
-    assert mean[1] == 4.0
-    assert mean[4] == 7.0
+    assert mean[X.PY] == 4.0
+    assert mean[X.CLOCK] == 7.0
     assert cov[1].tolist() == [0.0] * 6
     assert np.isfinite(cov).all()
-    assert 0.0 < cov[0, 0] < 4.0
+    assert 0.0 < cov[X.PX, X.PX] < 4.0
 
 
 def test_ill_conditioned_covariance_stays_definite(row: Maker) -> None:
     """P - K S K' turns negative here; the Joseph form does not."""
     mean, cov = np.zeros(6), np.diag([1e10, 1e10, 1.0, 1.0, 1e10, 1.0])
-    cov[0, 1] = cov[1, 0] = 1e10 * (1 - 1e-9)
+    cov[X.PX, X.PY] = cov[X.PY, X.PX] = 1e10 * (1 - 1e-9)
     rows = np.array(
         [
             row(Kind.LINEAR, 1.0, 1e-8, 0, h=(1, 0, 0, 0, 0, 0)),

@@ -10,6 +10,7 @@ from netpos.filters.measurement import (
     curvature_variance,
     linearise,
 )
+from netpos.filters.state import X
 from netpos.messages.values import Array
 
 
@@ -26,7 +27,7 @@ def range_problem(seed: int) -> tuple[Array, Array, Array]:
     rng = np.random.default_rng(seed)
     mean = np.array([10.0, 8.0, 1.0, 0.0, 0.0, 0.0]) + rng.normal(size=6) * 0.5
     cov = np.diag([30.0, 20.0, 1.0, 1.0, 1.0, 1.0])
-    cov[0, 2] = cov[2, 0] = 2.0
+    cov[X.PX, X.VX] = cov[X.VX, X.PX] = 2.0
     rows = np.array(
         [
             row(Kind.RANGE, 10.0, 0.01, 0, np.array([0.0, 0.0, 0.0])),

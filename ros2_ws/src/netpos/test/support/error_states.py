@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from netpos.filters.error_state import MEMORY, UNCONSTRAINED, Constraints, Imu, Sensors, advance
 from netpos.filters.space import innovation_at
+from netpos.filters.state import NAV_POSITION, NAV_QUATERNION, NAV_VELOCITY, Nav
 from netpos.inertial.strapdown import ERR, NAV, InertialNoise, rotation_of, still_earth
 from netpos.messages.values import Array
 from scipy.spatial.transform import Rotation
@@ -18,8 +19,11 @@ _SCALES = np.repeat([3.0, 1.0, 0.1, 0.01, 1e-3], 3)
 def vehicle(rng: np.random.Generator) -> tuple[Array, Array]:
     """A navigation state near the middle with correlated errors of some metres and degrees."""
     nav = np.zeros(NAV)
-    nav[:3], nav[3:6] = rng.normal(0.0, [5.0, 5.0, 1.0]), rng.normal(0.0, [5.0, 5.0, 0.5])
-    nav[6:10] = Rotation.from_euler("ZYX", rng.normal(0.0, [1.5, 0.05, 0.05])).as_quat()
+    nav[NAV_POSITION], nav[NAV_VELOCITY] = (
+        rng.normal(0.0, [5.0, 5.0, 1.0]),
+        rng.normal(0.0, [5.0, 5.0, 0.5]),
+    )
+    nav[NAV_QUATERNION] = Rotation.from_euler("ZYX", rng.normal(0.0, [1.5, 0.05, 0.05])).as_quat()
     A = rng.normal(size=(ERR, ERR)) / 4.0
     return nav, (A @ A.T + 0.3 * np.eye(ERR)) * np.outer(_SCALES, _SCALES)
 
@@ -27,14 +31,14 @@ def vehicle(rng: np.random.Generator) -> tuple[Array, Array]:
 def moving(speed: float) -> Array:
     """A level vehicle at the origin, along x."""
     nav = np.zeros(NAV)
-    nav[3], nav[9] = speed, 1.0
+    nav[Nav.VX], nav[Nav.QW] = speed, 1.0
     return nav
 
 
 def linearised(rows: Array, nav: Array) -> tuple[Array, Array]:
     """Innovations (m,) of rows and their Jacobian (m, ERR)."""
     C, H = np.empty((3, 3)), np.empty((len(rows), ERR))
-    rotation_of(nav[6:10], C)
+    rotation_of(nav[NAV_QUATERNION], C)
     return np.array([innovation_at(r, nav, C, h) for r, h in zip(rows, H, strict=True)]), H
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from filter_rows import row
 from netpos.filters.measurement import AXES, COMMON, HEADING, KIND, LEVER, ORIGIN, Kind
 from netpos.filters.rows import rsu_axes
+from netpos.filters.state import POSITION, X
 from netpos.messages.values import AngleConvention, Array, RsuInfo
 from scipy.spatial.transform import Rotation
 
@@ -38,9 +39,9 @@ def closed_form(row: Array, x: Array, height_m: float) -> float:
     """h written with SciPy and NumPy only."""
     if row[KIND] == Kind.STEP_VELOCITY:
         turn = Rotation.from_euler("z", x[8])
-        reported = turn.inv().apply([x[2], x[3], 0.0])[:2] / np.exp(x[6])
+        reported = turn.inv().apply([x[X.VX], x[X.VY], 0.0])[:2] / np.exp(x[6])
         return float(row[ORIGIN + 2 : ORIGIN + 4] @ reported)
-    antenna = np.append(x[:2], height_m + row[LEVER + 2])
+    antenna = np.append(x[POSITION], height_m + row[LEVER + 2])
     if row[HEADING] >= 0:
         turn = Rotation.from_euler("z", x[int(row[HEADING])])
         antenna += turn.apply([row[LEVER], row[LEVER + 1], 0.0])
@@ -50,10 +51,10 @@ def closed_form(row: Array, x: Array, height_m: float) -> float:
     value = {
         Kind.AZIMUTH: lambda: np.arctan2(uy, ux),
         Kind.ELEVATION: lambda: np.arcsin(uz / r),
-        Kind.TOA: lambda: r + x[4],
+        Kind.TOA: lambda: r + x[X.CLOCK],
         Kind.RANGE: lambda: r,
         Kind.LINEAR: lambda: row[ORIGIN : ORIGIN + 6] @ [*antenna[:2], *x[2:6]],
-        Kind.SPEED: lambda: abs(complex(x[2], x[3])),
+        Kind.SPEED: lambda: abs(complex(x[X.VX], x[X.VY])),
         Kind.COSINE_Y: lambda: uy / r,
         Kind.COSINE_Z: lambda: uz / r,
         Kind.PHASE: lambda: ux / r,  # an array of one radian along the x axis

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from netpos.filters.state import POSITION
 from netpos.messages.values import Array, InitialPose
 from netpos.tracking import TrackOutput
 
@@ -31,4 +32,4 @@ def pose(t_s: float, x: float, y: float, var: float = 1.0) -> InitialPose:
 def error(output: TrackOutput, truth: Array) -> float:
     """Distance of the published position from the truth."""
     assert output.odometry is not None
-    return float(np.linalg.norm(output.odometry.position[:2] - truth[:2]))
+    return float(np.linalg.norm(output.odometry.position[:2] - truth[POSITION]))

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking import Tracker, TrackerConfig, TrackOutput
 from scipy.constants import speed_of_light
@@ -47,7 +48,7 @@ class World:
         chosen = list(names or self.rsus)
         for name in chosen:
             noise = self.rng.normal(size=5) if self.rng is not None else np.zeros(5)
-            d = state[:2] - self.rsus[name].position[:2]
+            d = state[POSITION] - self.rsus[name].position[:2]
             r = math.hypot(*d) + self.biases.get(name, 0.0)
             values: dict[str, Any] = {
                 "stamp_ns": T0_NS + round(t_s * 1e9),
@@ -57,11 +58,11 @@ class World:
                 "fields": fields,
                 "azimuth_rad": math.atan2(d[1], d[0]) + self.angle_sd * noise[0],
                 "azimuth_var": self.angle_sd**2,
-                "toa_s": (r + state[4] + self.range_sd * noise[1]) / speed_of_light,
+                "toa_s": (r + state[X.CLOCK] + self.range_sd * noise[1]) / speed_of_light,
                 "toa_var": (self.range_sd / speed_of_light) ** 2,
                 "range_m": abs(r + self.range_sd * noise[2]),
                 "range_var": self.range_sd**2,
-                "position": np.array([*(state[:2] + self.range_sd * noise[3:]), 0.0]),
+                "position": np.array([*(state[POSITION] + self.range_sd * noise[3:]), 0.0]),
                 "position_cov": np.eye(3) * self.range_sd**2,
             }
             out.append(RsuMeasurement(**(values | change)))

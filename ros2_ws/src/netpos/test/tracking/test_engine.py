@@ -19,6 +19,7 @@ from netpos.filters.measurement import (
 )
 from netpos.filters.motion import NO_BIAS, SPEED_OF_LIGHT_MPS, Parameter, noise
 from netpos.filters.rows import rsu_axes, rsu_rows
+from netpos.filters.state import POSITION, VELOCITY, X
 from netpos.messages.values import Array, Field, InitialPose, RsuInfo, RsuMeasurement
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking import Tracker, TrackerConfig, engine
@@ -36,7 +37,7 @@ def rows_of(state: Array, rng: np.random.Generator, wrong: tuple[int, ...] = ())
     """Azimuth and TOA of three RSUs; those in ``wrong`` are 1 rad off."""
     blocks = []
     for group, info in enumerate(STATIONS):
-        d = state[:2] - info.position[:2]
+        d = state[POSITION] - info.position[:2]
         m = RsuMeasurement(
             stamp_ns=1,
             rsu_id=info.rsu_id,
@@ -44,7 +45,7 @@ def rows_of(state: Array, rng: np.random.Generator, wrong: tuple[int, ...] = ())
             fields=Field.AZIMUTH | Field.TOA,
             azimuth_rad=math.atan2(d[1], d[0]) + 0.01 * rng.normal() + (group in wrong),
             azimuth_var=1e-4,
-            toa_s=(math.hypot(*d, 4.0) + state[4] + 0.3 * rng.normal()) / SPEED_OF_LIGHT_MPS,
+            toa_s=(math.hypot(*d, 4.0) + state[X.CLOCK] + 0.3 * rng.normal()) / SPEED_OF_LIGHT_MPS,
             toa_var=(0.3 / SPEED_OF_LIGHT_MPS) ** 2,
         )
         blocks.append(rsu_rows(m, info, rsu_axes(info), group))
@@ -61,7 +62,7 @@ def turned(mean: Array, cov: Array, rows: Array, unheard_s: float, options: Arra
     sd = options[Option.MANOEUVRE_SPEED]
     noticed_s = math.sqrt(options[GATE + 2] / (np.trace(information) / 2.0)) / sd
     within_s = max(unheard_s, 2.0 * noticed_s)
-    if sd**2 <= np.trace(cov[2:4, 2:4]) / 2.0:  # no manoeuvre
+    if sd**2 <= np.trace(cov[VELOCITY, VELOCITY]) / 2.0:  # no manoeuvre
         within_s = unheard_s
     nodes, weights = np.polynomial.legendre.leggauss(3)
     times = within_s * (nodes + 1.0) / 2.0
@@ -163,7 +164,7 @@ def test_step_follows_the_rules(filter_name: str, name: str) -> None:
     mean, cov = start()
     cov *= 0.01
     truth = mean.copy()
-    truth[:2] += [0.8, moved]
+    truth[POSITION] += [0.8, moved]
     rows = rows_of(truth, np.random.default_rng(3), wrong)
     kept = rows.copy()
     own = motion.copy()  # the step notes there which velocity step it allowed for
@@ -194,9 +195,9 @@ def drive(epochs: int = 60) -> tuple[Array, Array, Array]:
     stamps, starts, blocks = [], [0], []
     for k in range(epochs):
         stamps.append(1_000_000_000 + 100_000_000 * k)
-        state[0] += 0.8
+        state[X.PX] += 0.8
         if k == 30:
-            state[1] += 6.0
+            state[X.PY] += 6.0
         wrong = (1,) if k % 7 == 3 else ()
         rows = rows_of(state, rng, wrong) if k % 11 else np.zeros((0, ROW_WIDTH))
         blocks.append(rows)
@@ -334,10 +335,10 @@ def test_a_run_equals_the_tracker(metis: Any, name: str, rtol: float) -> None:
     assert [o.status.nis_dof for o in outputs] == dof.tolist()
     c = SPEED_OF_LIGHT_MPS
     compared = [
-        ([o.odometry.position[:2] for o in outputs], means[:, :2]),
-        ([o.odometry.pose_cov[:2, :2] for o in outputs], covs[:, :2, :2]),
+        ([o.odometry.position[:2] for o in outputs], means[:, POSITION]),
+        ([o.odometry.pose_cov[:2, :2] for o in outputs], covs[:, POSITION, POSITION]),
         ([o.status.nis for o in outputs], nis),
-        ([o.clock.offset_s for o in outputs], means[:, 4] / c),
+        ([o.clock.offset_s for o in outputs], means[:, X.CLOCK] / c),
         ([tracker._tracks[pose.vue_id]._state.estimate.mean], means[-1:]),
         ([tracker._tracks[pose.vue_id]._state.estimate.cov], covs[-1:]),
     ]

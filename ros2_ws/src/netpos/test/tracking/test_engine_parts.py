@@ -12,6 +12,7 @@ from netpos.filters import ekf, srukf
 from netpos.filters.measurement import GATE_VARIANCE, VARIANCE
 from netpos.filters.motion import NO_BIAS, noise
 from netpos.filters.rows import linear_rows
+from netpos.filters.state import POSITION
 from netpos.tracking import TrackerConfig, engine
 from netpos.tracking.models import motions_of, options_of
 from scipy.stats import chi2
@@ -132,13 +133,13 @@ def test_predict_does_nothing_for_no_time(name: str) -> None:
 def test_every_filter_applies_what_is_linear_alike(name: str) -> None:
     """Two fixes, the second 100 m off: the information form of the first."""
     options, (prior, cov) = options_of(TrackerConfig(filter=name)), start()
-    R, fix = np.diag([0.25, 0.16]), prior[:2] + np.array([0.8, -0.5])
+    R, fix = np.diag([0.25, 0.16]), prior[POSITION] + np.array([0.8, -0.5])
     rows = np.vstack([linear_rows(fix, R, H, 0), linear_rows(fix + 100.0, R, H, 1)])
     x, S, accepted = prior.copy(), engine.to_spread(cov, options), np.full(2, 9.0)
     nis, used = engine.update(x, S, rows, options, accepted, ekf.workspace(6, 4))
     assert accepted.tolist() == [1.0, 0.0]
-    residual, information = fix - prior[:2], np.linalg.inv(cov)
-    expected = residual @ np.linalg.solve(cov[:2, :2] + R, residual)
+    residual, information = fix - prior[POSITION], np.linalg.inv(cov)
+    expected = residual @ np.linalg.solve(cov[POSITION, POSITION] + R, residual)
     assert (nis, used) == (pytest.approx(expected, rel=1e-7), 2)
     posterior = np.linalg.inv(information + H.T @ np.linalg.inv(R) @ H)
     expected_mean = prior + posterior @ H.T @ np.linalg.solve(R, residual)
@@ -181,9 +182,9 @@ def test_rows_are_weighed_by_what_is_carried(name: str) -> None:
     """Huber's factor of a fix 9 m and 7 m off, under the covariance of either filter."""
     options = options_of(TrackerConfig(filter=name, robust="huber", robust_parameter=1.5))
     (mean, cov), R, off = start(), np.diag([0.25, 0.16]), np.array([9.0, -7.0])
-    rows = linear_rows(mean[:2] + off, R, H, 0)
+    rows = linear_rows(mean[POSITION] + off, R, H, 0)
     S, work = engine.to_spread(cov, options), ekf.workspace(6, 2)
     engine.condition(mean, S, rows, options, work)
-    factor = math.sqrt(off @ np.linalg.solve(cov[:2, :2] + R, off) / 2.0) / 1.5
+    factor = math.sqrt(off @ np.linalg.solve(cov[POSITION, POSITION] + R, off) / 2.0) / 1.5
     assert factor > 2.0
     np.testing.assert_allclose(rows[:, [VARIANCE, GATE_VARIANCE]], factor, rtol=1e-9)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from netpos.filters.motion import NO_BIAS
 from netpos.filters.rows import linear_rows
+from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array, Field, GroundSpeed, ImuSample
 from netpos.tracking import TrackerConfig, TrackOutput, estimates
 from netpos.tracking.models import motions_of
@@ -118,7 +119,7 @@ def test_filterpy_says_the_same(world: Any, name: str, model: str) -> None:
             if o.odometry is not None:
                 parts = [o.odometry.position[:2], o.odometry.linear_velocity[:2]]
                 covs = (o.odometry.pose_cov, o.odometry.twist_cov)
-                parts += [cov[:2, :2].ravel() for cov in covs]
+                parts += [cov[POSITION, POSITION].ravel() for cov in covs]
                 parts += [[o.clock.offset_s * 3e8], o.clock.cov.ravel() * 9e16]
                 rows.append(np.concatenate([*parts, [o.status.nis, o.status.nis_dof]]))
         found[backend] = np.array(rows), outputs[-1].status
@@ -213,7 +214,7 @@ def test_step_keeps_the_prediction_and_what_it_accepted(name: str) -> None:
     assert 0.0 <= nis < 1.0
     np.testing.assert_allclose(estimate.prior[0], ahead.mean, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(estimate.prior[1], ahead.cov, rtol=1e-12, atol=1e-15)
-    assert estimate.cov[0, 0] < 0.3 < ahead.cov[0, 0]
+    assert estimate.cov[X.PX, X.PX] < 0.3 < ahead.cov[X.PX, X.PX]
     # nothing accepted: the prediction it is
     refused = started(name)
     assert refused.step(T0 + 10**9, 1.0, 0, fix(900.0, 6.0), NO_BIAS)[1:] == (0, [0.0])
@@ -228,7 +229,7 @@ def test_many_rows_need_no_warning() -> None:
     rows[:, 6] = np.repeat(np.arange(30), 2)
     _, dof, accepted = estimate.step(T0, 0.0, 0, rows, NO_BIAS)
     assert (dof, accepted.sum()) == (60, 30)
-    assert estimate.cov[0, 0] == pytest.approx(1.0 / (1.0 + 30 / 0.25))
+    assert estimate.cov[X.PX, X.PX] == pytest.approx(1.0 / (1.0 + 30 / 0.25))
     _, dof, accepted = estimate.step(T0, 0.0, 0, fix(1.0, 2.0), NO_BIAS)
     assert (dof, accepted.tolist()) == (2, [1.0])
 

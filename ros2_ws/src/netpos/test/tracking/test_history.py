@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from netpos.filters.state import POSITION
 from netpos.messages.values import (
     Array,
     Field,
@@ -62,7 +63,7 @@ def drive(world: Any, seed: int, seconds: float = 5.0) -> list[Any]:
         state = truth(t)
         jumped = 1.0 <= t < 1.45
         if jumped:
-            state[:2] += 250.0  # nobody believes it
+            state[POSITION] += 250.0  # nobody believes it
         names = [n for n in "abc" if rng.random() < 0.9] or ["a"]
         found = world.measure(t, state, Field.AZIMUTH | Field.TOA, names)
         if rng.random() < 0.15 and t > 0.5:

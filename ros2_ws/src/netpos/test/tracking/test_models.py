@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from netpos.filters.motion import Model, Parameter, ProcessNoise
+from netpos.filters.state import POSITION
 from netpos.tracking.config import FILTERS, ROBUST, TrackerConfig
 from netpos.tracking.engine import GATE, GATE_SIZE, Filter, Option
 from netpos.tracking.models import (
@@ -154,7 +155,7 @@ def test_pose_state_is_that_of_the_paper() -> None:
     mean, P = pose_state(config, np.array([3.0, -4.0]), cov)
     c = speed_of_light
     np.testing.assert_allclose(mean, [3.0, -4.0, 0.0, 0.0, 0.0, 1e-6 * c])
-    np.testing.assert_array_equal(P[:2, :2], cov)
+    np.testing.assert_array_equal(P[POSITION, POSITION], cov)
     np.testing.assert_allclose(np.diag(P)[2:], [16.0, 16.0, (1e-5 * c) ** 2, (30e-6 * c) ** 2])
     assert np.count_nonzero(P) == 8
 

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from netpos.filters.state import CLOCK_DRIFT, POSITION, VELOCITY, X
 from netpos.messages.values import Array, TrackState
 from netpos.tracking import TrackerConfig, output
 from netpos.tracking.protection import protection_level
@@ -33,14 +34,14 @@ def test_heading_variance_by_differences(velocity: tuple[float, float]) -> None:
         ahead, back = np.array(velocity) + step, np.array(velocity) - step
         turn = math.atan2(ahead[1], ahead[0]) - math.atan2(back[1], back[0])
         gradient[i] = math.remainder(turn, 2 * math.pi) / (2 * eps)
-    assert variance == pytest.approx(gradient @ cov[2:4, 2:4] @ gradient, rel=1e-6)
+    assert variance == pytest.approx(gradient @ cov[VELOCITY, VELOCITY] @ gradient, rel=1e-6)
 
 
 def test_heading_variance_by_sampling() -> None:
     rng = np.random.default_rng(3)
     cov = np.eye(6)
-    cov[2:4, 2:4] = [[0.04, 0.01], [0.01, 0.09]]
-    v = rng.multivariate_normal([6.0, 3.0], cov[2:4, 2:4], size=200_000)
+    cov[VELOCITY, VELOCITY] = [[0.04, 0.01], [0.01, 0.09]]
+    v = rng.multivariate_normal([6.0, 3.0], cov[VELOCITY, VELOCITY], size=200_000)
     _, variance = output.heading(state(6.0, 3.0)[:6], cov, 0.0)
     assert variance == pytest.approx(np.arctan2(v[:, 1], v[:, 0]).var(), rel=0.02)
 
@@ -73,9 +74,9 @@ def test_odometry(yaw: float) -> None:
     np.testing.assert_array_equal(odometry.angular_velocity, 0.0)
     back = turn.as_matrix()[:2, :2]
     np.testing.assert_allclose(
-        back @ odometry.twist_cov[:2, :2] @ back.T, cov[2:4, 2:4], atol=1e-12
+        back @ odometry.twist_cov[:2, :2] @ back.T, cov[VELOCITY, VELOCITY], atol=1e-12
     )
-    np.testing.assert_array_equal(odometry.pose_cov[:2, :2], cov[:2, :2])
+    np.testing.assert_array_equal(odometry.pose_cov[:2, :2], cov[POSITION, POSITION])
     assert odometry.pose_cov[5, 5] == 0.02
 
 
@@ -98,16 +99,18 @@ def test_moving_along_the_heading_is_forward() -> None:
 
 def test_clock_state_in_seconds() -> None:
     cov = spd(4)
-    clock = output.clock_state(77, "vue_9", state(0.0, 0.0)[4:6], cov[4:6, 4:6])
+    clock = output.clock_state(77, "vue_9", state(0.0, 0.0)[4:6], cov[CLOCK_DRIFT, CLOCK_DRIFT])
     assert (clock.stamp_ns, clock.vue_id) == (77, "vue_9")
     assert clock.offset_s == pytest.approx(30.0 / speed_of_light, rel=1e-14)
     assert clock.drift == pytest.approx(0.5 / speed_of_light, rel=1e-14)
-    np.testing.assert_allclose(clock.cov, cov[4:6, 4:6] / speed_of_light**2, rtol=1e-14)
+    np.testing.assert_allclose(
+        clock.cov, cov[CLOCK_DRIFT, CLOCK_DRIFT] / speed_of_light**2, rtol=1e-14
+    )
 
 
 def test_largest_sd() -> None:
     cov = spd(5)
-    expected = math.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1])
+    expected = math.sqrt(np.linalg.eigvalsh(cov[POSITION, POSITION])[-1])
     assert output.largest_sd(cov) == pytest.approx(expected, rel=1e-12)
     assert output.largest_sd(np.zeros((6, 6))) == 0.0
     assert output.largest_sd(-np.eye(6)) == 0.0  # rounding below a covariance of zero
@@ -148,15 +151,15 @@ def test_all_of_a_track_in_one_go(velocity: tuple[float, float], heading: int) -
         np.testing.assert_allclose(getattr(said, name), getattr(expected, name), atol=1e-14)
     np.testing.assert_allclose(said.pose_cov, expected.pose_cov, rtol=1e-12)
     np.testing.assert_allclose(said.twist_cov, expected.twist_cov, rtol=1e-12)
-    told = output.clock_state(7, "v", mean[4:6], cov[4:6, 4:6])
+    told = output.clock_state(7, "v", mean[CLOCK_DRIFT], cov[CLOCK_DRIFT, CLOCK_DRIFT])
     assert (clock.offset_s, clock.drift) == (told.offset_s, told.drift)
     np.testing.assert_allclose(clock.cov, told.cov, rtol=1e-14)
     assert sd_m == output.largest_sd(cov)
-    assert radius_m == protection_level(cov[:2, :2], 1e-3)
+    assert radius_m == protection_level(cov[POSITION, POSITION], 1e-3)
 
 
 def test_a_covariance_that_is_none_is_not_described() -> None:
     cov = np.eye(6)
-    cov[0, 1] = cov[1, 0] = 1.5
+    cov[X.PX, X.PY] = cov[X.PY, X.PX] = 1.5
     with pytest.raises(ValueError, match="covariance"):
         output.describe(7, "v", np.ones(6), cov, 1.5, 0.0, -1, 1e-4)

@@ -19,6 +19,7 @@ from netpos.filters.measurement import (
     predict_row,
 )
 from netpos.filters.rows import rsu_axes, rsu_rows
+from netpos.filters.state import POSITION, VELOCITY
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.phase_fix import (
     admissible,
@@ -200,8 +201,8 @@ def test_spawn_opens_the_velocity_and_keeps_the_rest() -> None:
     np.testing.assert_allclose(mean, [*xy, 0.0, 0.0, 4.0, 5.0, 6.0, 7.0], atol=1e-9)
     np.testing.assert_array_equal(cov[4:, 4:], rest)
     np.testing.assert_array_equal(cov[:4, 4:], 0.0)
-    np.testing.assert_array_equal(cov[2:4, 2:4], 2.25 * np.eye(2))
-    assert area == pytest.approx(0.5 * math.log(np.linalg.det(cov[:2, :2])))
+    np.testing.assert_array_equal(cov[VELOCITY, VELOCITY], 2.25 * np.eye(2))
+    assert area == pytest.approx(0.5 * math.log(np.linalg.det(cov[POSITION, POSITION])))
     before = mean.copy()
     assert spawn(mean, cov, rows[0], rows[1], 9, 1.5, HEIGHT) == -math.inf
     np.testing.assert_array_equal(mean, before)

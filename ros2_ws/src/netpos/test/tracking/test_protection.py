@@ -21,6 +21,7 @@ from netpos.filters.measurement import (
     linearise,
 )
 from netpos.filters.rows import linear_rows, rsu_axes, rsu_rows
+from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking import TrackerConfig
 from netpos.tracking.engine import GATE, Option
@@ -89,7 +90,7 @@ def test_limits(risk: float) -> None:
 def test_no_radius_exceeds_that_of_a_circle(risk: float) -> None:
     for ratio in (1.0, 0.5, 0.0):
         cov = rotated(3.0, 3.0 * ratio, 0.7)
-        sides = cov[0, 0], cov[0, 1], cov[1, 1], risk
+        sides = cov[X.PX, X.PX], cov[X.PX, X.PY], cov[X.PY, X.PY], risk
         assert radius_limit(*sides) == pytest.approx(3.0 * math.sqrt(-2.0 * math.log(risk)))
         assert gaussian_radius(*sides) <= radius_limit(*sides) * (1.0 + 1e-12)
 
@@ -226,7 +227,7 @@ def azimuth_row(x: float, y: float, sd_rad: float, mean: Array) -> Array:
         rsu_id="a",
         vue_id="vue_1",
         fields=Field.AZIMUTH,
-        azimuth_rad=math.atan2(mean[1] - y, mean[0] - x),
+        azimuth_rad=math.atan2(mean[X.PY] - y, mean[X.PX] - x),
         azimuth_var=sd_rad**2,
     )
     return rsu_rows(m, info, rsu_axes(info), 0)
@@ -277,8 +278,10 @@ def test_level_of_a_manoeuvre_is_a_second_answer_and_how_far_it_is(unheard_s: fl
         wide[p + 2, p] += 16.0 * within_s / 2.0
         wide[p + 2, p + 2] += 16.0
     K = wide[:, :2] @ np.linalg.inv(wide[:2, :2] + R)
-    x, P = prior + K @ (fix - prior[:2]), wide - K @ wide[:2]
-    expected = np.linalg.norm(x[:2] - mean[:2]) + protection_level(P[:2, :2], 1e-4)
+    x, P = prior + K @ (fix - prior[POSITION]), wide - K @ wide[:2]
+    expected = np.linalg.norm(x[POSITION] - mean[POSITION]) + protection_level(
+        P[POSITION, POSITION], 1e-4
+    )
     level = manoeuvre_level(prior, cov, rows, accepted, unheard_s, mean, options(), 1e-4)
     assert level == pytest.approx(expected, rel=1e-6)
 
@@ -293,7 +296,7 @@ def test_level_of_a_manoeuvre_with_biases_that_tell_nothing() -> None:
         mean, P = np.zeros(n), np.zeros((n, n))
         mean[:6], P[:6, :6] = prior, cov
         state = mean.copy()
-        state[:2] += 0.7, -0.4
+        state[POSITION] += 0.7, -0.4
         args = (mean, P, rows, np.ones(2), 0.3, state, options(), 1e-4)
         levels.append(manoeuvre_level(*args))
         assert np.array_equal(mean[:6], prior)
@@ -326,7 +329,9 @@ def test_level_of_a_manoeuvre_is_linearised_at_its_own_answer() -> None:
         P = wide - wide @ H.T @ np.linalg.solve(S, H @ wide)
         bent = np.array([curvature_variance(row, x, P, height_m) for row in used])
     assert (bent[1:] > 0.01 * used[1:, VARIANCE]).all()
-    expected = np.linalg.norm(x[:2] - mean[:2]) + protection_level(P[:2, :2], 1e-4)
+    expected = np.linalg.norm(x[POSITION] - mean[POSITION]) + protection_level(
+        P[POSITION, POSITION], 1e-4
+    )
     level = manoeuvre_level(prior, cov, rows, accepted, 0.1, mean, said, 1e-4)
     assert level == pytest.approx(expected, rel=1e-9)
 
@@ -337,7 +342,7 @@ def test_a_manoeuvre_nobody_could_notice() -> None:
     row = azimuth_row(0.0, 0.0, 0.01, mean)
     level = manoeuvre_level(mean, np.eye(6), row, accepted, 0.1, mean, options(), 1e-4)
     assert math.isinf(level)
-    fix = linear_rows(mean[:2], np.eye(2), np.eye(2, 6), 0)
+    fix = linear_rows(mean[POSITION], np.eye(2), np.eye(2, 6), 0)
     for probability, finite in ((1.0, False), (0.9999, True)):
         level = manoeuvre_level(
             mean, np.eye(6), fix, accepted, 0.1, mean, options(probability), 1e-4
@@ -362,9 +367,9 @@ def test_fits_and_level_in_one_go(speed: float) -> None:
 def test_nothing_is_told_of_what_is_not_sound(where: str) -> None:
     mean, cov, fits = np.zeros(6), np.eye(6), np.full((1, 2), 7.0)
     if where == "mean":
-        mean[0] = np.nan
+        mean[X.PX] = np.nan
     else:
-        cov[1, 1] = -1.0
+        cov[X.PY, X.PY] = -1.0
     row = azimuth_row(-50.0, 0.0, 0.05, np.zeros(6))
     args = (np.zeros(6), np.eye(6), row, np.ones(1), 0.1, mean, cov, options(), 1e-4, fits)
     assert math.isnan(fits_and_level(*args))

@@ -22,6 +22,7 @@ from antenna_square import (
 )
 from netpos.filters.measurement import HEADING, LEVER, linearise
 from netpos.filters.rows import Coupling, rsu_axes, rsu_rows
+from netpos.filters.state import POSITION
 from netpos.messages.values import (
     AngleConvention,
     Array,
@@ -121,11 +122,13 @@ def test_a_position_fix_is_that_of_the_antenna(yaw: float) -> None:
     assert np.abs(H[:, 6]).max() > 0.1
     c, s = math.cos(yaw), math.sin(yaw)
     off = m.position[:2] - (6.0 + 1.5 * c + 0.7 * s, 5.0 + 1.5 * s - 0.7 * c)
-    assert innovation @ innovation == pytest.approx(off @ np.linalg.solve(cov[:2, :2], off))
+    assert innovation @ innovation == pytest.approx(
+        off @ np.linalg.solve(cov[POSITION, POSITION], off)
+    )
     planar = rsu_rows(m, info, rsu_axes(info), 0)  # no heading: the fix is the device's
-    off = m.position[:2] - mean[:2]
+    off = m.position[:2] - mean[POSITION]
     bare = linearise(planar, mean, 1.2)[0]
-    assert bare @ bare == pytest.approx(off @ np.linalg.solve(cov[:2, :2], off))
+    assert bare @ bare == pytest.approx(off @ np.linalg.solve(cov[POSITION, POSITION], off))
 
 
 @pytest.mark.parametrize("filter_name", ["ekf", "iekf", "ukf", "srukf", "kf"])
@@ -204,7 +207,7 @@ def test_position_and_heading_errors_are_as_large_as_promised(feed: Any) -> None
         assert report.odometry is not None
         cov = report.odometry.pose_cov
         d = report.odometry.position[:2] - path(t)[:2]
-        total += float(d @ np.linalg.solve(cov[:2, :2], d))
+        total += float(d @ np.linalg.solve(cov[POSITION, POSITION], d))
         total_heading += heading_error(path, t, report.odometry) ** 2 / cov[5, 5]
     assert chi2.ppf(0.001, 2 * runs) < total < chi2.ppf(0.999, 2 * runs)
     assert chi2.ppf(0.001, runs) < total_heading < chi2.ppf(0.999, runs)

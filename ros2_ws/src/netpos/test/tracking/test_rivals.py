@@ -12,6 +12,7 @@ from netpos.filters.manoeuvre import unnoticed_s
 from netpos.filters.measurement import GROUP
 from netpos.filters.motion import Model, Parameter
 from netpos.filters.rows import linear_rows
+from netpos.filters.state import X
 from netpos.messages.values import Array
 from netpos.tracking import TrackerConfig
 from netpos.tracking import rivals as rivals_module
@@ -113,7 +114,7 @@ class Plain:
             x, P, odds = rival
             share = RISK / min(math.exp(odds), 1.0)
             if share < 0.5:
-                own = gaussian_radius(P[0, 0], P[0, 1], P[1, 1], share)
+                own = gaussian_radius(P[X.PX, X.PX], P[X.PX, X.PY], P[X.PY, X.PY], share)
                 radius = max(radius, math.hypot(*(x - middle)[:2]) + own)
         return float(radius)
 
@@ -236,7 +237,7 @@ def test_the_rival_that_has_won_is_reported() -> None:
     assert cov is estimate.cov
     _turned(estimate, rivals, 0.8, range(3, 60))
     mean, cov = rivals.reported(5_900_000_000, estimate, NO_BIAS)
-    assert mean[0] == pytest.approx(0.8 - 0.3 * mean[4], abs=0.05)
+    assert mean[X.PX] == pytest.approx(0.8 - 0.3 * mean[X.CLOCK], abs=0.05)
     later, wider = rivals.reported(6_900_000_000, estimate, NO_BIAS)
     ekf.predict(mean, cov, 1.0, MOTION.copy(), NO_BIAS)
     np.testing.assert_allclose(later, mean)

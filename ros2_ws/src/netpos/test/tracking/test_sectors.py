@@ -25,6 +25,7 @@ from anchor_walk import (
     wrap,
 )
 from netpos.filters.rows import rsu_axes, rsu_rows
+from netpos.filters.state import POSITION
 from netpos.messages.values import (
     Field,
     InitialPose,
@@ -148,7 +149,7 @@ def test_half_a_wavelength_needs_no_decision() -> None:
     bank = Sectors.begin(config, T0, rows, 1, pose_state(config, np.zeros(2), np.eye(2)))
     assert bank is not None
     assert bank.decided
-    assert np.hypot(*(bank.mean[:2] - xy[0])) < 0.1
+    assert np.hypot(*(bank.mean[POSITION] - xy[0])) < 0.1
 
 
 STEADY = {"steady_accel_density_mps2_sqrthz": 0.05}

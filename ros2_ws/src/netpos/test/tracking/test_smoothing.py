@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array, Odometry, RsuMeasurement
 from netpos.tracking import Tracker, TrackerConfig
 from netpos.tracking.smoothing import FixedLag, Posterior, Smoother
@@ -23,7 +24,9 @@ def drive(world: Any, seed: int) -> tuple[dict[int, Array], list[list[RsuMeasure
     truth, epochs = {}, []
     for k in range(1, EPOCHS + 1):
         noise = rng.normal(size=6) * math.sqrt(STEP_S) * np.array([0, 0, 0.5, 0.5, 0.03, 0.3])
-        state = state + STEP_S * np.array([state[2], state[3], 0, 0, state[5], 0]) + noise
+        state = (
+            state + STEP_S * np.array([state[X.VX], state[X.VY], 0, 0, state[X.DRIFT], 0]) + noise
+        )
         measured = world.measure(k * STEP_S, state)
         truth[measured[0].stamp_ns] = state.copy()
         epochs.append(measured)
@@ -55,13 +58,13 @@ def run(world: Any, epochs: list[list[RsuMeasurement]], **change: Any) -> tuple[
 
 def squared_errors(odometry: list[Odometry], truth: dict[int, Array]) -> Array:
     found = [o for o in odometry if o.stamp_ns in truth]
-    return np.array([np.sum((o.position[:2] - truth[o.stamp_ns][:2]) ** 2) for o in found])
+    return np.array([np.sum((o.position[:2] - truth[o.stamp_ns][POSITION]) ** 2) for o in found])
 
 
 def nees(odometry: list[Odometry], truth: dict[int, Array]) -> Array:
     values = []
     for o in odometry:
-        d = o.position[:2] - truth[o.stamp_ns][:2]
+        d = o.position[:2] - truth[o.stamp_ns][POSITION]
         values.append(d @ np.linalg.solve(o.pose_cov[:2, :2], d))
     return np.array(values)
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from netpos.filters.state import X
 from netpos.tracking import Tracker
 from street_run import epochs, fed, ran, truth
 
@@ -121,9 +122,9 @@ def test_a_gap_inflates_the_covariance_and_no_more(world: Any, name: str) -> Non
         ahead.predict(T0 + round((1.9 + gap_s) * 1e9), track._state.bias)
         np.linalg.cholesky(ahead.cov)
         assert np.isfinite(ahead.mean).all()
-        assert ahead.cov[0, 0] > before[0, 0]
+        assert ahead.cov[X.PX, X.PX] > before[0, 0]
         # white acceleration, a lost velocity, no more than a turning, braking car could do
-        grown = math.sqrt(ahead.cov[0, 0])
+        grown = math.sqrt(ahead.cov[X.PX, X.PX])
         assert 0.1 < grown < 40.0 * gap_s**1.5 + 1.0
         (output,) = [
             *fed(tracker, world.measure(1.9 + gap_s, truth(1.9))),

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from netpos.filters.measurement import BIAS, COMMON, KIND, Kind
+from netpos.filters.state import POSITION, VELOCITY
 from netpos.messages.values import Array, Field, StepCalibration, Velocity
 from netpos.tracking import TrackerConfig
 from netpos.tracking.batch import batch_of
@@ -60,11 +61,11 @@ def test_factor_and_offset_are_found_within_their_sd(world: Any, feed: Any) -> N
         x = np.array([60.0, 0.0, 1.0, 1.0, 0.0, 0.0])
         tracker = world.tracker(**WALK, **SDS)
         for i in range(1, 45):
-            x[:2] += STEP_S * x[2:4]
+            x[POSITION] += STEP_S * x[VELOCITY]
             jolt = density * root @ rng.normal(size=(2, 2))
-            x[:2], x[2:4] = x[:2] + jolt[0], x[2:4] + jolt[1]
+            x[POSITION], x[VELOCITY] = x[POSITION] + jolt[0], x[VELOCITY] + jolt[1]
             noise = rng.normal(size=2)
-            feed(tracker, [reported(i * STEP_S, x[2:4], math.exp(k), offset, noise)])
+            feed(tracker, [reported(i * STEP_S, x[VELOCITY], math.exp(k), offset, noise)])
             (output,) = feed(tracker, world.measure(i * STEP_S, x, Field.RANGE))
         found = output.status.steps
         off = math.log(found.length_factor) - k, found.heading_offset_rad - offset

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from netpos.filters.state import X
 from netpos.messages.values import (
     Array,
     Field,
@@ -45,10 +46,10 @@ def test_straight_run_converges_in_position_velocity_and_clock(world: Any, feed:
     np.testing.assert_allclose(map_velocity(outputs[-1]), [8.0, 0.0], atol=0.6)
     clock = outputs[-1].clock
     assert clock is not None
-    assert abs(clock.offset_s * speed_of_light - truth[4]) < 1.0
+    assert abs(clock.offset_s * speed_of_light - truth[X.CLOCK]) < 1.0
     assert abs(clock.drift * speed_of_light - 7500.0) < 30.0
     assert (
-        abs(clock.offset_s * speed_of_light - truth[4])
+        abs(clock.offset_s * speed_of_light - truth[X.CLOCK])
         < 4 * math.sqrt(clock.cov[0, 0]) * speed_of_light
     )
     status = outputs[-1].status

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from netpos.filters.state import POSITION, VELOCITY
 from netpos.messages.values import (
     Array,
     Field,
@@ -107,7 +108,7 @@ def test_step_velocity_is_fused_as_the_equations_say(world: Any, feed: Any) -> N
     K = P @ np.linalg.inv(P + cov)
     np.testing.assert_allclose(map_velocity(output), K @ [1.0, -2.0], rtol=1e-9)
     estimate = tracker._tracks["vue_1"]._state.estimate
-    np.testing.assert_allclose(estimate.cov[2:4, 2:4], P - K @ P, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(estimate.cov[VELOCITY, VELOCITY], P - K @ P, rtol=1e-8, atol=1e-10)
     assert output.status.sources == ("step_velocity",)
     assert output.status.nis_dof == 2
 
@@ -116,12 +117,12 @@ def test_ground_speed_is_fused_along_the_motion(world: Any, feed: Any) -> None:
     tracker = world.tracker(filter="ekf", **STILL)
     feed(tracker, [pose(0.0, 0.0, 0.0), velocity(0.0, (3.0, 4.0), 0.25)])
     before = tracker._tracks["vue_1"]._state.estimate.copy()
-    v = before.mean[2:4]
+    v = before.mean[VELOCITY]
     u = v / np.linalg.norm(v)
     # 1 ns later: in the same epoch it would be linearised at rest
     s = GroundSpeed(stamp_ns=T0 + 1, vue_id="vue_1", speed_mps=5.5, speed_var=0.04)
     (output,) = feed(tracker, [s])
-    P = before.cov[2:4, 2:4]
+    P = before.cov[VELOCITY, VELOCITY]
     K = P @ u / (u @ P @ u + 0.04)
     np.testing.assert_allclose(map_velocity(output), v + K * (5.5 - np.linalg.norm(v)), rtol=1e-6)
     assert output.status.sources == ("ground_speed",)
@@ -236,8 +237,8 @@ def test_coloured_noise_is_inflated_and_keeps_the_covariance_honest(world: Any, 
                 feed(tracker, items)
                 e = keep * e + math.sqrt(1 - keep**2) * rng.normal(size=3)
             estimate = tracker._tracks["vue_1"]._state.estimate
-            d = estimate.mean[:2] - standing()[:2]
-            nees.append(d @ np.linalg.solve(estimate.cov[:2, :2], d))
+            d = estimate.mean[POSITION] - standing()[:2]
+            nees.append(d @ np.linalg.solve(estimate.cov[POSITION, POSITION], d))
         means[spectral] = float(np.mean(nees))
     low, high = chi2.ppf([0.0005, 0.9995], 2 * runs) / runs
     assert low < means[2 * tau] < high

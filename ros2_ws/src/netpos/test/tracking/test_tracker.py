@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from netpos.filters.state import X
 from netpos.messages.values import (
     AngleConvention,
     Field,
@@ -30,7 +31,7 @@ STATE = np.array([30.0, 0.0, 5.0, 0.0, 0.0, 0.0])
 
 def at(t_s: float) -> np.ndarray:
     state = STATE.copy()
-    state[0] += 5.0 * t_s
+    state[X.PX] += 5.0 * t_s
     return state
 
 

@@ -32,6 +32,7 @@ from netpos.evaluation.bench.yardstick import Yardstick
 from netpos.filters import ekf, sigma, srukf
 from netpos.filters.measurement import AXES, ORIGIN, VALUE, VARIANCE, linearise, predict_row
 from netpos.filters.motion import NO_BIAS, propagate
+from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array
 
 NO_GATE = np.array([np.inf])
@@ -165,21 +166,21 @@ def _expected(x: Array, rows: Array) -> Array:
 
 def numpy_expected(x: Array, rows: Array) -> Array:
     """h (4,): azimuth, TOA of one RSU, then of the other, for RSUs that look east."""
-    d = np.array([*x[:2], HEIGHT_M]) - rows[::2, ORIGIN:AXES]
+    d = np.array([*x[POSITION], HEIGHT_M]) - rows[::2, ORIGIN:AXES]
     values = np.empty(ROWS)
     values[::2] = np.arctan2(d[:, 1], d[:, 0])
-    values[1::2] = np.linalg.norm(d, axis=1) + x[4]
+    values[1::2] = np.linalg.norm(d, axis=1) + x[X.CLOCK]
     return values
 
 
 def numpy_jacobian(x: Array, rows: Array) -> Array:
     """H (4, 6) of ``numpy_expected``."""
-    d = np.array([*x[:2], HEIGHT_M]) - rows[::2, ORIGIN:AXES]
+    d = np.array([*x[POSITION], HEIGHT_M]) - rows[::2, ORIGIN:AXES]
     rho2 = d[:, 0] ** 2 + d[:, 1] ** 2
     H = np.zeros((ROWS, 6))
-    H[::2, 0], H[::2, 1] = -d[:, 1] / rho2, d[:, 0] / rho2
-    H[1::2, :2] = d[:, :2] / np.linalg.norm(d, axis=1)[:, None]
-    H[1::2, 4] = 1.0
+    H[::2, X.PX], H[::2, X.PY] = -d[:, 1] / rho2, d[:, 0] / rho2
+    H[1::2, POSITION] = d[:, :2] / np.linalg.norm(d, axis=1)[:, None]
+    H[1::2, X.CLOCK] = 1.0
     return H
 
 

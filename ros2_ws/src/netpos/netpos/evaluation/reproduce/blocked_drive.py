@@ -17,6 +17,7 @@ from netpos.filters.measurement import LEVER
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.filters.position_fix import FixStatus
 from netpos.filters.space import place_rows
+from netpos.filters.state import ERR_ATTITUDE, ERR_POSITION, ERR_VELOCITY
 from netpos.messages.values import Array, RsuInfo
 from netpos.radio.noise import generator
 from netpos.scenario import Simulation, load_scenario
@@ -209,8 +210,11 @@ def started(simulation: Simulation, case: Case, config: TrackerConfig) -> tuple[
     truth = simulation.truth(VUE, simulation.beacons(VUE).stamp_ns[:1])
     seed, sd = simulation.scenario.seed, start_sd(config, *START_SD)
     error = sd * generator(seed, f"{VUE}/start").standard_normal(sd.size)
-    turned = Rotation.from_rotvec(error[6:9]) * truth.rotation[0]
-    place, velocity = truth.position[0] + error[:3], truth.velocity[0] + error[3:6]
+    turned = Rotation.from_rotvec(error[ERR_ATTITUDE]) * truth.rotation[0]
+    place, velocity = (
+        truth.position[0] + error[ERR_POSITION],
+        truth.velocity[0] + error[ERR_VELOCITY],
+    )
     nav, cov = nav_of(place, velocity, turned.as_quat()), np.diag(sd**2)
     return with_clock(config, nav, cov) if case.one_way else (nav, cov)
 

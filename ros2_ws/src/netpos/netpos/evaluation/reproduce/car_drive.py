@@ -29,6 +29,7 @@ from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
 from netpos.filters.error_state import UNCONSTRAINED, Imu, Sensors
 from netpos.filters.measurement import LEVER
 from netpos.filters.space import place_rows
+from netpos.filters.state import NAV_POSITION, NAV_QUATERNION
 from netpos.messages.values import Array
 from netpos.scenario.along_path import FIELDS
 from netpos.scenario.recorded_drive import VUE, station_drive
@@ -143,7 +144,9 @@ def _run(known: Recording, epochs: Epochs, sensors: Sensors, start: Start) -> Dr
 
 def _antenna(nav: Array) -> Array:
     """(n, 3) of states (n, NAV)."""
-    return np.asarray(nav[:, :3] + Rotation.from_quat(nav[:, 6:10]).apply(LEVER_ARM_M))
+    return np.asarray(
+        nav[:, NAV_POSITION] + Rotation.from_quat(nav[:, NAV_QUATERNION]).apply(LEVER_ARM_M)
+    )
 
 
 def station_seeds(case: Case, seeds: range) -> dict[str, Tally]:

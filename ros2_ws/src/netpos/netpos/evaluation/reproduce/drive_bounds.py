@@ -32,6 +32,7 @@ from netpos.evaluation.reproduce.frame import Work
 from netpos.filters.error_state import UNCONSTRAINED, Sensors
 from netpos.filters.measurement import ORIGIN, VALUE
 from netpos.filters.space import linearise_in_space
+from netpos.filters.state import NAV_POSITION
 from netpos.messages.values import Array
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking.models import gate_thresholds
@@ -183,7 +184,7 @@ def _smoothed(case: Case, seeds: range) -> dict[str, Squares]:
             filtered = drive(*begin, imu, epochs, by, gate).nav
             smoothed, _ = smoothed_drive(*begin, imu, epochs, by, gate)
             for what, nav in ((f"{name}, filtered", filtered), (f"{name}, smoothed", smoothed)):
-                square = ((nav[:, :3] - truth) ** 2)[silent][:, [1, 0, 2]]
+                square = ((nav[:, NAV_POSITION] - truth) ** 2)[silent][:, [1, 0, 2]]
                 part = Squares(len(square), square.sum(axis=0), 0, np.zeros(3))
                 total[what] = total[what] + part if what in total else part
     return total

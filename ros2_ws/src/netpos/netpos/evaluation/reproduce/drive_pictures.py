@@ -12,6 +12,7 @@ from netpos.evaluation.pictures import TRACK_COLOURS
 from netpos.evaluation.reproduce.blocked_drive import FIX, LOOSE, VEHICLE, Run, ned
 from netpos.evaluation.reproduce.car_drive import Outages
 from netpos.filters.position_fix import FixStatus
+from netpos.filters.state import NAV_POSITION
 
 _AXES = ("north", "east", "down")
 
@@ -31,7 +32,7 @@ def drive_errors(runs: Sequence[tuple[str, Run]]) -> Figure:
                 time[good], fixed[good, row], ".", ms=2, color="#BBBBBB", label="least squares"
             )
             for variant, colour in zip((LOOSE, VEHICLE), TRACK_COLOURS, strict=False):
-                error = ned(done.drives[variant].nav[:, :3] - done.position)[:, row]
+                error = ned(done.drives[variant].nav[:, NAV_POSITION] - done.position)[:, row]
                 axes.plot(time, error, lw=0.9, color=colour, label=f"SINS, {variant}")
             axes.set(ylabel=f"{axis} error [m]")
             axes.grid(alpha=0.3)

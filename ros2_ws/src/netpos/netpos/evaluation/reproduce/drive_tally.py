@@ -13,7 +13,7 @@ from netpos.evaluation.reproduce.blocked_drive import Case, Run, ned, run
 from netpos.evaluation.reproduce.frame import Work
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.filters.position_fix import FixStatus
-from netpos.filters.space import CLOCK
+from netpos.filters.state import NAV_POSITION, NAV_QUATERNION, NAV_VELOCITY, Err, Nav
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.strapdown_engine import Drive, Epochs, Fixes
@@ -127,11 +127,11 @@ def is_lost(epochs: Epochs, result: Drive) -> bool:
 
 def error_of(done: Run, result: Drive) -> Array:
     """(N, 9) position, velocity and attitude, estimate minus truth in the filter's terms."""
-    turned = Rotation.from_quat(result.nav[:, 6:10]) * done.attitude.inv()
+    turned = Rotation.from_quat(result.nav[:, NAV_QUATERNION]) * done.attitude.inv()
     return np.hstack(
         [
-            result.nav[:, :3] - done.position,
-            result.nav[:, 3:6] - done.velocity,
+            result.nav[:, NAV_POSITION] - done.position,
+            result.nav[:, NAV_VELOCITY] - done.velocity,
             turned.as_rotvec(),
         ]
     )
@@ -171,9 +171,9 @@ def tally_drive(done: Run, name: str) -> Tally:
 
 def _clock(done: Run, result: Drive) -> tuple[Array, Array]:
     """(N,) error [m] and variance [m^2] of the clock's offset; 0 without one."""
-    if result.cov.shape[1] <= CLOCK:
+    if result.cov.shape[1] <= Err.CLOCK:
         return np.zeros(len(result.nav)), np.zeros(len(result.nav))
-    return result.nav[:, CLOCK + 1] - done.clock_m, result.cov[:, CLOCK, CLOCK]
+    return result.nav[:, Nav.CLOCK] - done.clock_m, result.cov[:, Err.CLOCK, Err.CLOCK]
 
 
 def tally_seeds(case: Case, seeds: range) -> dict[str, Tally]:

@@ -12,7 +12,8 @@ from netpos.evaluation.bounds import bound_covariances
 from netpos.evaluation.reproduce.paper_filter import follow_paper
 from netpos.evaluation.reproduce.rows import RowTemplates, observation_rows
 from netpos.evaluation.reproduce.segments import Epochs, Flags, Followed, Follower, Ints
-from netpos.filters.motion import N_CORE, SPEED_OF_LIGHT_MPS
+from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.filters.state import N_CORE, POSITION, VELOCITY, X
 from netpos.messages.values import Array
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.simulation import Beacons
@@ -70,7 +71,7 @@ class Track:
     @property
     def error_m(self) -> Array:
         """(N,) horizontal errors; NaN while there is no track."""
-        error: Array = np.hypot(*(self.mean[:, :2] - self.truth[:, :2]).T)
+        error: Array = np.hypot(*(self.mean[:, POSITION] - self.truth[:, POSITION]).T)
         return error
 
 
@@ -158,10 +159,10 @@ def _truth(beacons: Beacons, heard: Ints, n: int) -> Array:
     """(N, n) true states of the beacons ``heard`` (N,); entries beyond the six are 0."""
     c = SPEED_OF_LIGHT_MPS
     truth = np.zeros((heard.size, n))
-    truth[:, :2] = beacons.position[heard, :2]
-    truth[:, 2:4] = beacons.velocity[heard]
-    truth[:, 4] = c * beacons.clock_offset_s[heard]
-    truth[:, 5] = c * beacons.clock_drift[heard]
+    truth[:, POSITION] = beacons.position[heard, :2]
+    truth[:, VELOCITY] = beacons.velocity[heard]
+    truth[:, X.CLOCK] = c * beacons.clock_offset_s[heard]
+    truth[:, X.DRIFT] = c * beacons.clock_drift[heard]
     return truth
 
 

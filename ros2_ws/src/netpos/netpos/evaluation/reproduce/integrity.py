@@ -12,6 +12,7 @@ from netpos.filters import ekf
 from netpos.filters.compile import kernel
 from netpos.filters.measurement import GROUP
 from netpos.filters.motion import Parameter
+from netpos.filters.state import X
 from netpos.messages.values import Array
 from netpos.tracking.engine import GATE, GATE_SIZE, Option
 from netpos.tracking.protection import gaussian_radius, level_in, level_scratch, radius_limit
@@ -50,7 +51,7 @@ def reported(
         means, covs = _allow_for_manoeuvres(epochs, motions, bias, options, risk, level)
     optimism = _optimism(row_start, rows, nis, taken, options)
     for k in range(level.size):
-        xx, xy, yy = covs[k, 0, 0], covs[k, 0, 1], covs[k, 1, 1]
+        xx, xy, yy = covs[k, X.PX, X.PX], covs[k, X.PX, X.PY], covs[k, X.PY, X.PY]
         if level[k] < optimism[k] * radius_limit(xx, xy, yy, risk):
             level[k] = max(level[k], optimism[k] * gaussian_radius(xx, xy, yy, risk))
     return means, covs, level

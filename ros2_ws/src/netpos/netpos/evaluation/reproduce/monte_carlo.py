@@ -15,6 +15,7 @@ from netpos.evaluation.reproduce.experiment import Experiment, Track, setup_of
 from netpos.evaluation.reproduce.frame import Work
 from netpos.filters.compile import kernel
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.filters.state import X
 from netpos.messages.values import Array
 
 Ints = npt.NDArray[np.int64]
@@ -105,23 +106,23 @@ def _sums(
     for i in range(mean.shape[0]):
         if not tracked[i]:
             continue
-        x, y = mean[i, 0] - truth[i, 0], mean[i, 1] - truth[i, 1]
+        x, y = mean[i, X.PX] - truth[i, X.PX], mean[i, X.PY] - truth[i, X.PY]
         square = x * x + y * y
         error = np.sqrt(square)
-        clock = to_ns * (mean[i, 4] - truth[i, 4])
+        clock = to_ns * (mean[i, X.CLOCK] - truth[i, X.CLOCK])
         out[0] += square
         out[1] += error
         out[2] += clock
         out[3] += clock * clock
-        vx, vy = truth[i, 2], truth[i, 3]
+        vx, vy = truth[i, X.VX], truth[i, X.VY]
         if vx * vx + vy * vy > MIN_SPEED_FOR_HEADING_MPS**2:
-            wx, wy = mean[i, 2], mean[i, 3]
+            wx, wy = mean[i, X.VX], mean[i, X.VY]
             turn = np.arctan2(vx * wy - vy * wx, vx * wx + vy * wy)
             out[4] += turn * turn
             out[5] += 1.0
         out[6] += bound[i, 0, 0] + bound[i, 1, 1]
         out[7] = max(out[7], error)
-        a, b, c = cov[i, 0, 0], cov[i, 0, 1], cov[i, 1, 1]
+        a, b, c = cov[i, X.PX, X.PX], cov[i, X.PX, X.PY], cov[i, X.PY, X.PY]
         out[8] += (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
         out[9] += 1.0
         histogram[min(int(error / BIN_M), BINS)] += 1
@@ -135,11 +136,11 @@ def tally(track: Track, position_sd_max_m: float, histogram: Ints, skip: int) ->
     out = np.zeros(10)
     _sums(track.mean, track.cov, track.truth, track.bound, scored, out, histogram)
     error2, error, clock, clock2, heading2, heading_n, bound2, error_max, nees, n = out.tolist()
-    a, b, c = track.cov[:, 0, 0], track.cov[:, 0, 1], track.cov[:, 1, 1]
+    a, b, c = track.cov[:, X.PX, X.PX], track.cov[:, X.PX, X.PY], track.cov[:, X.PY, X.PY]
     largest = (a + c) / 2 + np.hypot((a - c) / 2, b)
     ready = np.flatnonzero(largest <= position_sd_max_m**2)
     elapsed = (track.stamps_ns - track.stamps_ns[0]) / NS
-    speed = np.hypot(track.truth[:, 2], track.truth[:, 3])
+    speed = np.hypot(track.truth[:, X.VX], track.truth[:, X.VY])
     level = track.level[scored]
     return Tally(
         n=int(n),

@@ -21,6 +21,7 @@ from netpos.evaluation.reproduce.network_stages import (
 )
 from netpos.evaluation.reproduce.network_summary import NetworkSummary
 from netpos.evaluation.reproduce.network_truth import START_NS
+from netpos.filters.state import POSITION
 from netpos.messages.values import Array, Field, NetworkTrack, RsuInfo, RsuMeasurement
 from netpos.scenario.networks import fix_errors
 from netpos.scenario.schema import NS
@@ -103,7 +104,7 @@ def _moved(tracks: list[NetworkTrack], stamps: Ints, truth: Array) -> tuple[Arra
         track = tracks[newest[k]]
         if stamps[k] - track.stamp_ns <= FUSION.stale_s * 1e9:
             moved = at_common_instant([track], int(stamps[k]), FUSION.jerk_density)
-            error[k], cov[k] = moved.mean[0, :2] - truth[k], moved.cov[0, :2, :2]
+            error[k], cov[k] = moved.mean[0, POSITION] - truth[k], moved.cov[0, POSITION, POSITION]
     return error, cov
 
 

@@ -18,6 +18,7 @@ from netpos.evaluation.reproduce.network_truth import START_NS
 from netpos.filters.intersection import METHODS, fuse_pair
 from netpos.filters.measurement import GATE_VARIANCE, GROUP, ROW_WIDTH, VALUE, VARIANCE
 from netpos.filters.motion import NO_BIAS
+from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array, Field, NetworkTrack, RsuInfo, RsuMeasurement
 from netpos.radio.noise import generator
 from netpos.scenario.networks import fix_errors
@@ -114,7 +115,7 @@ class Pass:
         self._row_start = np.concatenate([[0], 2 * np.arange(len(self.stamps_ns) + 1)])
         cov = np.zeros((8, 8))
         cov[TRACK_STATES, TRACK_STATES] = setting.start_var
-        cov[4, 4] = cov[5, 5] = 1.0
+        cov[X.CLOCK, X.CLOCK] = cov[X.DRIFT, X.DRIFT] = 1.0
         self._start_cov = cov
 
     def fixes(self, seed: int, truth: Array, vue: str = VUE) -> Array:
@@ -219,13 +220,13 @@ class Stages:
                 for i, stamp in zip(newest, self.stamps_ns, strict=True)
             ]
             tracks.append([(m.cov[0], m.own_cov[0]) for m in moved])
-            self.covs[name] = np.array([m.cov[0, :2, :2] for m in moved])
+            self.covs[name] = np.array([m.cov[0, POSITION, POSITION] for m in moved])
         for method in METHODS:
             pairs = [
                 fuse_pair(cov_a, own_a, cov_b, own_b, method)
                 for (cov_a, own_a), (cov_b, own_b) in zip(*tracks[:2], strict=True)
             ]
-            self.covs[method] = np.array([pair.cov[:2, :2] for pair in pairs])
+            self.covs[method] = np.array([pair.cov[POSITION, POSITION] for pair in pairs])
             self._gains[method] = (
                 np.array([pair.gain_a for pair in pairs]),
                 np.array([pair.gain_b for pair in pairs]),

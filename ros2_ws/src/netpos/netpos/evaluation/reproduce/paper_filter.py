@@ -21,6 +21,7 @@ from netpos.evaluation.metrics import SKIP_EPOCHS
 from netpos.evaluation.reproduce.segments import Epochs, Followed
 from netpos.filters.compile import kernel
 from netpos.filters.measurement import AXES, BIAS, KIND, ORIGIN, VALUE, VARIANCE, Kind
+from netpos.filters.state import X
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.models import motions_of
@@ -57,12 +58,12 @@ def _predict(x: Array, P: Array, dt: float, variances: Array) -> None:
         for a in range(_STATES):
             P[a, to] += dt * P[a, source]
     for p in range(2):
-        v = p + 2
+        v = X.VX + p
         P[p, p] += variances[1] * dt**4 / 4.0
         P[p, v] += variances[1] * dt**3 / 2.0
         P[v, p] += variances[1] * dt**3 / 2.0
         P[v, v] += variances[1] * dt**2 + variances[0]
-    P[5, 5] += variances[2]
+    P[X.DRIFT, X.DRIFT] += variances[2]
 
 
 @kernel
@@ -70,16 +71,16 @@ def _linearised(rows: Array, x: Array, H: Array, innovation: Array) -> None:
     """Fill H (m, 6) of eq. 44 and y - h(x) (m,) of eq. 37; angles are wrapped."""
     H[:] = 0.0
     for i in range(rows.shape[0]):
-        dx, dy = x[0] - rows[i, ORIGIN], x[1] - rows[i, ORIGIN + 1]
+        dx, dy = x[X.PX] - rows[i, ORIGIN], x[X.PY] - rows[i, ORIGIN + 1]
         r2 = dx * dx + dy * dy
         if int(rows[i, KIND]) == _AZIMUTH:
-            H[i, 0], H[i, 1] = -dy / r2, dx / r2
+            H[i, X.PX], H[i, X.PY] = -dy / r2, dx / r2
             angle = rows[i, VALUE] - math.atan2(dy, dx)
             innovation[i] = math.atan2(math.sin(angle), math.cos(angle))
         else:
             r = math.sqrt(r2)
-            H[i, 0], H[i, 1], H[i, 4] = dx / r, dy / r, 1.0
-            innovation[i] = rows[i, VALUE] - r - x[4]
+            H[i, X.PX], H[i, X.PY], H[i, X.CLOCK] = dx / r, dy / r, 1.0
+            innovation[i] = rows[i, VALUE] - r - x[X.CLOCK]
 
 
 @kernel

@@ -40,6 +40,7 @@ from netpos.evaluation.reproduce.walk_figures import (
     Scores,
     ratio_at_same_instants,
 )
+from netpos.filters.state import POSITION
 from netpos.messages.values import Array
 
 DURING = "step velocities during the step they describe"
@@ -130,8 +131,8 @@ def _job(case: Case, seeds: range) -> list[Scores]:
 
 
 def _scores(run: Walked) -> Scores:
-    error = np.where(run.decided[:, None], run.mean[:, :2] - run.truth, np.nan)
-    return Scores.of(error, run.cov[:, :2, :2])
+    error = np.where(run.decided[:, None], run.mean[:, POSITION] - run.truth, np.nan)
+    return Scores.of(error, run.cov[:, POSITION, POSITION])
 
 
 def figures_of(work: Work, case: Case) -> Figures:

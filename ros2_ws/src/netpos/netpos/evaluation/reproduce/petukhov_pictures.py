@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from netpos.evaluation.pictures import RSU_COLOUR, TRACK_COLOURS, save
 from netpos.evaluation.reproduce.rectangle import Walked
 from netpos.evaluation.reproduce.sector_choice import Conditions, Found
+from netpos.filters.state import POSITION
 from netpos.messages.values import Array
 from netpos.radio.anchor import uwb_wavelength_m
 from netpos.tracking.step_heading import choose_sector
@@ -66,7 +67,7 @@ def tracks(runs: Mapping[str, Walked]) -> Figure:
     truth = next(iter(runs.values())).truth
     axes.plot(*truth.T, color=_TRUTH_COLOUR, lw=1.0, label="truth")
     for (name, run), colour in zip(runs.items(), TRACK_COLOURS, strict=False):
-        places = np.where(run.decided[:, None], run.mean[:, :2], np.nan)
+        places = np.where(run.decided[:, None], run.mean[:, POSITION], np.nan)
         axes.plot(*places.T, ".-", ms=3, lw=0.8, color=colour, label=name)
     axes.plot(0.0, 0.0, "^", color=RSU_COLOUR, label="anchor")
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")

@@ -21,6 +21,7 @@ from netpos.evaluation.pictures import (
 )
 from netpos.evaluation.reproduce.experiment import Track
 from netpos.evaluation.reproduce.monte_carlo import BIN_M, Summary
+from netpos.filters.state import POSITION
 from netpos.messages.values import Array
 from netpos.radio.propagation import LosModel, los_probability
 
@@ -79,7 +80,9 @@ def passages(samples: Sequence[Sample]) -> Figure:
 def _draw_track(axes: Axes, sample: Sample) -> None:
     track = sample.track
     axes.plot(*sample.way.T, color="#BBBBBB", lw=4.0, label="true way")
-    axes.plot(*track.mean[:, :2].T, ".-", ms=2, lw=0.7, color=TRACK_COLOURS[0], label="estimate")
+    axes.plot(
+        *track.mean[:, POSITION].T, ".-", ms=2, lw=0.7, color=TRACK_COLOURS[0], label="estimate"
+    )
     _draw_ellipses(axes, track)
     axes.plot(*sample.rsus.T, "^", ms=8, color=RSU_COLOUR, mec="white", label="RSU", zorder=5)
     points = np.vstack([sample.way, sample.rsus])
@@ -105,7 +108,7 @@ def _draw_ellipses(axes: Axes, track: Track) -> None:
             minor,
             angle,
             units="xy",
-            offsets=track.mean[chosen, :2],
+            offsets=track.mean[chosen, POSITION],
             offset_transform=axes.transData,
             facecolor="none",
             edgecolor=TRACK_COLOURS[1],

@@ -26,6 +26,7 @@ from netpos.evaluation.reproduce.troubles import NO_TROUBLE, Trouble, within
 from netpos.evaluation.reproduce.waist_chain import Settings, config_of
 from netpos.filters.measurement import GROUP, VALUE, predict_row
 from netpos.filters.motion import NO_BIAS
+from netpos.filters.state import POSITION
 from netpos.messages.values import Array
 from netpos.radio.noise import generator
 from netpos.scenario import Simulation, load_scenario
@@ -89,7 +90,7 @@ class Walked:
     @property
     def error_m(self) -> Array:
         """(n,) horizontal errors; NaN where there is no estimate or it is not decided."""
-        error = np.hypot(*(self.mean[:, :2] - self.truth).T)
+        error = np.hypot(*(self.mean[:, POSITION] - self.truth).T)
         return np.where(self.decided, error, np.nan)
 
 

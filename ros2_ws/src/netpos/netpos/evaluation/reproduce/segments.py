@@ -10,7 +10,7 @@ import numpy.typing as npt
 from netpos.evaluation.metrics import NS
 from netpos.evaluation.reproduce.integrity import reported
 from netpos.filters.measurement import BIAS
-from netpos.filters.motion import N_CORE
+from netpos.filters.state import N_CORE
 from netpos.messages.values import Array, ImuSample
 from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig

@@ -9,10 +9,11 @@ from functools import lru_cache
 import numpy as np
 
 from netpos.filters.motion import NO_BIAS, Model, motion_parameters, noise, transition
+from netpos.filters.state import X
 from netpos.messages.values import Array, NetworkTrack
 
 # Entries of the state of ``filters.motion`` that a network's track has.
-TRACK_STATES = np.array([0, 1, 2, 3, 6, 7])
+TRACK_STATES = np.array([X.PX, X.PY, X.VX, X.VY, X.AX, X.AY])
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +29,8 @@ class Moved:
 def step_matrices(dt_ns: int, jerk_density: float) -> tuple[Array, Array]:
     """F and Q (6, 6) over ``dt_ns`` of a state x, y, vx, vy, ax, ay under white jerk."""
     motion = motion_parameters(Model.CONSTANT_ACCELERATION, jerk=jerk_density)
-    mean, F, Q = np.zeros(8), np.empty((8, 8)), np.empty((8, 8))
+    n = X.AY + 1
+    mean, F, Q = np.zeros(n), np.empty((n, n)), np.empty((n, n))
     dt_s = dt_ns * 1e-9
     transition(mean, dt_s, motion, NO_BIAS, F)
     noise(mean, dt_s, motion, NO_BIAS, Q)

@@ -15,6 +15,7 @@ from typing import cast
 import numpy as np
 
 from netpos.filters.intersection import fuse_pair
+from netpos.filters.state import POSITION
 from netpos.messages.values import Array, NetworkTrack, TrackState, TrackStatus
 from netpos.tracking import output
 from netpos.tracking.networks.association import Association, Slots, by_name
@@ -312,7 +313,7 @@ class TrackFusion:
             sources=tuple(sources),
             position_sd_m=output.largest_sd(fused.cov),
             protection_level_m=protection_level(
-                fused.cov[:2, :2], self._config.integrity_risk, 1.0
+                fused.cov[POSITION, POSITION], self._config.integrity_risk, 1.0
             ),
         )
         return TrackOutput(odometry, None, status)

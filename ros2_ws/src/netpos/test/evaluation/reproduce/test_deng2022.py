@@ -27,7 +27,7 @@ from netpos.evaluation.reproduce.drive_tally import Tally, tally_seeds
 from netpos.evaluation.reproduce.frame import Work
 from netpos.filters.measurement import ORIGIN, ROW_WIDTH
 from netpos.filters.position_fix import FixStatus
-from netpos.filters.space import CLOCK
+from netpos.filters.state import Err, Nav
 from netpos.tracking.models import gate_thresholds
 from netpos.tracking.strapdown_engine import Drive, Epochs, drive
 from netpos.tracking.strapdown_models import sensors_of
@@ -266,7 +266,10 @@ def test_the_clock_is_judged_by_its_own_variance() -> None:
     done = run(deng2022.ONE_WAY, SEED + 2)
     found = tally_seeds(deng2022.ONE_WAY, range(SEED + 2, SEED + 3))[VEHICLE]
     result = done.drives[VEHICLE]
-    error, sd = result.nav[:, CLOCK + 1] - done.clock_m, np.sqrt(result.cov[:, CLOCK, CLOCK])
+    error, sd = (
+        result.nav[:, Nav.CLOCK] - done.clock_m,
+        np.sqrt(result.cov[:, Err.CLOCK, Err.CLOCK]),
+    )
     assert found.nees_test(1).mean == pytest.approx(np.mean((error / sd) ** 2))
     to_ns = 1e9 / 299_792_458.0
     assert found.clock_ns[0] == pytest.approx(to_ns * np.sqrt(np.mean(error**2)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from netpos.evaluation.reproduce.experiment import Experiment, Setup
+from netpos.filters.state import POSITION
 from setup_tracker import tracker_outputs
 
 
@@ -39,5 +40,5 @@ def test_levels_are_those_of_the_tracker(
     assert (track.level[1:] > 0.0).all()
     positions = {o.status.stamp_ns: o.odometry.position for o in outputs if o.odometry}
     told = np.array([positions[stamp][:2] for stamp in track.stamps_ns.tolist()])
-    astray = np.hypot(*(track.mean[:, :2] - told).T) > 1e-6
+    astray = np.hypot(*(track.mean[:, POSITION] - told).T) > 1e-6
     assert astray[1:].sum() <= 2

@@ -17,6 +17,7 @@ from netpos.evaluation.reproduce.monte_carlo import (
     monte_carlo,
     tally,
 )
+from netpos.filters.state import POSITION, VELOCITY, X
 from netpos.messages.values import Beacon, ImuSample, InitialPose
 from netpos.tracking import Tracker
 
@@ -31,7 +32,7 @@ def _track(seed: int, epochs: int) -> Track:
     """Random errors of known size about a random truth."""
     rng = np.random.default_rng(seed)
     truth = rng.normal(size=(epochs, 6)) * [100.0, 100.0, 3.0, 3.0, 1e4, 100.0]
-    truth[5, 2:4] = 0.1, 0.2  # too slow to have a heading
+    truth[5, VELOCITY] = 0.1, 0.2  # too slow to have a heading
     sd = np.array([0.5, 0.2, 0.3, 0.3, 0.4, 1.0])
     mix = np.eye(6)
     mix[1, 0] = 0.6
@@ -70,7 +71,9 @@ def test_figures_of_two_runs() -> None:
     assert ours.error_max_m == pytest.approx(distance.max())
     assert ours.clock_sd_ns == pytest.approx(clock_ns.std())
     assert ours.clock_rmse_ns == pytest.approx(np.sqrt(np.mean(clock_ns**2)))
-    assert ours.nees.mean == pytest.approx(nees(error[:, :2], cov[:, :2, :2])[0].mean())
+    assert ours.nees.mean == pytest.approx(
+        nees(error[:, :2], cov[:, POSITION, POSITION])[0].mean()
+    )
     assert ours.bound_rmse_m == pytest.approx(np.sqrt(0.1))
     assert ours.bound_ratio == pytest.approx(ours.rmse_m / np.sqrt(0.1))
     assert ours.percentile_m(50) == pytest.approx(np.percentile(distance, 50), abs=0.02)
@@ -88,7 +91,7 @@ def test_figures_of_two_runs() -> None:
 
 def test_heading_counts_where_the_vehicle_moves() -> None:
     track = _track(3, 40)
-    track.truth[25, 2:4] = 0.3, 0.39  # 0.492 m/s
+    track.truth[25, VELOCITY] = 0.3, 0.39  # 0.492 m/s
     velocity, truth = track.mean[SKIP:, 2:4], track.truth[SKIP:, 2:4]
     turn = np.arctan2(velocity[:, 1], velocity[:, 0]) - np.arctan2(truth[:, 1], truth[:, 0])
     turn = (turn + np.pi) % (2 * np.pi) - np.pi
@@ -100,7 +103,7 @@ def test_heading_counts_where_the_vehicle_moves() -> None:
 
 def test_ready_when_the_worst_run_is() -> None:
     tracks = [_track(1, 120), _track(2, 60)]
-    largest = [np.sqrt(np.linalg.eigvalsh(t.cov[:, :2, :2])[:, -1]) for t in tracks]
+    largest = [np.sqrt(np.linalg.eigvalsh(t.cov[:, POSITION, POSITION])[:, -1]) for t in tracks]
     limit = float(np.median(largest[1]))
     expected = max(0.25 * np.flatnonzero(sd <= limit)[0] for sd in largest)
     assert expected > 0
@@ -115,7 +118,7 @@ def test_a_run_goes_astray_above_5_m_or_when_lost(
     error_m: float, losses: int, astray: int
 ) -> None:
     tracks = [_track(1, 60), _track(2, 60)]
-    tracks[0].mean[SKIP, :2] = tracks[0].truth[SKIP, :2] + [error_m, 0.0]
+    tracks[0].mean[SKIP, POSITION] = tracks[0].truth[SKIP, POSITION] + [error_m, 0.0]
     tracks[0].mean[SKIP - 1, :2] += 100.0  # still converging
     tracks[1] = replace(tracks[1], losses=losses)
     ours = _summary(tracks)
@@ -174,7 +177,7 @@ def test_runs_with_an_error_above_their_level(error_m: float, runs: int) -> None
 
 def test_errors_beyond_the_histogram_have_no_percentile() -> None:
     track = _track(1, 60)
-    track.mean[:, 0] += 50.0
+    track.mean[:, X.PX] += 50.0
     ours = _summary([track])
     assert ours.percentile_m(50) is None
     assert ours.share_within(1.0) == 0.0
@@ -225,7 +228,7 @@ def test_a_run_is_what_the_tracker_makes_of_its_measurements(
     poses = [o.odometry for o in (*tracker.process(), *tracker.flush()) if o.odometry is not None]
     assert [pose.stamp_ns for pose in poses] == track.stamps_ns.tolist()
     positions = np.array([pose.position[:2] for pose in poses])
-    np.testing.assert_allclose(positions, track.mean[:, :2], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(positions, track.mean[:, POSITION], rtol=0, atol=1e-9)
 
 
 def test_metis_routes_keep_the_papers_figures_on_any_number_of_processes() -> None:

@@ -11,6 +11,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from netpos.evaluation.reproduce.experiment import VUE, Experiment, Setup
 from netpos.evaluation.reproduce.paper_filter import LOST_M, PaperNoise, run_paper_filter
 from netpos.filters.measurement import AXES, BIAS, KIND, ORIGIN, VALUE, VARIANCE, Kind
+from netpos.filters.state import POSITION, VELOCITY, X
 from netpos.messages.values import Array
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking import TrackerConfig
@@ -47,7 +48,7 @@ def _filterpy(route: dict[str, Any], noise: PaperNoise) -> tuple[Array, Array]:
         if k:
             dt = (stamp - epochs.stamps_ns[k - 1]) * 1e-9
             F = np.eye(6)
-            F[0, 2] = F[1, 3] = F[4, 5] = dt
+            F[X.PX, X.VX] = F[X.PY, X.VY] = F[X.CLOCK, X.DRIFT] = dt
             G = np.zeros((6, 2))
             G[:4] = np.vstack([dt**2 / 2 * np.eye(2), dt * np.eye(2)])
             step = noise.velocity_sd_mps**2
@@ -58,11 +59,11 @@ def _filterpy(route: dict[str, Any], noise: PaperNoise) -> tuple[Array, Array]:
         site, angle = rows[:, ORIGIN : ORIGIN + 2], rows[:, KIND] == Kind.AZIMUTH
 
         def measured(x: Array, site: Array = site, angle: Array = angle) -> Array:
-            dx, dy = (x[:2] - site).T
-            return np.where(angle, np.arctan2(dy, dx), np.hypot(dx, dy) + x[4])
+            dx, dy = (x[POSITION] - site).T
+            return np.where(angle, np.arctan2(dy, dx), np.hypot(dx, dy) + x[X.CLOCK])
 
         def slopes(x: Array, site: Array = site, angle: Array = angle) -> Array:
-            dx, dy = (x[:2] - site).T
+            dx, dy = (x[POSITION] - site).T
             r = np.hypot(dx, dy)
             H = np.zeros((len(site), 6))
             H[:, 0] = np.where(angle, -dy / r**2, dx / r)
@@ -91,9 +92,9 @@ def test_it_is_the_textbook_filter(route: dict[str, Any], noise: PaperNoise) -> 
     done, means, covs = run_paper_filter(*route["epochs"][:3], route["mean"], route["cov"], noise)
     expected, expected_covs = _filterpy(route, noise)
     assert done == len(expected) > 600
-    np.testing.assert_allclose(means[:, :2], expected[:, :2], rtol=0, atol=1e-5)
-    np.testing.assert_allclose(means[:, 2:4], expected[:, 2:4], rtol=0, atol=1e-5)
-    np.testing.assert_allclose(means[:, 4], expected[:, 4], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(means[:, POSITION], expected[:, :2], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(means[:, VELOCITY], expected[:, 2:4], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(means[:, X.CLOCK], expected[:, 4], rtol=0, atol=1e-4)
     own, other = covs[20:, :4, :4], expected_covs[20:, :4, :4]
     np.testing.assert_allclose(own, other, rtol=1e-3, atol=1e-6)
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from netpos.evaluation.reproduce.experiment import FACTS, Experiment, Setup
+from netpos.filters.state import POSITION
 from netpos.tracking import TrackerConfig
 from setup_tracker import tracker_outputs
 
@@ -38,7 +39,7 @@ def test_a_track_that_was_lost_comes_back_as_in_the_tracker(seed: int) -> None:
     stamps = track.stamps_ns.tolist()
     assert [published[stamp] is not None for stamp in stamps] == track.tracked.tolist()
     positions = np.array([published[s][0] for s in track.stamps_ns[track.tracked].tolist()])
-    np.testing.assert_allclose(positions, track.mean[track.tracked, :2], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(positions, track.mean[track.tracked, POSITION], rtol=0, atol=1e-6)
     assert np.isnan(track.error_m[~track.tracked]).all()
     assert np.isnan(track.level[~track.tracked]).all()
 
