@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,6 +39,16 @@ class Robust(IntEnum):
     STUDENT_T = 2
 
 
+class RobustOptions(NamedTuple):
+    """How rows are re-weighted: kind and parameter of the weighting, probability of a blocked path
+    and its mean excess [m]."""
+
+    kind: int  # Robust
+    parameter: float
+    nlos_probability: float
+    nlos_excess_m: float
+
+
 @leaf
 def unblock(row: Array, innovation: float, spread: float, prior: float, excess_m: float) -> None:
     """Replace a range or time by the measurement equivalent to the mixture of a direct and a
@@ -68,8 +79,7 @@ def weigh(
     innovation: Array,
     H: Array,
     bend: Array,
-    robust: int,
-    parameter: float,
+    options: RobustOptions,
 ) -> None:
     """Widen, in place, groups of ``rows`` (m, ROW_WIDTH) by how badly they fit: innovation (m,),
     Jacobian H (m, n), variance ``bend`` (m,) of what linearising leaves out."""
@@ -80,10 +90,10 @@ def weigh(
             stop += 1
         variance = rows[start:stop, GATE_VARIANCE] + bend[start:stop]
         d2 = group_nis(cov, innovation[start:stop], H[start:stop], variance)
-        if robust == Robust.HUBER:
-            factor = huber_factor(d2, stop - start, parameter)
+        if options.kind == Robust.HUBER:
+            factor = huber_factor(d2, stop - start, options.parameter)
         else:
-            factor = student_t_factor(d2, stop - start, parameter)
+            factor = student_t_factor(d2, stop - start, options.parameter)
         if math.isfinite(factor):
             rows[start:stop, VARIANCE] *= factor
             rows[start:stop, GATE_VARIANCE] *= factor
@@ -96,25 +106,25 @@ def condition(
     cov: Array,
     rows: Array,
     height_m: float,
-    robust: int,
-    parameter: float,
-    nlos_probability: float,
-    nlos_excess_m: float,
-    work: Array,
+    options: RobustOptions,
+    h: Array,
 ) -> None:
-    """Re-weight ``rows`` (m, ROW_WIDTH) in place, as seen from the prior mean (n,), cov (n, n)."""
-    m, h = rows.shape[0], work[0]
-    if nlos_probability > 0.0:
+    """Re-weight ``rows`` (m, ROW_WIDTH) in place, as seen from the prior mean (n,), cov (n, n).
+
+    h : scratch of at least n entries
+    """
+    m = rows.shape[0]
+    if options.nlos_probability > 0.0:
         for i in range(m):
             row = rows[i]
             if may_be_late(row):
                 innovation = innovation_row(row, mean, height_m, h)
                 spread = innovation_variance(row, mean, cov, height_m, row[VARIANCE], h)
-                unblock(row, innovation, spread, nlos_probability, nlos_excess_m)
-    if robust == Robust.NONE:
+                unblock(row, innovation, spread, options.nlos_probability, options.nlos_excess_m)
+    if options.kind == Robust.NONE:
         return
     innovations, H = linearise(rows, mean, height_m)
     bend = np.empty(m)
     for i in range(m):
         bend[i] = curvature_variance(rows[i], mean, cov, height_m)
-    weigh(cov, rows, innovations, H, bend, robust, parameter)
+    weigh(cov, rows, innovations, H, bend, options)

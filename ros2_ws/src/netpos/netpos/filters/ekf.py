@@ -161,19 +161,19 @@ def _passes(
     mean: Array,
     cov: Array,
     rows: Array,
-    start: int,
-    stop: int,
+    group: tuple[int, int],
     height_m: float,
     threshold: float,
     iterations: int,
     work: Array,
 ) -> bool:
-    """Whether one group lies within ``threshold`` of squared Mahalanobis distance of the
-    prediction.
+    """Whether one group, (first row, row after its last), lies within ``threshold`` of squared
+    Mahalanobis distance of the prediction.
 
     Where the linear distance says no and iterating is allowed, the misfit of the group's most
     probable state decides.
     """
+    start, stop = group
     if stop - start <= 2:
         nis = _small_nis(start, stop, work, mean.size, rows.shape[0])
     else:
@@ -182,9 +182,7 @@ def _passes(
         return True
     if iterations <= 1:
         return False
-    return bool(
-        _least_misfit(mean, cov, rows, start, stop, height_m, iterations, work) <= threshold
-    )
+    return bool(_least_misfit(mean, cov, rows, group, height_m, iterations, work) <= threshold)
 
 
 @kernel
@@ -192,16 +190,16 @@ def _least_misfit(
     mean: Array,
     cov: Array,
     rows: Array,
-    start: int,
-    stop: int,
+    group: tuple[int, int],
     height_m: float,
     iterations: int,
     work: Array,
 ) -> float:
     """``misfit`` of the most probable state of one group."""
-    group, variance = rows[start:stop], work[W_GATE_VARIANCE, start:stop].copy()
-    x, _ = iterate(mean, cov, group, variance, height_m, iterations, work)
-    return float(misfit(mean, cov, group, variance, height_m, x))
+    some = rows[group[0] : group[1]]
+    variance = work[W_GATE_VARIANCE, group[0] : group[1]].copy()
+    x, _ = iterate(mean, cov, some, variance, height_m, iterations, work)
+    return float(misfit(mean, cov, some, variance, height_m, x))
 
 
 @inlined
@@ -239,7 +237,7 @@ def gate(
             stop += 1
         threshold = gate_nis[min(stop - start, gate_nis.size - 1)]
         taken = is_open or _passes(
-            mean, cov, rows, start, stop, height_m, threshold, iterations, work
+            mean, cov, rows, (start, stop), height_m, threshold, iterations, work
         )
         accepted[group] = 1.0 if taken else 0.0
         for i in range(start, stop):

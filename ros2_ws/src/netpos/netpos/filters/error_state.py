@@ -239,7 +239,7 @@ def _stands(nav: Array, memory: Array, constraints: Constraints, chunk: Array) -
 
 @kernel
 def hold(nav: Array, cov: Array, memory: Array, sensors: Sensors, chunk: Array) -> None:
-    """Apply the constraints after a ``chunk`` (7,) as of ``predict_chunk``, in place."""
+    """Apply the constraints after a ``chunk`` (7,), the mean of ``Chunk``, in place."""
     constraints = sensors.constraints
     standing = _stands(nav, memory, constraints, chunk)
     still_sd = constraints.standstill_sd_mps if standing else 0.0
@@ -336,6 +336,14 @@ def _add_slow_noise(cov: Array, dt: float, slow: SlowErrors) -> None:
         cov[k, k] += slow.biases[0, i] ** 2 * (1.0 - math.exp(-2.0 * dt / slow.biases[1, i]))
 
 
+class Chunk(NamedTuple):
+    """What happened in a chunk: mean (7,) rate and specific force as measured, and the length [s];
+    transition (n, n) of the error state."""
+
+    mean: Array
+    transition: Array
+
+
 @kernel
 def predict_chunk(
     nav: Array,
@@ -345,24 +353,22 @@ def predict_chunk(
     to_ns: int,
     imu: Imu,
     sensors: Sensors,
-    Phi: Array,
-    chunk: Array,
+    chunk: Chunk,
 ) -> tuple[int, float]:
     """Move ``nav``, ``cov`` and ``memory`` (MEMORY,) on by one chunk, at most to ``to_ns`` >
     ``from_ns``, in place, without constraints.
 
-    Phi : (n, n) filled with the transition of the error state
-    chunk : (7,) filled with the mean rate and specific force as measured, and the length [s]
+    chunk : filled
     Returns its end and the time [s] in it without samples, in which the last one is held and
     trusted as ``BLIND``.
     """
-    noise, earth = sensors.noise, sensors.earth
+    noise, earth, Phi = sensors.noise, sensors.earth, chunk.transition
     before, after, gained = np.empty((3, 3)), np.empty((3, 3)), np.zeros(3)
     rotation_of(nav[QUATERNION:ACCEL_BIAS], before)
-    chunk[:] = 0.0
-    now, blind_s = _integrate(nav, memory, from_ns, to_ns, imu, earth, gained, chunk)
+    chunk.mean[:] = 0.0
+    now, blind_s = _integrate(nav, memory, from_ns, to_ns, imu, earth, gained, chunk.mean)
     rotation_of(nav[QUATERNION:ACCEL_BIAS], after)
-    span, tau = chunk[6], noise.bias_correlation_time_s
+    span, tau = chunk.mean[6], noise.bias_correlation_time_s
     Phi[:] = np.eye(cov.shape[0])
     Phi[:ERR, :ERR] = transition(gained, 0.5 * (before + after), span, tau, earth)
     _slow_transition(nav, span, sensors.slow, Phi)
@@ -386,10 +392,10 @@ def advance(
     Returns the time [s] without samples.
     """
     n, now, blind_s = cov.shape[0], from_ns, 0.0
-    Phi, chunk = np.empty((n, n)), np.empty(7)
+    chunk = Chunk(np.empty(7), np.empty((n, n)))
     while now < to_ns:
-        now, dark_s = predict_chunk(nav, cov, memory, now, to_ns, imu, sensors, Phi, chunk)
+        now, dark_s = predict_chunk(nav, cov, memory, now, to_ns, imu, sensors, chunk)
         blind_s += dark_s
         if dark_s == 0.0:
-            hold(nav, cov, memory, sensors, chunk)
+            hold(nav, cov, memory, sensors, chunk.mean)
     return blind_s

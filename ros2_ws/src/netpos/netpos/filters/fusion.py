@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -61,34 +62,36 @@ def _project(
     return hPh, residual
 
 
+class LinearRows(NamedTuple):
+    """Rows linearised at one state: innovation (m,), H (m, n), variance (m,); those with ``use``
+    (m,) 0 are left out."""
+
+    innovation: Array
+    H: Array
+    variance: Array
+    use: Array
+
+
 @inlined
 def _fuse_rows(
-    n: int,
-    mean: Array,
-    P: Array,
-    innovation: Array,
-    H: Array,
-    variance: Array,
-    use: Array,
-    step: Array,
-    Ph: Array,
-    K: Array,
+    n: int, mean: Array, P: Array, rows: LinearRows, step: Array, Ph: Array, K: Array
 ) -> float:
     """``fuse`` on P (n, n), with vectors ``step``, ``Ph`` and ``K`` (n,) to work in."""
     for a in range(n):
         step[a] = 0.0
     distance = 0.0
-    for i in range(H.shape[0]):
-        if use[i] == 0.0:
+    for i in range(rows.H.shape[0]):
+        if rows.use[i] == 0.0:
             continue
-        hPh, residual = _project(n, P, H[i], innovation[i], step, Ph)
-        s = hPh + variance[i]
+        hPh, residual = _project(n, P, rows.H[i], rows.innovation[i], step, Ph)
+        variance = rows.variance[i]
+        s = hPh + variance
         distance += residual * residual / s
         for a in range(n):
             K[a] = Ph[a] / s
             step[a] += K[a] * residual
         for a in range(n):
-            left = Ph[a] - K[a] * hPh - variance[i] * K[a]  # zero but for rounding: Joseph's
+            left = Ph[a] - K[a] * hPh - variance * K[a]  # zero but for rounding: Joseph's
             for b in range(a, n):
                 value = P[a, b] - K[a] * Ph[b] - left * K[b]
                 P[a, b] = value
@@ -99,16 +102,14 @@ def _fuse_rows(
 
 
 @leaf
-def _fuse_core(
-    mean: Array, cov: Array, innovation: Array, H: Array, variance: Array, use: Array
-) -> float:
+def _fuse_core(mean: Array, cov: Array, rows: LinearRows) -> float:
     """``fuse`` for the six core states."""
     P = local_array(N_CORE, N_CORE)
     step, Ph, K = local_array(N_CORE), local_array(N_CORE), local_array(N_CORE)
     for a in range(N_CORE):
         for b in range(N_CORE):
             P[a, b] = cov[a, b]
-    distance = _fuse_rows(N_CORE, mean, P, innovation, H, variance, use, step, Ph, K)
+    distance = _fuse_rows(N_CORE, mean, P, rows, step, Ph, K)
     for a in range(N_CORE):
         for b in range(N_CORE):
             cov[a, b] = P[a, b]
@@ -116,13 +117,11 @@ def _fuse_core(
 
 
 @leaf
-def _fuse_any(
-    mean: Array, cov: Array, innovation: Array, H: Array, variance: Array, use: Array, work: Array
-) -> float:
+def _fuse_any(mean: Array, cov: Array, rows: LinearRows, work: Array) -> float:
     """``fuse`` for any number of states."""
     step, Ph, K = work[W_STEP], work[W_PH], work[W_GAIN]
     n = mean.size
-    return float(_fuse_rows(n, mean, cov, innovation, H, variance, use, step, Ph, K))
+    return float(_fuse_rows(n, mean, cov, rows, step, Ph, K))
 
 
 @inlined
@@ -135,9 +134,10 @@ def fuse(
     mean (n,), cov (n, n), innovation (m,), H (m, n), variance (m,) > 0; rows with ``use`` (m,) 0
     are left out. Returns the squared Mahalanobis distance of the rows used.
     """
+    rows = LinearRows(innovation, H, variance, use)
     if mean.size == N_CORE:
-        return float(_fuse_core(mean, cov, innovation, H, variance, use))
-    return float(_fuse_any(mean, cov, innovation, H, variance, use, work))
+        return float(_fuse_core(mean, cov, rows))
+    return float(_fuse_any(mean, cov, rows, work))
 
 
 @kernel

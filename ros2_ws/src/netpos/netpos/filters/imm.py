@@ -1,13 +1,13 @@
 """Interacting multiple models over models that share one state (Bar-Shalom, Li and Kirubarajan
 2001, section 11.6), each an extended Kalman filter. Everything works in place.
 
-``means`` (K, n), ``covs`` (K, n, n) and ``weights`` (K,), the probabilities of the models, are the
-state; ``motions`` (K, Parameter) are the models, of equal EXTRAS.
+``Models`` is the state; ``motions`` (K, Parameter) are the models, of equal EXTRAS.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,14 @@ from netpos.messages.values import Array
 # No model is ever ruled out: its way back would take this many e-folds less.
 _LEAST_WEIGHT = 1e-12
 _NO_GATE = np.array([np.inf])
+
+
+class Models(NamedTuple):
+    """What each of K models knows, and how probable it is."""
+
+    means: Array  # (K, n)
+    covs: Array  # (K, n, n)
+    weights: Array  # (K,), their sum is 1
 
 
 @kernel
@@ -114,21 +122,14 @@ def log_likelihood(mean: Array, cov: Array, rows: Array, height_m: float) -> flo
 
 
 @kernel
-def predict(
-    means: Array,
-    covs: Array,
-    weights: Array,
-    dt: float,
-    motions: Array,
-    sojourn_s: Array,
-    bias: Array,
-) -> None:
+def predict(models: Models, dt: float, motions: Array, sojourn_s: Array, bias: Array) -> None:
     """Mix, then move each model by ``dt`` seconds. Nothing happens for dt <= 0.
 
     sojourn_s : (K,) mean time in each model; bias : (2, k) as for ``ekf.predict``
     """
     if dt <= 0.0:
         return
+    means, covs, weights = models
     mix(means, covs, weights, transition_matrix(sojourn_s, dt))
     for k in range(weights.size):
         ekf.predict(means[k], covs[k], dt, motions[k], bias)
@@ -136,9 +137,7 @@ def predict(
 
 @kernel
 def update(
-    means: Array,
-    covs: Array,
-    weights: Array,
+    models: Models,
     rows: Array,
     height_m: float,
     gate_nis: Array,
@@ -149,6 +148,7 @@ def update(
     """One epoch: groups are gated once, against the mixture; every model fuses the same rows and
     is weighed by their likelihood. Arguments and result as ``ekf.update``; the NIS is the
     mixture's."""
+    means, covs, weights = models
     mean, cov = np.empty_like(means[0]), np.empty_like(covs[0])
     combine(means, covs, weights, mean, cov)
     nis, used = ekf.update(mean, cov, rows, height_m, gate_nis, iterations, accepted, work)

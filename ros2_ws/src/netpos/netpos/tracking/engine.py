@@ -5,46 +5,29 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from netpos.filters import conditioning, ekf, kf, srukf, ukf
 from netpos.filters.compile import kernel, leaf
+from netpos.filters.conditioning import Robust, RobustOptions
 from netpos.filters.manoeuvre import add_manoeuvre, unnoticed_s
 from netpos.filters.measurement import GROUP
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS, Parameter, add_jump
 from netpos.filters.state import X
 from netpos.messages.values import Array
 
+Ints = npt.NDArray[np.int64]
+
 GATE_SIZE = 65
 _FARTHEST_M = 1e9  # no measurement may say more
 _ROUNDING = 1e-15  # of turned axes
 
 
-class Option(IntEnum):
-    """Entries of the vector ``options``; ``GATE_SIZE`` thresholds of the gate follow them."""
-
-    FILTER = 0  # Filter
-    ITERATIONS = 1
-    HEIGHT = 2  # of the device [m]
-    INFLATE_AFTER = 3  # epochs rejected in a row
-    LOST_AFTER = 4  # epochs rejected in a row
-    INITIAL_SPEED = 5  # sd [m/s] to which the velocity opens then
-    MANOEUVRE_SPEED = 6  # sd [m/s] of the second look; 0: none
-    ROBUST = 7  # conditioning.Robust
-    ROBUST_PARAMETER = 8
-    NLOS_PROBABILITY = 9
-    NLOS_EXCESS = 10  # mean [m]
-    POSITION_GAIN = 11
-    VELOCITY_GAIN = 12
-    ACCEL_GAIN = 13
-
-
-GATE = len(Option)
-
-
 class Filter(IntEnum):
-    """Entries of ``Option.FILTER``, in the order of ``config.FILTERS``."""
+    """``FilterOptions.filter``, in the order of ``config.FILTERS``."""
 
     EKF = 0
     IEKF = 1
@@ -53,25 +36,92 @@ class Filter(IntEnum):
     KF = 4
 
 
+class FilterOptions(NamedTuple):
+    """What a filter is told once; ``models.options_of`` makes it from the parameters."""
+
+    filter: int  # Filter
+    iterations: int
+    height_m: float  # of the device
+    inflate_after: int  # epochs rejected in a row
+    lost_after: int  # epochs rejected in a row
+    initial_speed_sd: float  # [m/s] to which the velocity opens then
+    manoeuvre_speed_sd: float  # [m/s] of the second look; 0: none
+    integrity_risk: float  # share of errors that may exceed the protection level
+    robust: RobustOptions
+    gain_floor: Array  # (3,) as for ``kf.update``
+    gate_nis: Array  # (GATE_SIZE,) largest accepted NIS for 0, 1, ... degrees of freedom
+
+
+class EpochInput(NamedTuple):
+    """What one epoch brings: seconds since the last one and since the last accepted measurement,
+    epochs rejected in a row before it, and rows (m, ROW_WIDTH), groups numbered 0, 1, ..."""
+
+    dt_s: float
+    unheard_s: float
+    rejected_in_row: int
+    rows: Array
+
+
+class StepResult(NamedTuple):
+    """What came of an epoch: NIS of the accepted rows, their number, that of accepted groups."""
+
+    nis: float
+    used: int
+    groups: int
+
+
+class Scratch(NamedTuple):
+    """Memory of ``step``: of ``ekf.workspace``, groups accepted by each look (2, groups), the
+    prediction (n,), (n, n) and the state of the second look."""
+
+    work: Array
+    accepted: Array
+    prior_mean: Array
+    prior_spread: Array
+    second_mean: Array
+    second_spread: Array
+
+
+class Epochs(NamedTuple):
+    """The epochs of a run: stamps_ns (N,) increasing; epoch k has the rows row_start[k] to
+    row_start[k + 1], none or more."""
+
+    stamps_ns: Ints
+    row_start: Ints  # (N + 1,)
+    rows: Array  # (M, ROW_WIDTH)
+
+
+class Run(NamedTuple):
+    """What a filter made of N epochs: means (N, n), covs (N, n, n); of the accepted rows nis (N,),
+    dof (N,) their number and groups (N,) that of their groups."""
+
+    means: Array
+    covs: Array
+    nis: Array
+    dof: Array
+    groups: Array
+
+
 @kernel
-def scratch(n: int, m: int) -> tuple[Array, Array]:
-    """Scratch memory ``work`` and ``spare`` for ``step`` with up to ``n`` states and ``m`` rows;
-    ``spare`` has to have exactly n columns."""
-    return ekf.workspace(n, m), np.zeros((2 * (n + 1), n))
+def scratch(n: int, m: int) -> Scratch:
+    """Memory for ``step`` with ``n`` states and up to ``m`` rows."""
+    means, spreads = np.zeros((2, n)), np.zeros((2, n, n))
+    accepted = np.zeros((2, m))
+    return Scratch(ekf.workspace(n, m), accepted, means[0], spreads[0], means[1], spreads[1])
 
 
-def to_spread(cov: Array, options: Array) -> Array:
+def to_spread(cov: Array, options: FilterOptions) -> Array:
     """What the filter carries instead of the covariance: its lower Cholesky factor where it is a
     square-root filter, a copy otherwise."""
-    if int(options[Option.FILTER]) == Filter.SRUKF:
+    if options.filter == Filter.SRUKF:
         factor: Array = srukf.factor(cov)
         return factor
     return cov.copy()
 
 
-def to_cov(spread: Array, options: Array) -> Array:
+def to_cov(spread: Array, options: FilterOptions) -> Array:
     """Covariance (n, n) of what the filter carries."""
-    if int(options[Option.FILTER]) == Filter.SRUKF:
+    if options.filter == Filter.SRUKF:
         cov: Array = srukf.covariance(spread)
         return cov
     return spread
@@ -79,12 +129,12 @@ def to_cov(spread: Array, options: Array) -> Array:
 
 @leaf
 def predict(
-    mean: Array, spread: Array, dt: float, motion: Array, bias: Array, options: Array
+    mean: Array, spread: Array, dt: float, motion: Array, bias: Array, options: FilterOptions
 ) -> None:
     """Move mean (n,) and spread (n, n) by ``dt`` seconds in place; nothing happens for dt <= 0.
     A velocity step noted in ``motion`` is over."""
     motion[Parameter.JUMP_SPEED] = 0.0
-    kind = int(options[Option.FILTER])
+    kind = options.filter
     if kind == Filter.UKF:
         ukf.predict(mean, spread, dt, motion, bias)
     elif kind == Filter.SRUKF:
@@ -95,30 +145,28 @@ def predict(
 
 @leaf
 def update(
-    mean: Array, spread: Array, rows: Array, options: Array, accepted: Array, work: Array
+    mean: Array, spread: Array, rows: Array, options: FilterOptions, accepted: Array, work: Array
 ) -> tuple[float, int]:
     """Gate and apply one epoch, in place: NIS of the accepted rows and their number; ``accepted``
     (groups,) is filled."""
-    kind = int(options[Option.FILTER])
-    height_m, gate = options[Option.HEIGHT], options[GATE:]
+    kind, height_m, gate = options.filter, options.height_m, options.gate_nis
     if kind == Filter.UKF:
         nis, used = ukf.update(mean, spread, rows, height_m, gate, accepted)
     elif kind == Filter.SRUKF:
         nis, used = srukf.update(mean, spread, rows, height_m, gate, accepted)
     elif kind == Filter.KF:
-        floor = options[Option.POSITION_GAIN : GATE]
-        nis, used = kf.update(mean, spread, rows, height_m, gate, accepted, floor)
+        nis, used = kf.update(mean, spread, rows, height_m, gate, accepted, options.gain_floor)
     else:
-        iterations = int(options[Option.ITERATIONS])
+        iterations = options.iterations
         nis, used = ekf.update(mean, spread, rows, height_m, gate, iterations, accepted, work)
     return nis, used
 
 
 @leaf
-def open_velocity(spread: Array, sd: float, unheard_s: float, options: Array) -> None:
+def open_velocity(spread: Array, sd: float, unheard_s: float, options: FilterOptions) -> None:
     """Add, in place, a velocity step of ``sd`` [m/s] per axis at some time in the last
     ``unheard_s`` seconds, and the position it leads to."""
-    if int(options[Option.FILTER]) == Filter.SRUKF:
+    if options.filter == Filter.SRUKF:
         _open_factor(spread, sd, unheard_s)
         return
     add_jump(sd, unheard_s, 0.0, spread)
@@ -134,16 +182,16 @@ def _open_factor(spread: Array, sd: float, unheard_s: float) -> None:
 
 @kernel
 def manoeuvre_s(
-    mean: Array, spread: Array, rows: Array, unheard_s: float, options: Array
+    mean: Array, spread: Array, rows: Array, unheard_s: float, options: FilterOptions
 ) -> float:
     """Time [s] in which a manoeuvre may have begun, seen from the prediction: since the last
     accepted measurement, or for as long as it goes unnoticed. A step of the velocity that its own
     sd allows for is followed, and no manoeuvre."""
     cov = spread
-    if int(options[Option.FILTER]) == Filter.SRUKF:
+    if options.filter == Filter.SRUKF:
         cov = srukf.covariance(spread)
-    h, height_m = np.empty(mean.size), options[Option.HEIGHT]
-    speed, gate = options[Option.MANOEUVRE_SPEED], options[GATE + 2]
+    h, height_m = np.empty(mean.size), options.height_m
+    speed, gate = options.manoeuvre_speed_sd, options.gate_nis[2]
     if 2.0 * speed * speed <= cov[X.VX, X.VX] + cov[X.VY, X.VY]:
         return unheard_s
     typical_s, _ = unnoticed_s(mean, cov, rows, height_m, gate, speed, h)
@@ -151,11 +199,11 @@ def manoeuvre_s(
 
 
 @kernel
-def allow_manoeuvre(spread: Array, within_s: float, options: Array) -> None:
+def allow_manoeuvre(spread: Array, within_s: float, options: FilterOptions) -> None:
     """Add, in place, a velocity step of the manoeuvre speed at any time of the last ``within_s``
     seconds."""
-    speed = options[Option.MANOEUVRE_SPEED]
-    if int(options[Option.FILTER]) != Filter.SRUKF:
+    speed = options.manoeuvre_speed_sd
+    if options.filter != Filter.SRUKF:
         add_manoeuvre(speed, within_s, spread)
         return
     _open_factor(spread, speed, within_s / 2.0)
@@ -217,154 +265,130 @@ def _count(accepted: Array, groups: int) -> int:
 def step(
     mean: Array,
     spread: Array,
-    dt: float,
-    unheard_s: float,
-    rejected_in_row: int,
-    rows: Array,
+    epoch: EpochInput,
     motion: Array,
     bias: Array,
-    options: Array,
-    accepted: Array,
-    work: Array,
-    spare: Array,
-) -> tuple[float, int, int]:
-    """Predict by ``dt`` and apply one epoch, in place.
+    options: FilterOptions,
+    scratch: Scratch,
+) -> StepResult:
+    """Predict and apply one epoch, in place.
 
     A first look gates with the prediction. Where it rejects something, a second look that allows
     for a manoeuvre in the time it may have gone unnoticed is taken if it accepts more. After
-    ``INFLATE_AFTER`` epochs rejected in a row the velocity opens to its initial sd. Nothing
+    ``inflate_after`` epochs rejected in a row the velocity opens to its initial sd. Nothing
     accepted leaves the prediction.
 
-    rows : (m, ROW_WIDTH), groups numbered 0, 1, ...; the robust options re-weight them in place
-    unheard_s : since the last accepted measurement
-    accepted : (2, groups), the first row filled with 0 or 1
-
-    Returns the NIS of the accepted rows, their number, the number of accepted groups. The velocity
-    step allowed for is left in ``motion`` (``note_jump``), for a smoother to know.
+    ``scratch`` keeps the prediction, and in the first row of ``accepted`` 0 or 1 of each group.
+    The robust options re-weight the rows in place. The velocity step allowed for is left in
+    ``motion`` (``note_jump``), for a smoother to know.
     """
-    n, groups = mean.size, int(rows[rows.shape[0] - 1, GROUP]) + 1
-    predict(mean, spread, dt, motion, bias, options)
-    prior_mean, prior_spread = spare[0], spare[1 : n + 1]
-    second_mean, second_spread = spare[n + 1], spare[n + 2 :]
-    _copy(mean, spread, prior_mean, prior_spread)
-    opened = rejected_in_row >= options[Option.INFLATE_AFTER]
-    jump = options[Option.INITIAL_SPEED] if opened else 0.0
+    rows, unheard_s, accepted = epoch.rows, epoch.unheard_s, scratch.accepted[0]
+    groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
+    predict(mean, spread, epoch.dt_s, motion, bias, options)
+    _copy(mean, spread, scratch.prior_mean, scratch.prior_spread)
+    opened = epoch.rejected_in_row >= options.inflate_after
+    jump = options.initial_speed_sd if opened else 0.0
     turn, within_s = 0.0, 0.0
     if opened:
         open_velocity(spread, jump, unheard_s, options)
-    if options[Option.ROBUST] > 0.0 or options[Option.NLOS_PROBABILITY] > 0.0:
-        condition(mean, spread, rows, options, work)
-    nis, used = update(mean, spread, rows, options, accepted[0], work)
-    taken = _count(accepted[0], groups)
-    manoeuvre = options[Option.MANOEUVRE_SPEED]
+    if options.robust.kind != Robust.NONE or options.robust.nlos_probability > 0.0:
+        condition(mean, spread, rows, options, scratch.work)
+    nis, used = update(mean, spread, rows, options, accepted, scratch.work)
+    taken = _count(accepted, groups)
+    manoeuvre = options.manoeuvre_speed_sd
     if taken < groups and manoeuvre > 0.0:
-        _copy(prior_mean, prior_spread, second_mean, second_spread)
-        if opened:
-            open_velocity(second_spread, jump, unheard_s, options)
-        within_s = manoeuvre_s(prior_mean, prior_spread, rows, unheard_s, options)
-        allow_manoeuvre(second_spread, within_s, options)
-        second_nis, second_used = update(
-            second_mean, second_spread, rows, options, accepted[1], work
-        )
-        if _count(accepted[1], groups) > taken:
-            nis, used, taken = second_nis, second_used, _count(accepted[1], groups)
-            _copy(second_mean, second_spread, mean, spread)
+        within_s = manoeuvre_s(scratch.prior_mean, scratch.prior_spread, rows, unheard_s, options)
+        second = _look_again(rows, jump, unheard_s, within_s, options, scratch)
+        if second.groups > taken:
+            nis, used, taken = second
+            _copy(scratch.second_mean, scratch.second_spread, mean, spread)
             for g in range(groups):
-                accepted[0, g] = accepted[1, g]
+                accepted[g] = scratch.accepted[1, g]
             turn = manoeuvre
     if taken == 0:
-        _copy(prior_mean, prior_spread, mean, spread)
+        _copy(scratch.prior_mean, scratch.prior_spread, mean, spread)
     else:
         note_jump(motion, jump, unheard_s, turn, within_s)
-    return nis, used, taken
+    return StepResult(nis, used, taken)
+
+
+@leaf
+def _look_again(
+    rows: Array,
+    jump: float,
+    unheard_s: float,
+    within_s: float,
+    options: FilterOptions,
+    scratch: Scratch,
+) -> StepResult:
+    """The second look of ``step``: from the prediction, with a manoeuvre in the last ``within_s``
+    seconds."""
+    mean, spread, accepted = scratch.second_mean, scratch.second_spread, scratch.accepted[1]
+    _copy(scratch.prior_mean, scratch.prior_spread, mean, spread)
+    if jump > 0.0:
+        open_velocity(spread, jump, unheard_s, options)
+    allow_manoeuvre(spread, within_s, options)
+    nis, used = update(mean, spread, rows, options, accepted, scratch.work)
+    groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
+    return StepResult(nis, used, _count(accepted, groups))
 
 
 @kernel
-def condition(mean: Array, spread: Array, rows: Array, options: Array, work: Array) -> None:
+def condition(
+    mean: Array, spread: Array, rows: Array, options: FilterOptions, work: Array
+) -> None:
     """Re-weight the rows in place as the robust options say."""
     cov = spread
-    if int(options[Option.FILTER]) == Filter.SRUKF:
+    if options.filter == Filter.SRUKF:
         cov = srukf.covariance(spread)
-    conditioning.condition(
-        mean,
-        cov,
-        rows,
-        options[Option.HEIGHT],
-        int(options[Option.ROBUST]),
-        options[Option.ROBUST_PARAMETER],
-        options[Option.NLOS_PROBABILITY],
-        options[Option.NLOS_EXCESS],
-        work,
-    )
+    conditioning.condition(mean, cov, rows, options.height_m, options.robust, work[0])
 
 
 @kernel
 def run_epochs(
-    stamps_ns: Array,
-    row_start: Array,
-    rows: Array,
+    epochs: Epochs,
     mean: Array,
     cov: Array,
     motion: Array,
     bias: Array,
-    options: Array,
-    means: Array,
-    covs: Array,
-    nis: Array,
-    dof: Array,
-    taken: Array,
+    options: FilterOptions,
+    run: Run,
 ) -> int:
     """A whole run: ``step`` for every epoch, from ``mean`` (n,), ``cov`` (n, n) valid at the
-    first stamp (a square-root filter takes and gives covariances, too).
-
-    stamps_ns : (N,) integers, increasing; row_start : (N + 1,) integers, epoch k has the rows
-    row_start[k] to row_start[k + 1], none or more; rows : (M, ROW_WIDTH), not changed
-    means (N, n), covs (N, n, n), nis (N,), dof (N,), taken (N,) : filled per epoch
+    first stamp (a square-root filter takes and gives covariances, too); ``run`` is filled.
 
     Returns the number of epochs done: less than N where the track was lost, that is after
-    ``LOST_AFTER`` epochs rejected in a row.
+    ``lost_after`` epochs rejected in a row.
     """
-    n, epochs = mean.size, stamps_ns.size
+    stamps_ns, row_start = epochs.stamps_ns, epochs.row_start
     most = 1
-    for k in range(epochs):
+    for k in range(stamps_ns.size):
         most = max(most, row_start[k + 1] - row_start[k])
-    work, spare = scratch(n, most)
-    accepted, own = np.zeros((2, most)), np.empty((most, rows.shape[1]))
-    square_root = int(options[Option.FILTER]) == Filter.SRUKF
+    memory, own = scratch(mean.size, most), np.empty((most, epochs.rows.shape[1]))
+    square_root = options.filter == Filter.SRUKF
     x = mean.copy()
     S = srukf.factor(cov) if square_root else cov.copy()
     rejected_in_row = 0
     last_ns = heard_ns = stamps_ns[0]
-    for k in range(epochs):
+    for k in range(stamps_ns.size):
         dt = (stamps_ns[k] - last_ns) * 1e-9
         last_ns = stamps_ns[k]
         m = row_start[k + 1] - row_start[k]
         if m == 0:
             predict(x, S, dt, motion, bias, options)
-            nis[k], dof[k], taken[k] = 0.0, 0, 0
+            run.nis[k], run.dof[k], run.groups[k] = 0.0, 0, 0
         else:
-            own[:m] = rows[row_start[k] : row_start[k + 1]]
+            own[:m] = epochs.rows[row_start[k] : row_start[k + 1]]
             unheard_s = (last_ns - heard_ns) * 1e-9
-            nis[k], dof[k], taken[k] = step(
-                x,
-                S,
-                dt,
-                unheard_s,
-                rejected_in_row,
-                own[:m],
-                motion,
-                bias,
-                options,
-                accepted,
-                work,
-                spare,
-            )
+            epoch = EpochInput(dt, unheard_s, rejected_in_row, own[:m])
+            result = step(x, S, epoch, motion, bias, options, memory)
+            run.nis[k], run.dof[k], run.groups[k] = result
             groups = int(own[m - 1, GROUP]) + 1
-            rejected_in_row = 0 if 2 * taken[k] >= groups else rejected_in_row + 1
-            if taken[k] > 0:
+            rejected_in_row = 0 if 2 * result.groups >= groups else rejected_in_row + 1
+            if result.groups > 0:
                 heard_ns = last_ns
-        means[k] = x
-        covs[k] = srukf.covariance(S) if square_root else S
-        if rejected_in_row >= options[Option.LOST_AFTER]:
+        run.means[k] = x
+        run.covs[k] = srukf.covariance(S) if square_root else S
+        if rejected_in_row >= options.lost_after:
             return k + 1
-    return epochs
+    return int(stamps_ns.size)

@@ -11,14 +11,14 @@ from typing import Protocol
 
 import numpy as np
 
-from netpos.filters import filterpy_backend, imm
+from netpos.filters import ekf, filterpy_backend, imm
 from netpos.filters.measurement import GROUP
 from netpos.filters.motion import Parameter
 from netpos.filters.state import N_CORE
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking import engine
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.engine import Option
+from netpos.tracking.engine import EpochInput, FilterOptions
 from netpos.tracking.models import grown, initial_extra_sd, motions_of, options_of
 
 
@@ -123,8 +123,7 @@ class Single(OnePlace, OneModel):
     def _make_room(self, rows: int) -> None:
         n = self.mean.size
         self._rows = max(rows, self._rows)
-        self._work, self._spare = engine.scratch(n, self._rows)
-        self._accepted = np.zeros((2, self._rows))
+        self._scratch: engine.Scratch = engine.scratch(n, self._rows)
 
     @property
     def cov(self) -> Array:
@@ -132,9 +131,9 @@ class Single(OnePlace, OneModel):
 
     @property
     def prior(self) -> tuple[Array, Array]:
-        spread = self._spare[1 : self.mean.size + 1]
+        spread = self._scratch.prior_spread
         cov = engine.to_cov(spread, self._options) if self._factored else spread
-        return self._spare[0], cov
+        return self._scratch.prior_mean, cov
 
     def grow(self, sd: Array) -> None:
         if self.mean.size < N_CORE + sd.size:
@@ -152,22 +151,19 @@ class Single(OnePlace, OneModel):
     ) -> tuple[float, int, Array]:
         if len(rows) > self._rows:
             self._make_room(len(rows))
+        dt_s = (stamp_ns - self.stamp_ns) * 1e-9
+        epoch = EpochInput(dt_s, unheard_s, rejected_in_row, rows)
         nis, dof, _ = engine.step(
             self.mean,
             self._spread,
-            (stamp_ns - self.stamp_ns) * 1e-9,
-            unheard_s,
-            rejected_in_row,
-            rows,
+            epoch,
             self._motion,
             bias,
             self._options,
-            self._accepted,
-            self._work,
-            self._spare,
+            self._scratch,
         )
         self.stamp_ns = stamp_ns
-        return nis, dof, self._accepted[0, : int(rows.item(-1, GROUP)) + 1]
+        return nis, dof, self._scratch.accepted[0, : int(rows.item(-1, GROUP)) + 1]
 
     def copy(self) -> Single:
         twin = Single.__new__(Single)
@@ -183,7 +179,7 @@ class _Looks(OnePlace):
     stamp_ns: int
     mean: Array
     cov: Array
-    _options: Array
+    _options: FilterOptions
     _prior: tuple[Array, Array]
 
     def _move(self, stamp_ns: int, bias: Array) -> None:
@@ -224,14 +220,14 @@ class _Looks(OnePlace):
         self.predict(stamp_ns, bias)
         self._prior = (self.mean.copy(), self.cov.copy())
         before = tuple(part.copy() for part in self._state())
-        opened = rejected_in_row >= self._options[Option.INFLATE_AFTER]
-        speed = float(self._options[Option.INITIAL_SPEED])
+        opened = rejected_in_row >= self._options.inflate_after
+        speed = self._options.initial_speed_sd
         turn = within_s = 0.0
         if opened:
             self._open(speed, unheard_s)
         accepted = np.zeros(int(rows[-1, GROUP]) + 1)
         nis, used = self._update(rows, accepted)
-        manoeuvre = float(self._options[Option.MANOEUVRE_SPEED])
+        manoeuvre = self._options.manoeuvre_speed_sd
         if manoeuvre > 0.0 and not accepted.all():
             first = self._state()
             self._restore(before)
@@ -264,24 +260,29 @@ class Interacting(_Looks):
         self._sojourn_s = np.full(count, config.sojourn_s)
         mean, cov = grown(mean, cov, initial_extra_sd(config))
         self._prior = (mean, cov)
-        self._set_state(
-            (np.tile(mean, (count, 1)), np.tile(cov, (count, 1, 1)), np.full(count, 1.0 / count))
-        )
+        means, covs = np.tile(mean, (count, 1)), np.tile(cov, (count, 1, 1))
+        self._set_state((means, covs, np.full(count, 1.0 / count)))
+
+    @property
+    def weights(self) -> Array:
+        """Probabilities (K,) of the models."""
+        return self._models.weights
 
     def _state(self) -> tuple[Array, ...]:
-        return self._means, self._covs, self.weights
+        return self._models
 
     def _set_state(self, state: tuple[Array, ...]) -> None:
-        self._means, self._covs, self.weights = state
-        self.mean = np.empty_like(self._means[0])
-        self.cov = np.empty_like(self._covs[0])
-        imm.combine(self._means, self._covs, self.weights, self.mean, self.cov)
+        self._models = models = imm.Models(*state)
+        self.mean = np.empty_like(models.means[0])
+        self.cov = np.empty_like(models.covs[0])
+        imm.combine(models.means, models.covs, models.weights, self.mean, self.cov)
 
     def grow(self, sd: Array) -> None:
         if self.mean.size < N_CORE + sd.size:
-            pairs = [grown(m, c, sd) for m, c in zip(self._means, self._covs, strict=True)]
+            models = self._models
+            pairs = [grown(m, c, sd) for m, c in zip(models.means, models.covs, strict=True)]
             means = np.array([mean for mean, _ in pairs])
-            self._set_state((means, np.array([cov for _, cov in pairs]), self.weights))
+            self._set_state((means, np.array([cov for _, cov in pairs]), models.weights))
 
     @property
     def motion(self) -> Array:
@@ -295,31 +296,29 @@ class Interacting(_Looks):
 
     def _move(self, stamp_ns: int, bias: Array) -> None:
         dt = (stamp_ns - self.stamp_ns) * 1e-9
-        state = self._state()
-        imm.predict(*state, dt, self._motions, self._sojourn_s, bias)
+        imm.predict(self._models, dt, self._motions, self._sojourn_s, bias)
         self.stamp_ns = stamp_ns
-        self._set_state(state)
+        self._set_state(self._models)
 
     def _update(self, rows: Array, accepted: Array) -> tuple[float, int]:
-        state = self._state()
         result: tuple[float, int] = imm.update(
-            *state,
+            self._models,
             rows,
-            float(self._options[Option.HEIGHT]),
-            self._options[engine.GATE :],
-            int(self._options[Option.ITERATIONS]),
+            self._options.height_m,
+            self._options.gate_nis,
+            self._options.iterations,
             accepted,
-            engine.scratch(self.mean.size, len(rows))[0],
+            ekf.workspace(self.mean.size, len(rows)),
         )
-        self._set_state(state)
+        self._set_state(self._models)
         return result
 
     def _open(self, sd: float, unheard_s: float) -> None:
-        for cov in self._covs:
+        for cov in self._models.covs:
             engine.open_velocity(cov, sd, unheard_s, self._options)
 
     def _allow(self, within_s: float) -> None:
-        for cov in self._covs:
+        for cov in self._models.covs:
             engine.allow_manoeuvre(cov, within_s, self._options)
 
     def copy(self) -> Interacting:
@@ -364,7 +363,7 @@ class Reference(OneModel, _Looks):
         self.stamp_ns = stamp_ns
 
     def _update(self, rows: Array, accepted: Array) -> tuple[float, int]:
-        gate, height_m = self._options[engine.GATE :], float(self._options[Option.HEIGHT])
+        gate, height_m = self._options.gate_nis, self._options.height_m
         return self._update_with(self.mean, self.cov, rows, height_m, gate, accepted)
 
     def _open(self, sd: float, unheard_s: float) -> None:

@@ -19,10 +19,10 @@ from netpos.filters.measurement import (
 )
 from netpos.messages.values import Array, RsuMeasurement
 from netpos.tracking.batch import Batch, Source
-from netpos.tracking.engine import Option, is_sound
+from netpos.tracking.engine import FilterOptions, is_sound
 from netpos.tracking.health import RsuHealth
 from netpos.tracking.observations import FittedEpoch
-from netpos.tracking.protection import manoeuvre_level
+from netpos.tracking.protection import FusedEpoch, manoeuvre_level
 from netpos.tracking.rsus import Rsu
 
 AnySource = TypeVar("AnySource", bound=Source)
@@ -48,29 +48,17 @@ def row_fits(mean: Array, cov: Array, rows: Array, height_m: float) -> Array:
 
 
 @kernel
-def fits_and_level(
-    prior_mean: Array,
-    prior_cov: Array,
-    rows: Array,
-    accepted: Array,
-    unheard_s: float,
-    mean: Array,
-    cov: Array,
-    options: Array,
-    risk: float,
-    fits: Array,
-) -> float:
+def fits_and_level(epoch: FusedEpoch, cov: Array, options: FilterOptions, fits: Array) -> float:
     """``row_fits`` at the prediction, put into ``fits`` (m, 2); ``manoeuvre_level`` where there
-    may be a manoeuvre, else 0. Not a number where ``mean``, ``cov`` are not sound."""
-    if not is_sound(mean, cov):
+    may be a manoeuvre, else 0. Not a number where the posterior, of covariance ``cov`` (n, n), is
+    not sound."""
+    if not is_sound(epoch.mean, cov):
         return math.nan
-    h = np.empty(mean.size)
-    _row_fits(prior_mean, prior_cov, rows, options[Option.HEIGHT], h, fits)
-    if options[Option.MANOEUVRE_SPEED] <= 0.0:
+    h = np.empty(epoch.mean.size)
+    _row_fits(epoch.prior_mean, epoch.prior_cov, epoch.rows, options.height_m, h, fits)
+    if options.manoeuvre_speed_sd <= 0.0:
         return 0.0
-    return float(
-        manoeuvre_level(prior_mean, prior_cov, rows, accepted, unheard_s, mean, options, risk)
-    )
+    return float(manoeuvre_level(epoch, options))
 
 
 def widen(fits: Array, rows: Array, rsu: Rsu) -> None:

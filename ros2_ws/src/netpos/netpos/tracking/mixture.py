@@ -11,7 +11,6 @@ from netpos.filters.measurement import GROUP
 from netpos.filters.motion import Parameter
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.engine import GATE, Option
 from netpos.tracking.estimates import Estimate, OneModel, Single
 from netpos.tracking.models import grown, options_of
 from netpos.tracking.protection import mixture_radius
@@ -94,7 +93,7 @@ class MixtureEstimate(OneModel):
         self.predict(stamp_ns, bias)
         self._prior = (self.mean, self.cov)
         accepted = np.zeros(int(rows[-1, GROUP]) + 1)
-        height_m, gate = float(self._options[Option.HEIGHT]), self._options[GATE:]
+        height_m, gate = self._options.height_m, self._options.gate_nis
         *components, nis, dof = mixture.update(*self._components, rows, height_m, gate, accepted)
         self._set(tuple(components))
         return nis, dof, accepted

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from netpos.filters.chi_square import chi_square_bound
+from netpos.filters.conditioning import RobustOptions
 from netpos.filters.motion import (
     SPEED_OF_LIGHT_MPS,
     Model,
@@ -17,7 +18,7 @@ from netpos.filters.motion import (
 from netpos.filters.state import N_CORE, POSITION, X
 from netpos.messages.values import Array
 from netpos.tracking.config import FILTERS, ROBUST, TrackerConfig
-from netpos.tracking.engine import GATE_SIZE, Option
+from netpos.tracking.engine import GATE_SIZE, FilterOptions
 
 FILTER_ITERATIONS = {"ekf": 1, "iekf": 8}
 
@@ -29,24 +30,33 @@ def gate_thresholds(probability: float) -> Array:
     return np.array([0.0, *bounds])
 
 
-def options_of(config: TrackerConfig) -> Array:
-    """Vector of ``engine.Option``, the gate thresholds at its end."""
-    options = np.zeros(len(Option))
-    options[Option.FILTER] = FILTERS.index(config.filter)
-    options[Option.ITERATIONS] = FILTER_ITERATIONS.get(config.filter, 1)
-    options[Option.HEIGHT] = config.device_height_m
-    options[Option.INFLATE_AFTER] = config.inflate_after_epochs
-    options[Option.LOST_AFTER] = config.max_rejected_epochs
-    options[Option.INITIAL_SPEED] = config.initial_speed_sd_mps
-    options[Option.MANOEUVRE_SPEED] = config.manoeuvre_speed_sd_mps
-    options[Option.ROBUST] = ROBUST.index(config.robust)
-    options[Option.ROBUST_PARAMETER] = config.robust_parameter
-    options[Option.NLOS_PROBABILITY] = config.nlos_probability
-    options[Option.NLOS_EXCESS] = config.nlos_mean_excess_m
-    options[Option.POSITION_GAIN] = config.position_gain_min
-    options[Option.VELOCITY_GAIN] = config.velocity_gain_min
-    options[Option.ACCEL_GAIN] = config.accel_gain_min
-    return np.append(options, gate_thresholds(config.gate_probability))
+def options_of(config: TrackerConfig) -> FilterOptions:
+    """What the kernels of a planar track take of the parameters."""
+    return FilterOptions(
+        filter=FILTERS.index(config.filter),
+        iterations=FILTER_ITERATIONS.get(config.filter, 1),
+        height_m=float(config.device_height_m),
+        inflate_after=int(config.inflate_after_epochs),
+        lost_after=int(config.max_rejected_epochs),
+        initial_speed_sd=float(config.initial_speed_sd_mps),
+        manoeuvre_speed_sd=float(config.manoeuvre_speed_sd_mps),
+        integrity_risk=float(config.integrity_risk),
+        robust=robust_options_of(config),
+        gain_floor=np.array(
+            [config.position_gain_min, config.velocity_gain_min, config.accel_gain_min]
+        ),
+        gate_nis=gate_thresholds(config.gate_probability),
+    )
+
+
+def robust_options_of(config: TrackerConfig) -> RobustOptions:
+    """How the rows of a planar or spatial track are re-weighted."""
+    return RobustOptions(
+        kind=ROBUST.index(config.robust),
+        parameter=float(config.robust_parameter),
+        nlos_probability=float(config.nlos_probability),
+        nlos_excess_m=float(config.nlos_mean_excess_m),
+    )
 
 
 def motions_of(config: TrackerConfig) -> Array:

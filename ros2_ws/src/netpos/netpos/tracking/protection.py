@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from netpos.filters.manoeuvre import add_manoeuvre, unnoticed_s
 from netpos.filters.measurement import GROUP, VARIANCE, curvature_variance, innovation_row
 from netpos.filters.state import X
 from netpos.messages.values import Array
-from netpos.tracking.engine import GATE, Option
+from netpos.tracking.engine import FilterOptions
 
 _ANGLES = 16
 _COS2 = np.cos(np.linspace(0.0, np.pi / 2, _ANGLES + 1)) ** 2
@@ -194,6 +195,21 @@ class NisWindow:
 Scratch = tuple[Array, Array, Array, Array]
 
 
+class FusedEpoch(NamedTuple):
+    """An epoch that a filter has applied: prediction (n,), (n, n), rows (m, ROW_WIDTH), which
+    groups it accepted, seconds since an accepted measurement before, posterior mean (n,), NIS of
+    the accepted rows and their number."""
+
+    prior_mean: Array
+    prior_cov: Array
+    rows: Array
+    accepted: Array
+    unheard_s: float
+    mean: Array
+    nis: float
+    dof: int
+
+
 @kernel
 def level_scratch(n: int, m: int) -> Scratch:
     """Scratch memory of ``level_in`` for ``n`` states and up to ``m`` rows."""
@@ -202,57 +218,40 @@ def level_scratch(n: int, m: int) -> Scratch:
 
 
 @kernel
-def manoeuvre_level(
-    prior_mean: Array,
-    prior_cov: Array,
-    rows: Array,
-    accepted: Array,
-    unheard_s: float,
-    mean: Array,
-    options: Array,
-    risk: float,
-) -> float:
-    """Radius [m] round ``mean`` (n,) that a device leaves with probability ``risk`` if it is in a
-    manoeuvre nobody has noticed.
+def manoeuvre_level(epoch: FusedEpoch, options: FilterOptions) -> float:
+    """Radius [m] round the posterior mean that a device leaves with probability ``integrity_risk``
+    if it is in a manoeuvre nobody has noticed.
 
-    The accepted groups of ``rows`` (m, ROW_WIDTH) are applied once more to the prediction
-    ``prior_mean`` (n,), ``prior_cov`` (n, n), which allows for a manoeuvre in the time it goes
-    unnoticed: how far the two answers lie apart, and the level of the second (solution separation,
-    as receiver autonomous integrity monitoring has it). inf where there is no
-    gate, or a direction is open.
+    The accepted groups are applied once more to the prediction, which allows for a manoeuvre in
+    the time it goes unnoticed: how far the two answers lie apart, and the level of the second
+    (solution separation, as receiver autonomous integrity monitoring has it). inf where there is
+    no gate, or a direction is open.
     """
-    scratch = level_scratch(mean.size, rows.shape[0])
-    return float(
-        level_in(prior_mean, prior_cov, rows, accepted, unheard_s, mean, options, risk, scratch)
-    )
+    scratch = level_scratch(epoch.mean.size, epoch.rows.shape[0])
+    return float(level_in(epoch, options, scratch))
 
 
 @leaf
-def level_in(
-    prior_mean: Array,
-    prior_cov: Array,
-    rows: Array,
-    accepted: Array,
-    unheard_s: float,
-    mean: Array,
-    options: Array,
-    risk: float,
-    scratch: Scratch,
-) -> float:
+def level_in(epoch: FusedEpoch, options: FilterOptions, scratch: Scratch) -> float:
     """``manoeuvre_level`` in the memory of ``level_scratch``."""
-    n, height_m, speed = mean.size, options[Option.HEIGHT], options[Option.MANOEUVRE_SPEED]
+    prior_mean, prior_cov, rows, mean = epoch.prior_mean, epoch.prior_cov, epoch.rows, epoch.mean
+    n, height_m, speed = mean.size, options.height_m, options.manoeuvre_speed_sd
     x, wide, P = scratch[0][0, :n], scratch[1][0], scratch[1][1]
-    _, longest_s = unnoticed_s(prior_mean, prior_cov, rows, height_m, options[GATE + 2], speed, x)
+    gate = options.gate_nis[2]
+    _, longest_s = unnoticed_s(prior_mean, prior_cov, rows, height_m, gate, speed, x)
     if math.isinf(longest_s):
         return math.inf
     for a in range(n):
         x[a] = mean[a]
         for b in range(n):
             wide[a, b] = prior_cov[a, b]
-    add_manoeuvre(speed, max(unheard_s, longest_s), wide)
-    apply_about(x, P, prior_mean, wide, rows, accepted, height_m, scratch)
+    add_manoeuvre(speed, max(epoch.unheard_s, longest_s), wide)
+    apply_about(x, P, prior_mean, wide, rows, epoch.accepted, height_m, scratch)
     apart = math.hypot(x[X.PX] - mean[X.PX], x[X.PY] - mean[X.PY])
-    return float(apart + gaussian_radius(P[X.PX, X.PX], P[X.PX, X.PY], P[X.PY, X.PY], risk))
+    return float(
+        apart
+        + gaussian_radius(P[X.PX, X.PX], P[X.PX, X.PY], P[X.PY, X.PY], options.integrity_risk)
+    )
 
 
 @leaf

@@ -54,25 +54,35 @@ def total(refused: Mapping[str, int], rejected: Mapping[str, int]) -> dict[str, 
     return counts
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EstimateStatus:
+    """What a status says of an estimate: heard_ns, stamp of the last accepted measurement, None
+    before the first fix; sd along the worst axis and protection level [m], -1: none; modes, where
+    the device may be while that is not decided; calibration of step velocities."""
+
+    heard_ns: int | None = None
+    position_sd_m: float = 0.0
+    level_m: float = -1.0
+    modes: tuple[TrackMode, ...] = ()
+    steps: StepCalibration | None = None
+
+
+NO_ESTIMATE = EstimateStatus()
+
+
 def track_status(
     config: TrackerConfig,
     vue_id: str,
     epoch: Applied,
     accepted: int,
     rejected: dict[str, int],
-    *,
-    heard_ns: int | None = None,
-    position_sd_m: float = 0.0,
-    level_m: float = -1.0,
-    modes: tuple[TrackMode, ...] = (),
-    steps: StepCalibration | None = None,
+    estimate: EstimateStatus = NO_ESTIMATE,
 ) -> TrackStatus:
-    """Status of a track after an ``epoch``.
-
-    accepted, rejected : counts since start; heard_ns : stamp of the last accepted measurement,
-    None before the first fix; modes : where the device may be while that is not decided
-    """
-    state = track_state(config, epoch.stamp_ns, heard_ns, position_sd_m, decided=not modes)
+    """Status of a track after an ``epoch``; accepted, rejected : counts since start."""
+    modes = estimate.modes
+    state = track_state(
+        config, epoch.stamp_ns, estimate.heard_ns, estimate.position_sd_m, decided=not modes
+    )
     return TrackStatus(
         stamp_ns=epoch.stamp_ns,
         vue_id=vue_id,
@@ -83,8 +93,8 @@ def track_status(
         accepted=accepted,
         rejected=rejected,
         sources=epoch.sources,
-        position_sd_m=position_sd_m,
-        protection_level_m=level_m,
-        steps=steps or _NO_STEPS,
+        position_sd_m=estimate.position_sd_m,
+        protection_level_m=estimate.level_m,
+        steps=estimate.steps or _NO_STEPS,
         modes=modes,
     )

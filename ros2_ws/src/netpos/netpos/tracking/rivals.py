@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import copy
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -28,16 +29,23 @@ from netpos.filters.motion import Model, Parameter
 from netpos.filters.state import X
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.engine import GATE, GATE_SIZE, Option, is_sound
+from netpos.tracking.engine import GATE_SIZE, FilterOptions, is_sound
 from netpos.tracking.estimates import Estimate
 from netpos.tracking.models import motions_of, options_of
-from netpos.tracking.protection import gaussian_radius, radius_limit
+from netpos.tracking.protection import FusedEpoch, gaussian_radius, radius_limit
 from netpos.tracking.sectors import Sectors
 
 Ints = npt.NDArray[np.int64]
-State = tuple[Array, Array, Array, Ints]
-"""Means (K, n), covariances (K, n, n), log odds to the estimate (K,) (-inf: no rival there), and
-(2,) ``LEADER`` and ``BEGUN``."""
+
+
+class State(NamedTuple):
+    """The rivals of one estimate."""
+
+    means: Array  # (K, n)
+    covs: Array  # (K, n, n)
+    odds: Array  # (K,) logarithms, to the estimate; -inf: no rival there
+    marks: Ints  # (2,) ``LEADER`` and ``BEGUN``
+
 
 LEADER, BEGUN = 0, 1  # the rival to report, -1: none; stamp [ns] of the last one's beginning
 
@@ -52,7 +60,8 @@ _CERTAIN = 50.0  # log odds; more is remembered for no longer
 def no_rivals(n: int, stamp_ns: int) -> State:
     """State of ``n`` states without rivals at ``stamp_ns``."""
     marks = np.array([-1, stamp_ns])
-    return np.zeros((_COUNT, n)), np.zeros((_COUNT, n, n)), np.full(_COUNT, -math.inf), marks
+    odds = np.full(_COUNT, -math.inf)
+    return State(np.zeros((_COUNT, n)), np.zeros((_COUNT, n, n)), odds, marks)
 
 
 @leaf
@@ -65,18 +74,19 @@ def _present(odds: Array) -> bool:
 
 
 @leaf
-def _begins(stamp_ns: int, rows: Array, nis: float, dof: int, begun_ns: int) -> bool:
+def _begins(stamp_ns: int, epoch: FusedEpoch, begun_ns: int) -> bool:
     """Whether a rival begins: in an epoch of a single measurement (two tell where the device is)
     that fits badly, and from time to time, for a turn that shows in none."""
+    rows = epoch.rows
     alone = rows[0, GROUP] == rows[rows.shape[0] - 1, GROUP]
-    wanted = nis > _UNUSUAL * dof or stamp_ns - begun_ns >= _PERIOD_NS
-    return bool(alone and dof > 0 and wanted)
+    wanted = epoch.nis > _UNUSUAL * epoch.dof or stamp_ns - begun_ns >= _PERIOD_NS
+    return bool(alone and epoch.dof > 0 and wanted)
 
 
 @leaf
-def matter(stamp_ns: int, rows: Array, nis: float, dof: int, odds: Array, marks: Ints) -> bool:
+def matter(stamp_ns: int, epoch: FusedEpoch, rivals: State) -> bool:
     """Whether ``rival_level`` has anything to do."""
-    return bool(_present(odds) or _begins(stamp_ns, rows, nis, dof, marks[BEGUN]))
+    return bool(_present(rivals.odds) or _begins(stamp_ns, epoch, rivals.marks[BEGUN]))
 
 
 @kernel
@@ -84,48 +94,40 @@ def rival_level(
     level: float,
     stamp_ns: int,
     dt: float,
-    prior_mean: Array,
-    prior_cov: Array,
-    rows: Array,
-    accepted: Array,
-    unheard_s: float,
-    nis: float,
-    dof: int,
-    mean: Array,
+    epoch: FusedEpoch,
     motion: Array,
     bias: Array,
-    options: Array,
-    risk: float,
+    options: FilterOptions,
     rivals: State,
 ) -> float:
-    """Radius [m] that holds ``level``, a radius round ``mean`` (n,), and the rivals, which are
-    moved by ``dt`` seconds to ``stamp_ns``, weighed and updated in place: round the rival
-    ``LEADER`` where there is one, else round ``mean``. Other arguments as for ``manoeuvre_level``.
+    """Radius [m] that holds ``level``, a radius round the posterior mean, and the rivals, which
+    are moved by ``dt`` seconds to ``stamp_ns``, weighed and updated in place: round the rival
+    ``LEADER`` where there is one, else round that mean.
 
-    nis, dof : of the accepted rows. An inertial model has no rivals: only the estimate gets its
-    increments.
+    An inertial model has no rivals: only the estimate gets its increments.
     """
-    odds, marks = rivals[2], rivals[3]
-    present, begins = _present(odds), _begins(stamp_ns, rows, nis, dof, marks[BEGUN])
+    odds, marks, rows, risk = rivals.odds, rivals.marks, epoch.rows, options.integrity_risk
+    present, begins = _present(odds), _begins(stamp_ns, epoch, marks[BEGUN])
     if not (present or begins) or int(motion[Parameter.MODEL]) == Model.INERTIAL:
         return level
     if present:
         _move(dt, motion, bias, rivals)
-    if dof > 0:
-        kept = rows[accepted_rows(rows, accepted)]
-        surprised = _weigh(prior_mean, prior_cov, kept, options, risk, rivals)
+    if epoch.dof > 0:
+        prior_mean, prior_cov = epoch.prior_mean, epoch.prior_cov
+        kept = rows[accepted_rows(rows, epoch.accepted)]
+        surprised = _weigh(prior_mean, prior_cov, kept, options, rivals)
         if begins:
-            unusual = nis > _UNUSUAL * dof
+            unusual = epoch.nis > _UNUSUAL * epoch.dof
             since_s = min(stamp_ns - marks[BEGUN], _PERIOD_NS) * 1e-9
-            within_s = max(unheard_s, since_s)
+            within_s = max(epoch.unheard_s, since_s)
             window_s = _window_s(prior_mean, prior_cov, kept, within_s, unusual, options)
-            if _begin(prior_mean, prior_cov, kept, window_s, surprised, options, risk, rivals):
+            if _begin(prior_mean, prior_cov, kept, window_s, surprised, options, rivals):
                 marks[BEGUN] = stamp_ns
         _update(kept, options, rivals)
     if rows[0, GROUP] != rows[rows.shape[0] - 1, GROUP]:
-        _dismiss(level, mean, risk, rivals)
+        _dismiss(level, epoch.mean, risk, rivals)
     _lead(risk, odds, marks)
-    return float(_reach(level, mean, risk, rivals))
+    return float(_reach(level, epoch.mean, risk, rivals))
 
 
 @kernel
@@ -140,16 +142,16 @@ def _move(dt: float, motion: Array, bias: Array, rivals: State) -> None:
 
 
 @kernel
-def _surprised(mean: Array, cov: Array, rows: Array, options: Array) -> float:
+def _surprised(mean: Array, cov: Array, rows: Array, options: FilterOptions) -> float:
     """Minus twice the log density of ``rows``. A misfit counts as far as the gate lets it: what
     is beyond is an outlier to any."""
-    distance, size = surprise(mean, cov, rows, options[Option.HEIGHT], False)
-    return float(min(distance, options[GATE + min(rows.shape[0], GATE_SIZE - 1)]) + size)
+    distance, size = surprise(mean, cov, rows, options.height_m, False)
+    return float(min(distance, options.gate_nis[min(rows.shape[0], GATE_SIZE - 1)]) + size)
 
 
 @kernel
 def _weigh(
-    prior_mean: Array, prior_cov: Array, rows: Array, options: Array, risk: float, rivals: State
+    prior_mean: Array, prior_cov: Array, rows: Array, options: FilterOptions, rivals: State
 ) -> float:
     """Add what ``rows`` say to the odds of each rival and drop those the risk no longer counts;
     returns how surprised the estimate is."""
@@ -159,7 +161,7 @@ def _weigh(
         if odds[k] > -math.inf:
             ratio = (estimate - _surprised(means[k], covs[k], rows, options)) / 2.0
             odds[k] = min(odds[k] + ratio, _CERTAIN)
-            if not odds[k] >= math.log(risk):
+            if not odds[k] >= math.log(options.integrity_risk):
                 odds[k] = -math.inf
     return float(estimate)
 
@@ -171,14 +173,14 @@ def _window_s(
     rows: Array,
     within_s: float,
     unusual: bool,
-    options: Array,
+    options: FilterOptions,
 ) -> float:
     """Time [s] in which the turn of a new rival lies: ``within_s``, or in an unusual epoch the
     time in which one in the worst direction would show in it."""
     if not unusual:
         return within_s
-    h, speed = np.empty(prior_mean.size), options[Option.MANOEUVRE_SPEED]
-    height_m, gate = options[Option.HEIGHT], options[GATE + 2]
+    h, speed = np.empty(prior_mean.size), options.manoeuvre_speed_sd
+    height_m, gate = options.height_m, options.gate_nis[2]
     _, longest_s = unnoticed_s(prior_mean, prior_cov, rows, height_m, gate, speed, h)
     return max(within_s, longest_s if math.isfinite(longest_s) else 0.0)
 
@@ -190,19 +192,18 @@ def _begin(
     rows: Array,
     window_s: float,
     surprised: float,
-    options: Array,
-    risk: float,
+    options: FilterOptions,
     rivals: State,
 ) -> bool:
     """Begin a rival that turned in the last ``window_s``, in the place of the least likely one
     unless it is less likely still; whether it did."""
     means, covs, odds, marks = rivals
     wide = prior_cov.copy()
-    add_manoeuvre(options[Option.MANOEUVRE_SPEED], window_s, wide)
+    add_manoeuvre(options.manoeuvre_speed_sd, window_s, wide)
     ratio = (surprised - _surprised(prior_mean, wide, rows, options)) / 2.0
     fresh = math.log(_TURNS_HZ * window_s) + ratio
     least = int(np.argmin(odds))
-    if not fresh > max(odds[least], math.log(risk)):
+    if not fresh > max(odds[least], math.log(options.integrity_risk)):
         return False
     means[least], covs[least], odds[least] = prior_mean, wide, fresh
     if marks[LEADER] == least:
@@ -211,11 +212,11 @@ def _begin(
 
 
 @kernel
-def _update(rows: Array, options: Array, rivals: State) -> None:
+def _update(rows: Array, options: FilterOptions, rivals: State) -> None:
     """Fuse ``rows``, linearised once: what iterates on a wide prior is soon sure of a range no
     bearing tells."""
     means, covs, odds, _ = rivals
-    m, height_m = rows.shape[0], options[Option.HEIGHT]
+    m, height_m = rows.shape[0], options.height_m
     work, accepted = ekf.workspace(means.shape[1], m), np.empty(int(rows[m - 1, GROUP]) + 1)
     no_gate = np.full(GATE_SIZE, np.inf)
     for k in range(odds.size):
@@ -274,7 +275,7 @@ class Rivals:
     """The rivals of one track, from epoch to epoch."""
 
     def __init__(self, config: TrackerConfig) -> None:
-        self._options, self._risk = options_of(config), config.integrity_risk
+        self._options = options_of(config)
         interacting = config.motion_model == "interacting"
         self._straight = motions_of(config)[1] if interacting else None
         self._able = config.manoeuvre_speed_sd_mps > 0.0
@@ -291,29 +292,27 @@ class Rivals:
         level: float,
         stamp_ns: int,
         estimate: Estimate,
-        rows: Array,
-        accepted: Array,
-        unheard_s: float,
-        fit: tuple[float, int],
+        epoch: FusedEpoch,
         bias: Array,
     ) -> float:
-        """``rival_level`` after an epoch; ``fit``: NIS and number of the accepted rows."""
+        """``rival_level`` after an epoch of the ``estimate``."""
         dt, self._stamp_ns = (stamp_ns - self._stamp_ns) * 1e-9, stamp_ns
         if self._begun_ns < 0:
             self._begun_ns = stamp_ns
         early = stamp_ns - self._begun_ns < _PERIOD_NS
-        usual = accepted.size > 1 or (early and fit[0] <= _UNUSUAL * fit[1])
+        usual = epoch.accepted.size > 1 or (early and epoch.nis <= _UNUSUAL * epoch.dof)
         if not self._able or (usual and self._state is None):
             return level
-        mean, options, risk = estimate.mean, self._options, self._risk
-        if self._state is None or self._state[0].shape[1] != mean.size:
+        state, n = self._state, epoch.mean.size
+        if state is None or state.means.shape[1] != n:
             # anew where a bias has joined the states
-            self._state = no_rivals(mean.size, self._begun_ns)
-        epoch = (*estimate.prior, rows, accepted, unheard_s, *fit, mean, self._motion(estimate))
-        state = self._state
-        reached: float = rival_level(level, stamp_ns, dt, *epoch, bias, options, risk, state)
-        self._begun_ns = int(state[3][BEGUN])
-        if math.isinf(state[2].max()):
+            state = self._state = no_rivals(n, self._begun_ns)
+        motion = self._motion(estimate)
+        reached: float = rival_level(
+            level, stamp_ns, dt, epoch, motion, bias, self._options, state
+        )
+        self._begun_ns = int(state.marks[BEGUN])
+        if math.isinf(state.odds.max()):
             self._state = None
         return reached
 
@@ -344,5 +343,5 @@ class Rivals:
         twin = copy.copy(self)
         if self._state is not None:
             means, covs, odds, marks = self._state
-            twin._state = (means.copy(), covs.copy(), odds.copy(), marks.copy())
+            twin._state = State(means.copy(), covs.copy(), odds.copy(), marks.copy())
         return twin

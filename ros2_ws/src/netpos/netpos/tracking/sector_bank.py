@@ -11,6 +11,7 @@ below a floor, the probability that the estimate has slipped unnoticed.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,7 @@ from netpos.filters.measurement import GROUP, KIND, VALUE, VARIANCE, Kind
 from netpos.filters.sigma import innovation_cov, regress
 from netpos.messages.values import Array
 from netpos.tracking import engine
-from netpos.tracking.engine import GATE, Filter, Option
+from netpos.tracking.engine import Filter, FilterOptions
 from netpos.tracking.phase_fix import TWO_PI, admissible, nearest_turns, spawn, to_fix
 
 Ints = npt.NDArray[np.int64]
@@ -31,6 +32,23 @@ Ints = npt.NDArray[np.int64]
 _WRAPPED, _UNWRAPPED = float(Kind.PHASE), float(Kind.UNWRAPPED_PHASE)
 _WIDE_RAD = 1.0  # a filter that knows the phase less well is moved to the fix itself
 _NEGLIGIBLE = 60.0  # squared distance of a number of turns that a filter does not explain
+
+
+class Bank(NamedTuple):
+    """S slots: means (S, n), covariances or their factors (S, n, n), log weights (S,)."""
+
+    means: Array
+    spreads: Array
+    weights: Array
+
+
+class BankResult(NamedTuple):
+    """What came of an epoch in every slot: groups accepted (S, groups), NIS (S,), rows used
+    (S,)."""
+
+    accepted: Array
+    nis: Array
+    used: Array
 
 
 @kernel
@@ -71,17 +89,16 @@ def _evidence(rows: Array, innovation: Array, S: Array, gate: Array, accepted: A
 
 @kernel
 def advance(
-    means: Array,
-    spreads: Array,
-    weights: Array,
+    bank: Bank,
     dt: float,
     jump_sd: float,
     unheard_s: float,
     motion: Array,
     bias: Array,
-    options: Array,
+    options: FilterOptions,
 ) -> None:
     """Move every filter by ``dt`` seconds; ``jump_sd`` > 0 opens the velocities."""
+    means, spreads, weights = bank
     for s in range(weights.size):
         if weights[s] > -math.inf:
             engine.predict(means[s], spreads[s], dt, motion, bias, options)
@@ -90,12 +107,12 @@ def advance(
 
 
 @leaf
-def _square_root(options: Array) -> bool:
-    return bool(int(options[Option.FILTER]) == Filter.SRUKF)
+def _square_root(options: FilterOptions) -> bool:
+    return bool(options.filter == Filter.SRUKF)
 
 
 @kernel
-def _factor_of(spread: Array, options: Array) -> Array:
+def _factor_of(spread: Array, options: FilterOptions) -> Array:
     if _square_root(options):
         return spread.copy()
     L: Array = factor(spread)
@@ -104,27 +121,19 @@ def _factor_of(spread: Array, options: Array) -> Array:
 
 @kernel
 def weigh(
-    means: Array,
-    spreads: Array,
-    weights: Array,
-    rows: Array,
-    options: Array,
-    accepted: Array,
-    nis: Array,
-    used: Array,
-    work: Array,
+    bank: Bank, rows: Array, options: FilterOptions, result: BankResult, work: Array
 ) -> None:
-    """An epoch without an ambiguous phase: every filter takes the rows, weights follow.
-
-    accepted (S, groups), nis (S,), used (S,) : filled
-    """
+    """An epoch without an ambiguous phase: every filter takes the rows, weights follow; ``result``
+    is filled."""
+    means, spreads, weights = bank
+    accepted, nis, used = result
     for s in range(weights.size):
         if weights[s] == -math.inf:
             continue
         L = _factor_of(spreads[s], options)
-        innovation, G, E = regress(means[s], L, rows, options[Option.HEIGHT])
+        innovation, G, E = regress(means[s], L, rows, options.height_m)
         S = innovation_cov(G, E, rows[:, VARIANCE].copy())
-        weights[s] += _evidence(rows, innovation, S, options[GATE:], accepted[s])
+        weights[s] += _evidence(rows, innovation, S, options.gate_nis, accepted[s])
         nis[s], used[s] = engine.update(means[s], spreads[s], rows, options, accepted[s], work)
     normalise(weights, 0.0)
 
@@ -149,26 +158,24 @@ def normalise(weights: Array, floor: float) -> None:
 
 @kernel
 def resolve(
-    means: Array,
-    spreads: Array,
-    weights: Array,
+    bank: Bank,
     rows: Array,
     at: int,
-    options: Array,
+    options: FilterOptions,
     floor: float,
     heir_of: Ints,
-    accepted: Array,
-    nis: Array,
-    used: Array,
+    result: BankResult,
     work: Array,
 ) -> None:
     """An epoch whose row ``at`` is an ambiguous phase and ``at - 1`` the range of the same array.
 
     heir_of (S,) : filled with the slot each filter comes from, -1 for one that was put where the
-    measurements say; accepted (S, groups), nis (S,), used (S,) : filled
+    measurements say; result : filled
     """
+    means, spreads, weights = bank
+    accepted, nis, used = result
     rows[at, KIND] = _UNWRAPPED
-    gains, wide = _gains(means, spreads, weights, rows, at, options)
+    gains, wide = _gains(bank, rows, at, options)
     old_means, old_spreads = means.copy(), spreads.copy()
     _inherit(gains, weights, rows[at], floor, heir_of)
     nis[:], used[:], accepted[:] = 0.0, 0.0, 0.0
@@ -184,7 +191,7 @@ def resolve(
         if parent >= 0:
             means[j], spreads[j] = old_means[parent], old_spreads[parent]
             if wide[parent] > 0.0:
-                to_fix(own, at, options[Option.HEIGHT])
+                to_fix(own, at, options.height_m)
             nis[j], used[j] = engine.update(means[j], spreads[j], own, options, accepted[j], work)
         lost = parent < 0 or accepted[j, group] == 0.0
         if j != leader and lost and accepted[leader, group] == 1.0:
@@ -212,7 +219,7 @@ def _start_over(
     spread: Array,
     own: Array,
     at: int,
-    options: Array,
+    options: FilterOptions,
     accepted: Array,
     work: Array,
 ) -> bool:
@@ -225,19 +232,18 @@ def _start_over(
 
 
 @kernel
-def _gains(
-    means: Array, spreads: Array, weights: Array, rows: Array, at: int, options: Array
-) -> tuple[Array, Array]:
+def _gains(bank: Bank, rows: Array, at: int, options: FilterOptions) -> tuple[Array, Array]:
     """Log weight of every number of turns (columns) as each filter (rows) has it, (S, S); and 1
     for a filter that knows the phase too badly for a tangent, (S,)."""
-    count, gate = weights.size, options[GATE:]
+    means, spreads, weights = bank
+    count, gate = weights.size, options.gate_nis
     gains, wide = np.full((count, count), -math.inf), np.zeros(count)
     flags = np.zeros(int(rows[rows.shape[0] - 1, GROUP]) + 1)
     for i in range(count):
         if weights[i] == -math.inf:
             continue
         L = _factor_of(spreads[i], options)
-        innovation, G, E = regress(means[i], L, rows, options[Option.HEIGHT])
+        innovation, G, E = regress(means[i], L, rows, options.height_m)
         S = innovation_cov(G, E, rows[:, VARIANCE].copy())
         raw = innovation[at]
         nearest = nearest_turns(rows[at], -raw)
@@ -259,17 +265,17 @@ def _gains(
 
 @kernel
 def _fix_evidence(
-    mean: Array, L: Array, rows: Array, at: int, turns: int, options: Array
+    mean: Array, L: Array, rows: Array, at: int, turns: int, options: FilterOptions
 ) -> float:
     """Log likelihood of the rows with range and phase taken as the fix they give."""
     own = np.empty_like(rows)
     _unwrap(rows, at, turns, own)
-    if not to_fix(own, at, options[Option.HEIGHT]):
+    if not to_fix(own, at, options.height_m):
         return -math.inf
-    innovation, G, E = regress(mean, L, own, options[Option.HEIGHT])
+    innovation, G, E = regress(mean, L, own, options.height_m)
     S = innovation_cov(G, E, own[:, VARIANCE].copy())
     flags = np.zeros(int(rows[rows.shape[0] - 1, GROUP]) + 1)
-    like = _evidence(own, innovation, S, options[GATE:], flags)
+    like = _evidence(own, innovation, S, options.gate_nis, flags)
     return float(like - 0.5 * math.log(rows[at, VARIANCE] * rows[at - 1, VARIANCE]))
 
 
@@ -293,10 +299,10 @@ def _inherit(gains: Array, weights: Array, phase: Array, floor: float, heir_of: 
 
 
 @kernel
-def _put(mean: Array, spread: Array, own: Array, at: int, options: Array) -> bool:
+def _put(mean: Array, spread: Array, own: Array, at: int, options: FilterOptions) -> bool:
     """Place a filter anew where range and phase ``own[at - 1]``, ``own[at]`` say."""
     cov = srukf.covariance(spread) if _square_root(options) else spread.copy()
-    speed, height = options[Option.INITIAL_SPEED], options[Option.HEIGHT]
+    speed, height = options.initial_speed_sd, options.height_m
     if spawn(mean, cov, own[at - 1], own[at], 0, speed, height) == -math.inf:
         return False
     if _square_root(options):
@@ -312,7 +318,7 @@ def _take_rest(
     spread: Array,
     own: Array,
     group: int,
-    options: Array,
+    options: FilterOptions,
     accepted: Array,
     work: Array,
 ) -> None:
@@ -327,8 +333,9 @@ def _take_rest(
 
 
 @kernel
-def combine(means: Array, spreads: Array, weights: Array, options: Array) -> tuple[Array, Array]:
+def combine(bank: Bank, options: FilterOptions) -> tuple[Array, Array]:
     """Mean (n,) and covariance (n, n) of the whole bank."""
+    means, spreads, weights = bank
     n = means.shape[1]
     mean, cov = np.zeros(n), np.zeros((n, n))
     for s in range(weights.size):

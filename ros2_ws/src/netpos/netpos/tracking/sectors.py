@@ -7,17 +7,18 @@ import math
 
 import numpy as np
 
+from netpos.filters import ekf
 from netpos.filters.compile import leaf
 from netpos.filters.measurement import BIAS, COMMON, GROUP, KIND, Kind
 from netpos.filters.state import N_CORE, POSITION, X
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking import engine, sector_bank
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.engine import Option
 from netpos.tracking.estimates import OneModel
 from netpos.tracking.models import grown, initial_extra_sd, motions_of, options_of
 from netpos.tracking.phase_fix import TWO_PI, phase_scale, spawn
 from netpos.tracking.protection import protection_level
+from netpos.tracking.sector_bank import Bank, BankResult
 
 _DOUBT = 0.9  # a decision is taken back below this probability
 
@@ -40,6 +41,10 @@ def sectors_of(phase: Array) -> int:
     return int(2 * math.ceil(turns + 0.5) + 1)
 
 
+def _copy_of(bank: Bank) -> Bank:
+    return Bank(bank.means.copy(), bank.spreads.copy(), bank.weights.copy())
+
+
 class Sectors(OneModel):
     """Bank of filters of ``sector_bank`` with the interface of ``estimates.Estimate``.
 
@@ -55,8 +60,8 @@ class Sectors(OneModel):
         self._config = config
         self._options = options_of(config)
         self._motion: Array = motions_of(config)[0].copy()
-        self._means, self._spreads = np.zeros((slots, n)), np.zeros((slots, n, n))
-        self._weights = np.full(slots, -math.inf)
+        weights = np.full(slots, -math.inf)
+        self._bank = Bank(np.zeros((slots, n)), np.zeros((slots, n, n)), weights)
         self._heirs = np.full(slots, -1)
         self._held = -1
         self._decided = False
@@ -75,16 +80,16 @@ class Sectors(OneModel):
         mean, cov = grown(*start, initial_extra_sd(config))
         bank = cls(config, stamp_ns, sectors_of(rows[at]), mean.size)
         speed, height = config.initial_speed_sd_mps, config.device_height_m
-        half = bank._weights.size // 2
-        for s in range(bank._weights.size):
+        half = bank._bank.weights.size // 2
+        for s in range(bank._bank.weights.size):
             own, P = mean.copy(), cov.copy()
             weight = spawn(own, P, rows[at - 1], rows[at], s - half, speed, height)
             if weight > -math.inf:
-                bank._means[s], bank._weights[s] = own, weight
-                bank._spreads[s] = engine.to_spread(P, bank._options)
-        if not (bank._weights > -math.inf).any():
+                bank._bank.means[s], bank._bank.weights[s] = own, weight
+                bank._bank.spreads[s] = engine.to_spread(P, bank._options)
+        if not (bank._bank.weights > -math.inf).any():
             return None
-        sector_bank.normalise(bank._weights, 0.0)
+        sector_bank.normalise(bank._bank.weights, 0.0)
         rest = rows[rows[:, GROUP] != rows[at, GROUP]].copy()
         if len(rest):
             rest[:, GROUP] = np.unique(rest[:, GROUP], return_inverse=True)[1]
@@ -99,9 +104,9 @@ class Sectors(OneModel):
     ) -> Sectors:
         """A bank with the one estimate known so far."""
         bank = cls(config, stamp_ns, sectors_of(rows[at]), mean.size)
-        middle = bank._weights.size // 2
-        bank._means[middle], bank._weights[middle] = mean, 0.0
-        bank._spreads[middle] = engine.to_spread(cov, bank._options)
+        middle = bank._bank.weights.size // 2
+        bank._bank.means[middle], bank._bank.weights[middle] = mean, 0.0
+        bank._bank.spreads[middle] = engine.to_spread(cov, bank._options)
         bank._judge()
         return bank
 
@@ -119,8 +124,8 @@ class Sectors(OneModel):
         return tuple(
             TrackMode(
                 weight=float(weights[s]),
-                x_m=float(self._means[s, X.PX]),
-                y_m=float(self._means[s, X.PY]),
+                x_m=float(self._bank.means[s, X.PX]),
+                y_m=float(self._bank.means[s, X.PY]),
             )
             for s in np.argsort(-weights, kind="stable").tolist()
             if weights[s] > risk
@@ -129,7 +134,7 @@ class Sectors(OneModel):
     @property
     def probabilities(self) -> Array:
         """Probability of each sector (S,); they sum to one."""
-        weights: Array = np.exp(self._weights)
+        weights: Array = np.exp(self._bank.weights)
         return weights
 
     @property
@@ -147,22 +152,20 @@ class Sectors(OneModel):
     @property
     def sector(self) -> int:
         """Whole turns of the last phase in the most probable sector."""
-        return self._best - self._weights.size // 2
+        return self._best - self._bank.weights.size // 2
 
     @property
     def _best(self) -> int:
-        return int(np.argmax(self._weights))
+        return int(np.argmax(self._bank.weights))
 
     def _view(self) -> tuple[Array, Array]:
         if self._seen is None:
             if self._decided:
                 s = self._best
-                cov = engine.to_cov(self._spreads[s], self._options)
-                self._seen = self._means[s].copy(), cov.copy()
+                cov = engine.to_cov(self._bank.spreads[s], self._options)
+                self._seen = self._bank.means[s].copy(), cov.copy()
             else:
-                self._seen = sector_bank.combine(
-                    self._means, self._spreads, self._weights, self._options
-                )
+                self._seen = sector_bank.combine(self._bank, self._options)
         return self._seen
 
     def radius(self, level_m: float) -> float:
@@ -172,35 +175,36 @@ class Sectors(OneModel):
         level_m : protection level of the most probable sector alone
         """
         risk = self._config.integrity_risk
-        order = np.argsort(self._weights)
+        order = np.argsort(self._bank.weights)
         left = risk / 2.0
         radius, centre = level_m, self.mean[POSITION]
         for s in order[:-1].tolist():
-            weight = math.exp(self._weights[s])
+            weight = math.exp(self._bank.weights[s])
             left -= weight
             if left < 0.0:
-                cov = engine.to_cov(self._spreads[s], self._options)[POSITION, POSITION]
-                apart = math.hypot(*(self._means[s, POSITION] - centre))
+                cov = engine.to_cov(self._bank.spreads[s], self._options)[POSITION, POSITION]
+                apart = math.hypot(*(self._bank.means[s, POSITION] - centre))
                 radius = max(radius, apart + protection_level(cov, risk))
         return radius
 
     def grow(self, sd: Array) -> None:
         n = N_CORE + sd.size
-        if self._means.shape[1] >= n:
+        if self._bank.means.shape[1] >= n:
             return
-        means, spreads = np.zeros((self._weights.size, n)), np.zeros((self._weights.size, n, n))
-        for s in np.flatnonzero(self._weights > -math.inf).tolist():
-            cov = engine.to_cov(self._spreads[s], self._options)
-            means[s], larger = grown(self._means[s], cov, sd)
+        means, spreads = (
+            np.zeros((self._bank.weights.size, n)),
+            np.zeros((self._bank.weights.size, n, n)),
+        )
+        for s in np.flatnonzero(self._bank.weights > -math.inf).tolist():
+            cov = engine.to_cov(self._bank.spreads[s], self._options)
+            means[s], larger = grown(self._bank.means[s], cov, sd)
             spreads[s] = engine.to_spread(larger, self._options)
-        self._means, self._spreads, self._seen = means, spreads, None
+        self._bank, self._seen = Bank(means, spreads, self._bank.weights), None
 
     def _advance(self, stamp_ns: int, jump_sd: float, unheard_s: float, bias: Array) -> None:
         dt = (stamp_ns - self.stamp_ns) * 1e-9
         sector_bank.advance(
-            self._means,
-            self._spreads,
-            self._weights,
+            self._bank,
             dt,
             jump_sd,
             unheard_s,
@@ -217,106 +221,95 @@ class Sectors(OneModel):
     def step(
         self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
     ) -> tuple[float, int, Array]:
-        opened = rejected_in_row >= self._options[Option.INFLATE_AFTER]
-        speed = float(self._options[Option.INITIAL_SPEED]) if opened else 0.0
+        opened = rejected_in_row >= self._options.inflate_after
+        speed = self._options.initial_speed_sd if opened else 0.0
         at = phase_place(rows)
         if at >= 0:
             self._make_room(sectors_of(rows[at]))
         self._advance(stamp_ns, speed, unheard_s, bias)
-        before = self._means.copy(), self._spreads.copy(), self._weights.copy()
+        before = _copy_of(self._bank)
         if self._config.robust != "none" or self._config.nlos_probability > 0.0:
-            best, work = self._best, engine.scratch(self._means.shape[1], len(rows))[0]
-            engine.condition(before[0][best], before[1][best], rows, self._options, work)
+            best, work = self._best, ekf.workspace(before.means.shape[1], len(rows))
+            engine.condition(before.means[best], before.spreads[best], rows, self._options, work)
         nis, used, accepted = self._look(rows, at)
-        manoeuvre = float(self._options[Option.MANOEUVRE_SPEED])
+        manoeuvre = self._options.manoeuvre_speed_sd
         if manoeuvre > 0.0 and not accepted[self._best].all():
-            first = self._means, self._spreads, self._weights, self._heirs
-            self._means, self._spreads = before[0].copy(), before[1].copy()
-            self._weights = before[2].copy()
-            self._heirs = self._heirs.copy()
-            probable = self._means[self._best], self._spreads[self._best]
-            within_s = engine.manoeuvre_s(*probable, rows, unheard_s, self._options)
-            for s in np.flatnonzero(self._weights > -math.inf).tolist():
-                engine.allow_manoeuvre(self._spreads[s], within_s, self._options)
+            first, first_heirs = self._bank, self._heirs
+            self._bank, self._heirs = _copy_of(before), self._heirs.copy()
+            mean, spread = self._bank.means[self._best], self._bank.spreads[self._best]
+            within_s = engine.manoeuvre_s(mean, spread, rows, unheard_s, self._options)
+            for s in np.flatnonzero(self._bank.weights > -math.inf).tolist():
+                engine.allow_manoeuvre(self._bank.spreads[s], within_s, self._options)
             second = self._look(rows, at)
-            if second[2][self._best].sum() > accepted[int(np.argmax(first[2]))].sum():
+            if second[2][self._best].sum() > accepted[int(np.argmax(first.weights))].sum():
                 nis, used, accepted = second
             else:
-                self._means, self._spreads, self._weights, self._heirs = first
+                self._bank, self._heirs = first, first_heirs
         self._judge()
         best, parent = self._best, int(self._heirs[self._best])
-        means, spreads = before[:2] if parent >= 0 else (self._means, self._spreads)
-        origin = parent if parent >= 0 else best
-        self._prior = means[origin], engine.to_cov(spreads[origin], self._options)
+        bank, origin = (before, parent) if parent >= 0 else (self._bank, best)
+        self._prior = bank.means[origin], engine.to_cov(bank.spreads[origin], self._options)
         return float(nis[best]), int(used[best]), accepted[best]
 
     def _look(self, rows: Array, at: int) -> tuple[Array, Array, Array]:
         """Apply an epoch, whose phase is in row ``at``, to the predicted bank: NIS (S,), rows used
         (S,), groups accepted (S, groups). Where nothing explains it at all, it is rejected."""
-        before = self._means.copy(), self._spreads.copy(), self._weights.copy()
+        before = _copy_of(self._bank)
         nis, used, accepted = self._weigh(rows) if at < 0 else self._resolve(rows, at)
-        alive = self._weights > -math.inf
+        alive = self._bank.weights > -math.inf
         sound = alive.any() and math.isfinite(
-            self._weights[alive].sum() + self._means[alive].sum() + self._spreads[alive].sum()
+            self._bank.weights[alive].sum()
+            + self._bank.means[alive].sum()
+            + self._bank.spreads[alive].sum()
         )
         if not sound:
-            self._means, self._spreads, self._weights = before
-            self._heirs[:] = np.arange(self._weights.size)
+            self._bank = before
+            self._heirs[:] = np.arange(self._bank.weights.size)
             return np.zeros_like(nis), np.zeros_like(used), np.zeros_like(accepted)
         return nis, used, accepted
 
-    def _filled(self, rows: Array) -> tuple[Array, Array, Array, Array]:
-        """Accepted groups, NIS and rows per slot, to be filled, and scratch memory."""
-        slots, groups = self._weights.size, int(rows[-1, GROUP]) + 1
-        work = engine.scratch(self._means.shape[1], len(rows))[0]
-        return np.zeros((slots, groups)), np.zeros(slots), np.zeros(slots), work
+    def _filled(self, rows: Array) -> tuple[BankResult, Array]:
+        """A result to be filled, and scratch memory."""
+        slots, groups = self._bank.weights.size, int(rows[-1, GROUP]) + 1
+        work = ekf.workspace(self._bank.means.shape[1], len(rows))
+        return BankResult(np.zeros((slots, groups)), np.zeros(slots), np.zeros(slots)), work
 
     def _weigh(self, rows: Array) -> tuple[Array, Array, Array]:
-        accepted, nis, used, work = self._filled(rows)
-        bank = self._means, self._spreads, self._weights
-        sector_bank.weigh(*bank, rows, self._options, accepted, nis, used, work)
-        self._heirs[:] = np.arange(self._weights.size)
+        result, work = self._filled(rows)
+        sector_bank.weigh(self._bank, rows, self._options, result, work)
+        self._heirs[:] = np.arange(self._bank.weights.size)
         self._seen = None
-        return nis, used, accepted
+        return result.nis, result.used, result.accepted
 
     def _resolve(self, rows: Array, at: int) -> tuple[Array, Array, Array]:
-        accepted, nis, used, work = self._filled(rows)
-        sector_bank.resolve(
-            self._means,
-            self._spreads,
-            self._weights,
-            rows,
-            at,
-            self._options,
-            self._config.sector_slip_probability,
-            self._heirs,
-            accepted,
-            nis,
-            used,
-            work,
-        )
+        result, work = self._filled(rows)
+        slip = self._config.sector_slip_probability
+        sector_bank.resolve(self._bank, rows, at, self._options, slip, self._heirs, result, work)
         self._seen = None
-        return nis, used, accepted
+        return result.nis, result.used, result.accepted
 
     def _make_room(self, slots: int) -> None:
         """Empty slots on both sides for an array with more sectors."""
-        more = (slots - self._weights.size) // 2
+        more = (slots - self._bank.weights.size) // 2
         if more > 0:
             pad = ((more, more), (0, 0))
-            self._means = np.pad(self._means, pad)
-            self._spreads = np.pad(self._spreads, (*pad, (0, 0)))
-            self._weights = np.pad(self._weights, more, constant_values=-math.inf)
+            means, spreads = (
+                np.pad(self._bank.means, pad),
+                np.pad(self._bank.spreads, (*pad, (0, 0))),
+            )
+            weights = np.pad(self._bank.weights, more, constant_values=-math.inf)
+            self._bank = Bank(means, spreads, weights)
             self._heirs = np.pad(self._heirs, more, constant_values=-1)
             self._held += more if self._held >= 0 else 0
 
     def _judge(self) -> None:
         """Decide, keep a decision, or take it back; follow the sector held."""
-        best, probability = self._best, math.exp(self._weights[self._best])
+        best, probability = self._best, math.exp(self._bank.weights[self._best])
         if self._held >= 0 and self._heirs[best] == self._held:
             self._held = best
         elif self._held >= 0:
             heirs = np.flatnonzero(self._heirs == self._held)
-            self._held = int(heirs[np.argmax(self._weights[heirs])]) if heirs.size else -2
+            self._held = int(heirs[np.argmax(self._bank.weights[heirs])]) if heirs.size else -2
         if probability >= self._config.sector_probability:
             if self._held not in (-1, best):
                 self.corrected += 1
@@ -327,7 +320,6 @@ class Sectors(OneModel):
 
     def copy(self) -> Sectors:
         twin = copy.copy(self)
-        twin._means, twin._spreads = self._means.copy(), self._spreads.copy()
-        twin._weights, twin._heirs = self._weights.copy(), self._heirs.copy()
+        twin._bank, twin._heirs = _copy_of(self._bank), self._heirs.copy()
         twin._motion = self._motion.copy()
         return twin

@@ -22,17 +22,10 @@ from netpos.filters.space import SpaceKind
 from netpos.filters.state import Nav
 from netpos.inertial.strapdown import ERR, NAV
 from netpos.messages.values import Array
+from netpos.tracking.engine import Epochs
 
 Ints = NDArray[np.int64]
 _PLACE = int(SpaceKind.PLACE)
-
-
-class Epochs(NamedTuple):
-    """stamps_ns (N,) of the epochs and the rows of each: rows[row_start[i] : row_start[i + 1]]."""
-
-    stamps_ns: Ints
-    row_start: Ints  # (N + 1,)
-    rows: Array  # (M, ROW_WIDTH)
 
 
 class Drive(NamedTuple):

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from netpos.filters.error_state import (
     MEMORY,
+    Chunk,
     Imu,
     Sensors,
     correct,
@@ -31,7 +32,7 @@ from netpos.filters.measurement import GROUP
 from netpos.filters.state import ERR_BIASES
 from netpos.inertial.strapdown import ACCEL_BIAS, ATTITUDE_ERR, QUATERNION, inject
 from netpos.messages.values import Array
-from netpos.tracking.strapdown_engine import Epochs
+from netpos.tracking.engine import Epochs
 from netpos.tracking.strapdown_models import grown_in_space
 
 
@@ -77,13 +78,13 @@ class Recorder:
         sensors: Sensors,
     ) -> None:
         """``error_state.advance``, recorded."""
-        chunk, now = np.empty(7), from_ns
+        now = from_ns
         while now < to_ns:
-            Phi = np.empty(cov.shape)
-            now, blind_s = predict_chunk(nav, cov, memory, now, to_ns, imu, sensors, Phi, chunk)
-            predicted = (nav.copy(), cov.copy(), Phi)
+            chunk = Chunk(np.empty(7), np.empty(cov.shape))
+            now, blind_s = predict_chunk(nav, cov, memory, now, to_ns, imu, sensors, chunk)
+            predicted = (nav.copy(), cov.copy(), chunk.transition)
             if blind_s == 0.0:
-                hold(nav, cov, memory, sensors, chunk)
+                hold(nav, cov, memory, sensors, chunk.mean)
             self._passages[-1].append(Instant(now, nav.copy(), cov.copy(), predicted))
 
     def note(self, nav: Array, cov: Array, rate: Array | None, bias_sd: Array) -> None:

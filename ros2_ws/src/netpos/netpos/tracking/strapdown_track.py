@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from netpos.filters.conditioning import Robust
 from netpos.filters.error_state import MEMORY, Imu, Sensors, advance, correct, doubt_standstill
 from netpos.filters.measurement import GROUP, KIND, VARIANCE, Kind
 from netpos.filters.space import SpaceKind, place_rows
@@ -25,14 +26,14 @@ from netpos.messages.values import Array, InitialPose, Odometry, RsuMeasurement
 from netpos.tracking import output
 from netpos.tracking.batch import Batch, mostly_accepted
 from netpos.tracking.blockage import Blockage
-from netpos.tracking.config import ROBUST, TrackerConfig
+from netpos.tracking.config import TrackerConfig
 from netpos.tracking.fit import observe_isolated, with_refused, without_isolated
 from netpos.tracking.health import RsuHealth
 from netpos.tracking.history import History, merge
-from netpos.tracking.models import gate_thresholds
+from netpos.tracking.models import gate_thresholds, robust_options_of
 from netpos.tracking.observations import FittedEpoch
 from netpos.tracking.protection import NisWindow, protection_level
-from netpos.tracking.report import Applied, TrackOutput, total, track_status
+from netpos.tracking.report import Applied, EstimateStatus, TrackOutput, total, track_status
 from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sequencer import Epoch, Item
 from netpos.tracking.strapdown_engine import compile_kernels
@@ -93,10 +94,7 @@ def warm_up(config: TrackerConfig) -> None:
     rows = place_rows(np.zeros(3), np.eye(3), (0.0, 0.0, 0.0))
     fits_in_space(rows, nav, cov)
     if config.robust != "none" or config.nlos_probability > 0.0:
-        condition_in_space(
-            nav, cov, rows, ROBUST.index(config.robust), config.robust_parameter,
-            config.nlos_probability, config.nlos_mean_excess_m,
-        )  # fmt: skip
+        condition_in_space(nav, cov, rows, robust_options_of(config))
 
 
 def track_of(
@@ -130,7 +128,7 @@ class StrapdownTrack:
         self._sensors = sensors_of(config)
         self._gate = gate_thresholds(config.gate_probability)
         self._gyro = config.gyro_noise_density
-        self._robust = ROBUST.index(config.robust)
+        self._robust = robust_options_of(config)
         self._history: History[_State] = History(int(config.history_s * 1e9))
         self.recorder: Recorder | None = None
         """Where what a smoother needs is kept; None: nowhere."""
@@ -256,12 +254,8 @@ class StrapdownTrack:
 
     def _condition(self, batch: Batch, nav: Array, cov: Array) -> None:
         """Re-weight the rows of an epoch as the robust options say."""
-        cfg = self._config
-        if self._robust or cfg.nlos_probability > 0.0:
-            condition_in_space(
-                nav, cov, batch.rows, self._robust, cfg.robust_parameter, cfg.nlos_probability,
-                cfg.nlos_mean_excess_m,
-            )  # fmt: skip
+        if self._robust.kind != Robust.NONE or self._robust.nlos_probability > 0.0:
+            condition_in_space(nav, cov, batch.rows, self._robust)
 
     def _note_accepted(self, stamp_ns: int, batch: Batch, accepted: Array) -> tuple[str, ...]:
         state, sources = self._state, []
@@ -380,10 +374,8 @@ class StrapdownTrack:
             self._config,
             self._vue_id,
             epoch,
-            accepted=state.accepted,
-            rejected=total(self.refused, state.rejected),
-            heard_ns=heard_ns,
-            position_sd_m=position_sd,
-            level_m=level,
+            state.accepted,
+            total(self.refused, state.rejected),
+            EstimateStatus(heard_ns=heard_ns, position_sd_m=position_sd, level_m=level),
         )
         return TrackOutput(odometry, clock, status)

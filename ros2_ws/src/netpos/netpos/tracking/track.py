@@ -16,7 +16,6 @@ from netpos.tracking import estimates, output
 from netpos.tracking.batch import Batch, Source, batch_of, mostly_accepted, velocity_inflation
 from netpos.tracking.blockage import Blockage
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.engine import GATE
 from netpos.tracking.estimates import Estimate
 from netpos.tracking.fit import (
     fits_and_level,
@@ -35,7 +34,8 @@ from netpos.tracking.models import heading_index, initial_extra_sd, options_of, 
 from netpos.tracking.networks.secondary import Secondary
 from netpos.tracking.observations import FittedEpoch
 from netpos.tracking.phase_start import PhaseStart, corrections, with_sectors
-from netpos.tracking.report import Applied, TrackOutput, total, track_status
+from netpos.tracking.protection import FusedEpoch
+from netpos.tracking.report import Applied, EstimateStatus, TrackOutput, total, track_status
 from netpos.tracking.rivals import Rivals
 from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sequencer import Epoch, Item
@@ -62,7 +62,7 @@ class Track:
         self._rsus = rsus
         self._health = health or RsuHealth()
         self._options = options_of(config)
-        self._gate = self._options[GATE:]
+        self._gate = self._options.gate_nis
         self._extra_sd = initial_extra_sd(config)
         self._heading = heading_index(config)
         self._use_imu, self._calibrates_steps = config.use_imu, config.calibrates_steps
@@ -304,18 +304,19 @@ class Track:
         estimate is not sound; ``flags`` (groups,) and ``accepted`` are the same."""
         state, fits = self._state, np.empty((len(batch.rows), 2))
         assert state.estimate is not None
-        estimate, risk = state.estimate, self._config.integrity_risk
-        fitted = batch.rows, flags, (stamp_ns - state.last_accepted_ns) * 1e-9
-        unnoticed_m = fits_and_level(
-            *estimate.prior, *fitted, estimate.mean, estimate.cov, self._options, risk, fits
+        estimate, (prior_mean, prior_cov) = state.estimate, state.estimate.prior
+        unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
+        fused = FusedEpoch(
+            prior_mean, prior_cov, batch.rows, flags, unheard_s, estimate.mean, nis, dof
         )
+        unnoticed_m: float = fits_and_level(fused, estimate.cov, self._options, fits)
         if math.isnan(unnoticed_m):
             return False
         state.unnoticed_m = unnoticed_m
         alone = len(accepted) == 1 and not isinstance(estimate, MixtureEstimate)
         if state.rivals.present or alone:
             state.unnoticed_m = state.rivals.level(
-                unnoticed_m, stamp_ns, estimate, *fitted, (nis, dof), state.bias
+                unnoticed_m, stamp_ns, estimate, fused, state.bias
             )
         nis, dof = with_refused(batch, accepted, self._gate, nis, dof)
         if math.isfinite(nis):
@@ -379,17 +380,14 @@ class Track:
             self._heading,
             config.integrity_risk,
         )
-        status = track_status(
-            config,
-            self._vue_id,
-            epoch,
-            *counts,
+        known = EstimateStatus(
             heard_ns=state.last_accepted_ns,
             position_sd_m=sd_m,
             level_m=self._level(epoch.stamp_ns, estimate, radius_m),
             modes=estimate.modes,
             steps=state.biases.step_calibration(mean, cov) if self._calibrates_steps else None,
         )
+        status = track_status(config, self._vue_id, epoch, *counts, known)
         track = None
         if self._secondary is not None:
             track = self._secondary.track(state.own, state.segment, estimate, state.bias)

@@ -11,6 +11,7 @@ from netpos.filters.rows import linear_rows
 from netpos.messages.values import Field, GroundSpeed, InitialPose, RsuInfo, RsuMeasurement
 from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.protection import FusedEpoch
 from netpos.tracking.rivals import Rivals
 from netpos.tracking.tracker import Tracker
 
@@ -105,5 +106,6 @@ def _rivals() -> None:
     estimate = estimates.start(config, 0, np.zeros(6), np.eye(6))
     rows = linear_rows(np.full(2, 4.0), np.eye(2), np.eye(6)[:2], 0)
     _, dof, accepted = estimate.step(stamp_ns, interval_s, 0, rows, NO_BIAS)
-    epoch = stamp_ns, estimate, rows, accepted, interval_s, (99.0, dof)
-    Rivals(config).level(1.0, *epoch, NO_BIAS)
+    mean, cov = estimate.prior
+    epoch = FusedEpoch(mean, cov, rows, accepted, interval_s, estimate.mean, 99.0, dof)
+    Rivals(config).level(1.0, stamp_ns, estimate, epoch, NO_BIAS)

@@ -34,7 +34,7 @@ def passes(mean: Array, cov: Array, rows: Array, threshold: float, iterations: i
     work[fusion.W_GATE_VARIANCE, :m] = rows[:, GATE_VARIANCE]
     work[fusion.W_COV + n : fusion.W_COV + n + m, :n] = H
     work[fusion.W_COV + n + m : fusion.W_COV + n + 2 * m, :n] = H @ cov
-    return bool(ekf._passes(mean, cov, rows, 0, m, 0.0, threshold, iterations, work))
+    return bool(ekf._passes(mean, cov, rows, (0, m), 0.0, threshold, iterations, work))
 
 
 def curved_group() -> tuple[Array, Array, Array]:

@@ -10,6 +10,7 @@ from netpos.filters.error_state import (
     LAST,
     MEMORY,
     UNCONSTRAINED,
+    Chunk,
     Constraints,
     Imu,
     Sensors,
@@ -51,7 +52,7 @@ def chunk_of(
     imu = Imu(np.array(stamps_ms, dtype=np.int64) * MS, rates)
     end, blind_s = predict_chunk(
         resting(), np.eye(ERR), memory, from_ms * MS, to_ms * MS, imu, SENSORS,
-        np.full((ERR, ERR), np.nan), chunk,
+        Chunk(chunk, np.full((ERR, ERR), np.nan)),
     )  # fmt: skip
     return end / MS, blind_s * 1e3, chunk, memory[:LAST]
 
@@ -126,11 +127,11 @@ def test_without_samples_a_tilted_vehicle_goes_on_as_it_was(samples: int) -> Non
 def test_a_chunk_without_samples_is_trusted_less(stamps_ms: range, blind: bool) -> None:
     """The noise is that of the IMU, or of a hole; the biases wander as they always do."""
     cov = np.diag(np.repeat([1.0, 0.1, 0.01, 1e-3, 1e-5], 3))
-    Phi, chunk, before = np.empty((ERR, ERR)), np.empty(7), cov.copy()
+    chunk, before = Chunk(np.empty(7), np.empty((ERR, ERR))), cov.copy()
     imu = Imu(np.array(stamps_ms, dtype=np.int64) * MS, np.ones((len(stamps_ms), 6)))
-    predict_chunk(resting(), cov, np.zeros(MEMORY), 0, 100 * MS, imu, SENSORS, Phi, chunk)
+    predict_chunk(resting(), cov, np.zeros(MEMORY), 0, 100 * MS, imu, SENSORS, chunk)
     taken = InertialNoise(*BLIND, *NOISE[2:]) if blind else NOISE
-    propagate(before, Phi, 0.1, taken)
+    propagate(before, chunk.transition, 0.1, taken)
     np.testing.assert_allclose(cov, before, rtol=1e-12, atol=1e-18)
 
 

@@ -59,8 +59,8 @@ def test_linear_track_equals_filterpy(row: Maker, random_cov: Maker) -> None:
     for step in range(40):
         z = np.array([0.8 * step + rng.normal(), (step > 20) * 3.0 * (step - 20) + rng.normal()])
         rows = np.array([row(Kind.LINEAR, z[i], R[i, i], 0, h=H[i]) for i in range(2)])
-        imm.predict(means, covs, weights, dt, motions, sojourn_s, NO_BIAS)
-        imm.update(means, covs, weights, rows, 0.0, OPEN, 1, accepted, work)
+        imm.predict(imm.Models(means, covs, weights), dt, motions, sojourn_s, NO_BIAS)
+        imm.update(imm.Models(means, covs, weights), rows, 0.0, OPEN, 1, accepted, work)
         imm.combine(means, covs, weights, mean, cov)
         reference.predict()
         reference.update(z)
@@ -165,19 +165,21 @@ def test_one_decision_for_all_models(row: Maker) -> None:
     weights, accepted, work = np.array([0.5, 0.5]), np.full(2, 9.0), ekf.workspace(6, 2)
     gate_nis = np.array([0.0, 9.0])
     before = means.copy()
-    nis, dof = imm.update(means, covs, weights, rows, 0.0, gate_nis, 1, accepted, work)
+    nis, dof = imm.update(imm.Models(means, covs, weights), rows, 0.0, gate_nis, 1, accepted, work)
     assert accepted.tolist() == [1.0, 0.0]
     assert (nis, dof) == (pytest.approx(0.0, abs=1e-12), 1)
     np.testing.assert_allclose(means[:, X.PX], [-5.0, 5.0], rtol=1e-12)
     assert (means[:, 1:] == before[:, 1:]).all()
     before, before_covs = means.copy(), covs.copy()
-    result = imm.update(means, covs, weights, rows[1:], 0.0, gate_nis, 1, accepted, work)
+    result = imm.update(
+        imm.Models(means, covs, weights), rows[1:], 0.0, gate_nis, 1, accepted, work
+    )
     assert result == (0.0, 0)
     assert accepted[1] == 0.0
     assert (means == before).all()
     assert (covs == before_covs).all()
     assert weights.tolist() == [0.5, 0.5]
-    imm.predict(means, covs, weights, 0.0, np.zeros((2, 16)), np.ones(2), NO_BIAS)
+    imm.predict(imm.Models(means, covs, weights), 0.0, np.zeros((2, 16)), np.ones(2), NO_BIAS)
     assert (means == before).all()
 
 
@@ -252,8 +254,8 @@ def test_stop_straight_turn(seed: int, row: Maker) -> None:
     weights, accepted, work = np.full(3, 1 / 3), np.zeros(1), ekf.workspace(7, 2)
     mean, cov, errors, leader = np.empty(7), np.empty((7, 7)), [], []
     for rows, p in zip(epochs, truth, strict=True):
-        imm.predict(means, covs, weights, DT, motions, sojourn_s, NO_BIAS)
-        imm.update(means, covs, weights, rows, 0.0, OPEN, 1, accepted, work)
+        imm.predict(imm.Models(means, covs, weights), DT, motions, sojourn_s, NO_BIAS)
+        imm.update(imm.Models(means, covs, weights), rows, 0.0, OPEN, 1, accepted, work)
         imm.combine(means, covs, weights, mean, cov)
         errors.append(np.sum((mean[POSITION] - p) ** 2))
         leader.append(int(np.argmax(weights)))

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from netpos.filters import ekf
-from netpos.filters.conditioning import Robust, condition
+from netpos.filters.conditioning import Robust, RobustOptions, condition
 from netpos.filters.measurement import AXES, BLOCKED, GROUP, HEADING, KIND, ROW_WIDTH, VALUE, Kind
 from netpos.filters.space_conditioning import condition_in_space
 from netpos.filters.state import ERR_BIASES, Err, Nav, X
@@ -48,9 +47,9 @@ def test_in_the_plane_it_is_the_planar_one(weights: Robust, late: tuple[float, f
         [(Kind.RANGE, 0.1), (Kind.TOA, 9.0), (Kind.RANGE, 4.0), (Kind.AZIMUTH, 0.2)], 55.0
     )
     planar, spatial = rows.copy(), rows.copy()
-    work = ekf.workspace(6, len(rows))
-    condition(mean, cov, planar, 0.0, int(weights), 2.0, *late, work)
-    condition_in_space(nav, wide, spatial, int(weights), 2.0, *late)
+    options = RobustOptions(int(weights), 2.0, *late)
+    condition(mean, cov, planar, 0.0, options, np.empty(6))
+    condition_in_space(nav, wide, spatial, options)
     np.testing.assert_allclose(spatial, planar, rtol=1e-9)
     changed = not np.array_equal(planar, rows)
     assert changed is (weights is not Robust.NONE or late == LATE)

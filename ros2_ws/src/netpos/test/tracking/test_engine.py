@@ -23,7 +23,7 @@ from netpos.filters.state import POSITION, VELOCITY, X
 from netpos.messages.values import Array, Field, InitialPose, RsuInfo, RsuMeasurement
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking import Tracker, TrackerConfig, engine
-from netpos.tracking.engine import GATE, Option
+from netpos.tracking.engine import EpochInput, Epochs, FilterOptions, Run
 from netpos.tracking.models import motions_of, options_of, pose_state
 
 STATIONS = [
@@ -52,15 +52,17 @@ def rows_of(state: Array, rng: np.random.Generator, wrong: tuple[int, ...] = ())
     return np.vstack(blocks)
 
 
-def turned(mean: Array, cov: Array, rows: Array, unheard_s: float, options: Array) -> Array:
+def turned(
+    mean: Array, cov: Array, rows: Array, unheard_s: float, options: FilterOptions
+) -> Array:
     """The mean over all times at which a manoeuvre may have begun: since the last accepted
     measurement, or twice as long as one goes unnoticed on average over its directions."""
     _, H = linearise(rows, mean, 0.0)
     S = np.einsum("ia,ab,ib->i", H, cov, H) + rows[:, GATE_VARIANCE]
     S += [curvature_variance(row, mean, cov, 0.0) for row in rows]
     information = (H[:, :2].T / S) @ H[:, :2]
-    sd = options[Option.MANOEUVRE_SPEED]
-    noticed_s = math.sqrt(options[GATE + 2] / (np.trace(information) / 2.0)) / sd
+    sd = options.manoeuvre_speed_sd
+    noticed_s = math.sqrt(options.gate_nis[2] / (np.trace(information) / 2.0)) / sd
     within_s = max(unheard_s, 2.0 * noticed_s)
     if sd**2 <= np.trace(cov[VELOCITY, VELOCITY]) / 2.0:  # no manoeuvre
         within_s = unheard_s
@@ -70,13 +72,12 @@ def turned(mean: Array, cov: Array, rows: Array, unheard_s: float, options: Arra
 
 
 def look(
-    mean: Array, cov: Array, rows: Array, options: Array
+    mean: Array, cov: Array, rows: Array, options: FilterOptions
 ) -> tuple[Array, Array, float, int, Array]:
     x, P, accepted = mean.copy(), cov.copy(), np.zeros(int(rows[-1, GROUP]) + 1)
     work = ekf.workspace(len(x), len(rows))
-    iterations = int(options[Option.ITERATIONS])
-    height = float(options[Option.HEIGHT])
-    nis, used = ekf.update(x, P, rows, height, options[GATE:], iterations, accepted, work)
+    height, gate = options.height_m, options.gate_nis
+    nis, used = ekf.update(x, P, rows, height, gate, options.iterations, accepted, work)
     return x, P, nis, used, accepted
 
 
@@ -88,7 +89,7 @@ def plain_step(
     rejected: int,
     rows: Array,
     motion: Array,
-    options: Array,
+    options: FilterOptions,
     allowed: Array | None = None,
 ) -> tuple[Array, Array, float, int, Array]:
     """The rules: predict; open after too many rejected epochs; re-weight what is to be; a second
@@ -98,13 +99,12 @@ def plain_step(
     prior, prior_cov = mean.copy(), cov.copy()
     ekf.predict(prior, prior_cov, dt, motion, NO_BIAS)
     P = prior_cov
-    if rejected >= options[Option.INFLATE_AFTER]:
-        P = opened(P, options[Option.INITIAL_SPEED], unheard_s)
+    if rejected >= options.inflate_after:
+        P = opened(P, options.initial_speed_sd, unheard_s)
     rows, work = rows.copy(), ekf.workspace(len(mean), len(rows))
-    robust, *weights = options[Option.ROBUST : Option.POSITION_GAIN].tolist()
-    conditioning.condition(prior, P, rows, 0.0, int(robust), *weights, work)
+    conditioning.condition(prior, P, rows, 0.0, options.robust, work[0])
     best = look(prior, P, rows, options)
-    sd = options[Option.MANOEUVRE_SPEED]
+    sd = options.manoeuvre_speed_sd
     if sd > 0.0 and not best[4].all():
         wide = P + turned(prior, prior_cov, rows, unheard_s, options) - prior_cov
         second = look(prior, wide, rows, options)
@@ -125,16 +125,14 @@ def compiled_step(
     rejected: int,
     rows: Array,
     motion: Array,
-    options: Array,
+    options: FilterOptions,
 ) -> tuple[Array, Array, float, int, Array]:
     x, S = mean.copy(), engine.to_spread(cov, options)
-    work, spare = engine.scratch(6, len(rows))
-    accepted = np.zeros((2, 3))
-    nis, used, taken = engine.step(
-        x, S, dt, unheard_s, rejected, rows, motion, NO_BIAS, options, accepted, work, spare
-    )
-    assert taken == accepted[0].sum()
-    return x, engine.to_cov(S, options), nis, used, accepted[0]
+    scratch, epoch = engine.scratch(6, len(rows)), EpochInput(dt, unheard_s, rejected, rows)
+    result = engine.step(x, S, epoch, motion, NO_BIAS, options, scratch)
+    accepted = scratch.accepted[0, :3]
+    assert result.groups == accepted.sum()
+    return x, engine.to_cov(S, options), result.nis, result.used, accepted
 
 
 CASES = {
@@ -205,22 +203,13 @@ def drive(epochs: int = 60) -> tuple[Array, Array, Array]:
     return np.array(stamps), np.array(starts), np.vstack(blocks)
 
 
-def run(config: TrackerConfig, mean: Array, cov: Array, inputs: Any) -> tuple[int, Any]:
+def run(config: TrackerConfig, mean: Array, cov: Array, inputs: Any) -> tuple[int, Run]:
     stamps, starts, rows = inputs
     N, n = len(stamps), len(mean)
-    out = tuple(np.full(shape, np.nan) for shape in ((N, n), (N, n, n), N, N, N))
-    before = rows.copy()
-    done = engine.run_epochs(
-        stamps,
-        starts,
-        rows,
-        mean,
-        cov,
-        motions_of(config)[0],
-        NO_BIAS,
-        options_of(config),
-        *out,
-    )
+    out = Run(*(np.full(shape, np.nan) for shape in ((N, n), (N, n, n), N, N, N)))
+    before, motion = rows.copy(), motions_of(config)[0]
+    epochs = Epochs(stamps, starts, rows)
+    done = engine.run_epochs(epochs, mean, cov, motion, NO_BIAS, options_of(config), out)
     np.testing.assert_array_equal(rows, before)
     return done, out
 

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from netpos.filters.conditioning import RobustOptions
 from netpos.filters.motion import Model, Parameter, ProcessNoise
 from netpos.filters.state import POSITION
 from netpos.tracking.config import FILTERS, ROBUST, TrackerConfig
-from netpos.tracking.engine import GATE, GATE_SIZE, Filter, Option
+from netpos.tracking.engine import GATE_SIZE, Filter, FilterOptions
 from netpos.tracking.models import (
     FILTER_ITERATIONS,
     gate_thresholds,
@@ -27,8 +28,8 @@ def test_every_filter_has_its_place_in_the_engine() -> None:
     assert [f.name.lower() for f in Filter] == list(FILTERS)
     for place, name in enumerate(FILTERS):
         options = options_of(TrackerConfig(filter=name))
-        assert options[Option.FILTER] == place
-        assert options[Option.ITERATIONS] == FILTER_ITERATIONS.get(name, 1)
+        assert options.filter == place
+        assert options.iterations == FILTER_ITERATIONS.get(name, 1)
 
 
 def test_options_hold_what_the_parameters_say() -> None:
@@ -47,12 +48,34 @@ def test_options_hold_what_the_parameters_say() -> None:
         velocity_gain_min=0.3,
         accel_gain_min=0.4,
         gate_probability=0.99,
+        integrity_risk=1e-5,
     )
     options = options_of(config)
-    values = [3, 1, 1.5, 3, 14, 6.5, 7.5, ROBUST.index("student_t"), 5.5, 0.1, 33, 0.2, 0.3, 0.4]
-    assert options[:GATE].tolist() == values
-    np.testing.assert_array_equal(options[GATE:], gate_thresholds(0.99))
-    assert len(options) == GATE + GATE_SIZE
+    expected = FilterOptions(
+        filter=3,
+        iterations=1,
+        height_m=1.5,
+        inflate_after=3,
+        lost_after=14,
+        initial_speed_sd=6.5,
+        manoeuvre_speed_sd=7.5,
+        integrity_risk=1e-5,
+        robust=RobustOptions(ROBUST.index("student_t"), 5.5, 0.1, 33.0),
+        gain_floor=options.gain_floor,
+        gate_nis=options.gate_nis,
+    )
+    assert options == expected
+    assert options.gain_floor.tolist() == [0.2, 0.3, 0.4]
+    np.testing.assert_array_equal(options.gate_nis, gate_thresholds(0.99))
+    assert len(options.gate_nis) == GATE_SIZE
+
+
+def test_options_have_one_signature_whatever_the_user_writes() -> None:
+    """Whole numbers for real ones would compile every kernel once more."""
+    whole = TrackerConfig(device_height_m=1, manoeuvre_speed_sd_mps=2, nlos_mean_excess_m=30)
+    kinds = [[type(value) for value in o] for o in map(options_of, (whole, TrackerConfig()))]
+    assert kinds[0] == kinds[1]
+    assert [type(v) for v in options_of(whole).robust] == [int, float, float, float]
 
 
 @pytest.mark.parametrize("probability", [0.5, 0.95, 0.9999])

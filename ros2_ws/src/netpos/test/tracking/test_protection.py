@@ -24,11 +24,12 @@ from netpos.filters.rows import linear_rows, rsu_axes, rsu_rows
 from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking import TrackerConfig
-from netpos.tracking.engine import GATE, Option
+from netpos.tracking.engine import FilterOptions
 from netpos.tracking.fit import fits_and_level, row_fits
 from netpos.tracking.models import options_of
 from netpos.tracking.protection import (
     RISK_MIN,
+    FusedEpoch,
     NisWindow,
     gaussian_radius,
     gaussian_tail,
@@ -253,10 +254,18 @@ def test_a_manoeuvre_is_noticed_where_the_gate_begins_to_refuse() -> None:
     assert wider[1] > longest
 
 
-def options(gate_probability: float = 0.9999, speed: float = 4.0) -> Array:
+def options(gate_probability: float = 0.9999, speed: float = 4.0) -> FilterOptions:
     return options_of(
-        TrackerConfig(gate_probability=gate_probability, manoeuvre_speed_sd_mps=speed)
+        TrackerConfig(
+            gate_probability=gate_probability, manoeuvre_speed_sd_mps=speed, integrity_risk=1e-4
+        )
     )
+
+
+def fused(
+    prior: Array, cov: Array, rows: Array, accepted: Array, unheard_s: float, mean: Array
+) -> FusedEpoch:
+    return FusedEpoch(prior, cov, rows, accepted, unheard_s, mean, 0.0, 0)
 
 
 @pytest.mark.parametrize("unheard_s", [0.1, 5.0])
@@ -282,7 +291,7 @@ def test_level_of_a_manoeuvre_is_a_second_answer_and_how_far_it_is(unheard_s: fl
     expected = np.linalg.norm(x[POSITION] - mean[POSITION]) + protection_level(
         P[POSITION, POSITION], 1e-4
     )
-    level = manoeuvre_level(prior, cov, rows, accepted, unheard_s, mean, options(), 1e-4)
+    level = manoeuvre_level(fused(prior, cov, rows, accepted, unheard_s, mean), options())
     assert level == pytest.approx(expected, rel=1e-6)
 
 
@@ -297,8 +306,8 @@ def test_level_of_a_manoeuvre_with_biases_that_tell_nothing() -> None:
         mean[:6], P[:6, :6] = prior, cov
         state = mean.copy()
         state[POSITION] += 0.7, -0.4
-        args = (mean, P, rows, np.ones(2), 0.3, state, options(), 1e-4)
-        levels.append(manoeuvre_level(*args))
+        epoch = fused(mean, P, rows, np.ones(2), 0.3, state)
+        levels.append(manoeuvre_level(epoch, options()))
         assert np.array_equal(mean[:6], prior)
         assert np.array_equal(P[:6, :6], cov)
     assert levels[0] == pytest.approx(levels[1], rel=1e-9)
@@ -316,8 +325,8 @@ def test_level_of_a_manoeuvre_is_linearised_at_its_own_answer() -> None:
             filter_rows.row(Kind.RANGE, 90.0, 0.3, 2, (0.0, 0.0, 3.0)),
         ]
     )
-    accepted, mean, height_m = np.array([1.0, 1.0, 0.0]), prior + 0.4, said[Option.HEIGHT]
-    _, longest_s = unnoticed_s(prior, cov, rows, height_m, said[GATE + 2], 4.0, np.empty(6))
+    accepted, mean, height_m = np.array([1.0, 1.0, 0.0]), prior + 0.4, said.height_m
+    _, longest_s = unnoticed_s(prior, cov, rows, height_m, said.gate_nis[2], 4.0, np.empty(6))
     nodes, weights = np.polynomial.legendre.leggauss(3)
     times_s = longest_s * (nodes + 1.0) / 2.0
     wide = sum(w / 2.0 * opened(cov, 4.0, s) for s, w in zip(times_s, weights, strict=True))
@@ -332,7 +341,7 @@ def test_level_of_a_manoeuvre_is_linearised_at_its_own_answer() -> None:
     expected = np.linalg.norm(x[POSITION] - mean[POSITION]) + protection_level(
         P[POSITION, POSITION], 1e-4
     )
-    level = manoeuvre_level(prior, cov, rows, accepted, 0.1, mean, said, 1e-4)
+    level = manoeuvre_level(fused(prior, cov, rows, accepted, 0.1, mean), said)
     assert level == pytest.approx(expected, rel=1e-9)
 
 
@@ -340,13 +349,12 @@ def test_a_manoeuvre_nobody_could_notice() -> None:
     """Along a single bearing, or without a gate."""
     mean, accepted = np.array([100.0, 0, 0, 0, 0, 0]), np.ones(1)
     row = azimuth_row(0.0, 0.0, 0.01, mean)
-    level = manoeuvre_level(mean, np.eye(6), row, accepted, 0.1, mean, options(), 1e-4)
+    level = manoeuvre_level(fused(mean, np.eye(6), row, accepted, 0.1, mean), options())
     assert math.isinf(level)
     fix = linear_rows(mean[POSITION], np.eye(2), np.eye(2, 6), 0)
     for probability, finite in ((1.0, False), (0.9999, True)):
-        level = manoeuvre_level(
-            mean, np.eye(6), fix, accepted, 0.1, mean, options(probability), 1e-4
-        )
+        epoch = fused(mean, np.eye(6), fix, accepted, 0.1, mean)
+        level = manoeuvre_level(epoch, options(probability))
         assert math.isfinite(level) is finite
 
 
@@ -357,9 +365,10 @@ def test_fits_and_level_in_one_go(speed: float) -> None:
     rows[:, GROUP] = 0, 1
     mean, taken, fits = prior + 0.2, np.array([1.0, 0.0]), np.full((2, 2), np.nan)
     said = options(speed=speed)
-    level = fits_and_level(prior, cov, rows, taken, 0.3, mean, cov, said, 1e-4, fits)
-    assert np.array_equal(fits, row_fits(prior, cov, rows, said[Option.HEIGHT]))
-    alone = manoeuvre_level(prior, cov, rows, taken, 0.3, mean, said, 1e-4)
+    epoch = fused(prior, cov, rows, taken, 0.3, mean)
+    level = fits_and_level(epoch, cov, said, fits)
+    assert np.array_equal(fits, row_fits(prior, cov, rows, said.height_m))
+    alone = manoeuvre_level(epoch, said)
     assert level == (alone if speed else 0.0)
 
 
@@ -371,8 +380,8 @@ def test_nothing_is_told_of_what_is_not_sound(where: str) -> None:
     else:
         cov[X.PY, X.PY] = -1.0
     row = azimuth_row(-50.0, 0.0, 0.05, np.zeros(6))
-    args = (np.zeros(6), np.eye(6), row, np.ones(1), 0.1, mean, cov, options(), 1e-4, fits)
-    assert math.isnan(fits_and_level(*args))
+    epoch = fused(np.zeros(6), np.eye(6), row, np.ones(1), 0.1, mean)
+    assert math.isnan(fits_and_level(epoch, cov, options(), fits))
     assert np.array_equal(fits, [[7.0, 7.0]])
 
 

@@ -16,14 +16,16 @@ from netpos.filters.state import X
 from netpos.messages.values import Array
 from netpos.tracking import TrackerConfig
 from netpos.tracking import rivals as rivals_module
-from netpos.tracking.engine import GATE, GATE_SIZE, Option
+from netpos.tracking.engine import GATE_SIZE
 from netpos.tracking.estimates import Single
 from netpos.tracking.models import motions_of, options_of
-from netpos.tracking.protection import gaussian_radius
+from netpos.tracking.protection import FusedEpoch, gaussian_radius
 from netpos.tracking.rivals import BEGUN, LEADER, Rivals, State, matter, no_rivals, rival_level
 from scipy.stats import multivariate_normal
 
-CONFIG = TrackerConfig(manoeuvre_speed_sd_mps=5.0, accel_density_mps2_sqrthz=0.1)
+CONFIG = TrackerConfig(
+    manoeuvre_speed_sd_mps=5.0, accel_density_mps2_sqrthz=0.1, integrity_risk=1e-4
+)
 MOTION, OPTIONS, NO_BIAS = motions_of(CONFIG)[0], options_of(CONFIG), np.zeros((2, 0))
 H = np.eye(6)[[0, 1]] + 0.3 * np.eye(6)[[4, 4]]
 R = np.diag([0.2, 0.3]) ** 2
@@ -35,7 +37,7 @@ def surprise(z: Array, mean: Array, cov: Array) -> float:
     S = H @ cov @ H.T + R
     distance = float((z - H @ mean) @ np.linalg.solve(S, z - H @ mean))
     density = multivariate_normal(H @ mean, S).logpdf(z)
-    return float(-2.0 * density - distance + min(distance, OPTIONS[GATE + 2]))
+    return float(-2.0 * density - distance + min(distance, OPTIONS.gate_nis[2]))
 
 
 def updated(z: Array, mean: Array, cov: Array) -> tuple[Array, Array]:
@@ -92,7 +94,7 @@ class Plain:
             return
         window_s = max(DT, min(since_s, 0.25))
         if unusual:
-            args = (rows, 0.0, OPTIONS[GATE + 2], 5.0, np.empty(6))
+            args = (rows, 0.0, OPTIONS.gate_nis[2], 5.0, np.empty(6))
             window_s = max(window_s, unnoticed_s(mean, cov, *args)[1])
         wide = opened(cov, window_s)
         own, fresh = surprise(z, mean, cov), surprise(z, mean, wide)
@@ -124,6 +126,12 @@ def drifting(k: int) -> float:
     return 0.02 * max(k - 20, 0) ** 1.5 if k < 45 else 3.0 * (50 <= k < 53)
 
 
+def wrong_epoch(rows: Array, nis: float = 200.0) -> FusedEpoch:
+    """All groups of ``rows`` accepted by an estimate at the origin, sure of it."""
+    accepted = np.ones(int(rows[-1, GROUP]) + 1)
+    return FusedEpoch(np.zeros(6), 0.01 * np.eye(6), rows, accepted, DT, np.zeros(6), nis, 2)
+
+
 def test_rivals_follow_the_rules() -> None:
     """The estimate goes straight on, sure of it."""
     rng = np.random.default_rng(11)
@@ -139,18 +147,18 @@ def test_rivals_follow_the_rules() -> None:
         S = H @ cov @ H.T + R
         nis = float((z - H @ mean) @ np.linalg.solve(S, z - H @ mean))
         cov = updated(z, mean, cov)[1]  # the estimate learns nothing of where it is
-        epoch = (stamp_ns, DT, *prior, rows, np.ones(1), DT, nis, 2, mean)
-        got = rival_level(1.0, *epoch, MOTION, NO_BIAS, OPTIONS, RISK, rivals)
+        epoch = FusedEpoch(*prior, rows, np.ones(1), DT, mean, nis, 2)
+        got = rival_level(1.0, stamp_ns, DT, epoch, MOTION, NO_BIAS, OPTIONS, rivals)
         plain.step(stamp_ns, z, rows, prior)
         assert got == pytest.approx(plain.reach(1.0, mean), rel=1e-6)
-        assert rivals[3][LEADER] == (-1 if plain.leader is None else plain.leader)
-        assert rivals[3][BEGUN] == plain.begun_ns
+        assert rivals.marks[LEADER] == (-1 if plain.leader is None else plain.leader)
+        assert rivals.marks[BEGUN] == plain.begun_ns
         for i, rival in enumerate(plain.rivals):
             odds = -math.inf if rival is None else rival[2]
-            assert rivals[2][i] == pytest.approx(odds, rel=1e-6, abs=1e-6)
-        led = rivals[3][LEADER]
-        apart = 0.0 if led < 0 else math.hypot(*(rivals[0][led] - mean)[:2])
-        seen.append((rivals[2].max(), got, led, apart))
+            assert rivals.odds[i] == pytest.approx(odds, rel=1e-6, abs=1e-6)
+        led = rivals.marks[LEADER]
+        apart = 0.0 if led < 0 else math.hypot(*(rivals.means[led] - mean)[:2])
+        seen.append((rivals.odds.max(), got, led, apart))
     odds, levels, leaders, apart = np.array(seen).T
     assert odds[:20].max() < 0.0
     assert odds[44] == 50.0
@@ -163,58 +171,54 @@ def test_rivals_follow_the_rules() -> None:
 def test_an_inertial_model_has_no_rivals() -> None:
     motion, rivals = MOTION.copy(), no_rivals(6, 0)
     motion[Parameter.MODEL] = Model.INERTIAL
-    rows, wrong = linear_rows(np.array([3.0, 3.0]), R, H, 0), 200.0
-    epoch = (100_000_000, DT, np.zeros(6), np.eye(6) * 0.01, rows, np.ones(1), DT)
-    args, rest = (*epoch, wrong, 2, np.zeros(6)), (NO_BIAS, OPTIONS, RISK, rivals)
-    assert rival_level(1.0, *args, motion, *rest) == 1.0
-    assert rival_level(1.0, *args, MOTION, *rest) > 1.0
+    epoch = wrong_epoch(linear_rows(np.array([3.0, 3.0]), R, H, 0))
+    args = 1.0, 100_000_000, DT, epoch
+    assert rival_level(*args, motion, NO_BIAS, OPTIONS, rivals) == 1.0
+    assert rival_level(*args, MOTION, NO_BIAS, OPTIONS, rivals) > 1.0
 
 
 def test_no_rival_begins_where_two_measurements_tell_the_place() -> None:
     """One that has begun is carried on."""
     rows, twice = linear_rows(np.array([3.0, 3.0]), R, H, 0), linear_rows(np.full(2, 3.0), R, H, 0)
     twice[1, GROUP] = 1
-    before = (np.zeros(6), np.eye(6) * 0.01)
     rivals = no_rivals(6, 0)
-    fit, rest = (200.0, 2, np.zeros(6), MOTION), (NO_BIAS, OPTIONS, RISK, rivals)
     for k, (own, begins) in enumerate(((twice, False), (rows, True), (twice, True))):
         stamp_ns = 100_000_000 * (k + 1)
-        assert matter(stamp_ns, own, 200.0, 2, rivals[2], rivals[3]) is begins
-        level = rival_level(1.0, stamp_ns, DT, *before, own, np.ones(2), DT, *fit, *rest)
+        epoch = wrong_epoch(own)
+        assert matter(stamp_ns, epoch, rivals) is begins
+        level = rival_level(1.0, stamp_ns, DT, epoch, MOTION, NO_BIAS, OPTIONS, rivals)
         assert (level > 1.0) is begins
 
 
 def test_two_measurements_end_a_rival_within_the_level() -> None:
     rows, twice = linear_rows(np.array([3.0, 3.0]), R, H, 0), linear_rows(np.full(2, 3.0), R, H, 0)
     twice[1, GROUP] = 1
-    before, rivals = (np.zeros(6), np.eye(6) * 0.01), no_rivals(6, 0)
-    fit, rest = (200.0, 2, np.zeros(6), MOTION), (NO_BIAS, OPTIONS, RISK, rivals)
+    rivals = no_rivals(6, 0)
     for k, (level, own) in enumerate(((1.0, rows), (99.0, rows), (1.0, twice), (99.0, twice))):
-        epoch = (100_000_000 * (k + 1), DT, *before, own, np.ones(2), DT)
-        reached = rival_level(level, *epoch, *fit, *rest)
+        stamp_ns, epoch = 100_000_000 * (k + 1), wrong_epoch(own)
+        reached = rival_level(level, stamp_ns, DT, epoch, MOTION, NO_BIAS, OPTIONS, rivals)
         gone = level == 99.0 and own is twice
-        assert math.isinf(rivals[2].max()) is gone
-    assert rivals[3][LEADER] == -1
+        assert math.isinf(rivals.odds.max()) is gone
+    assert rivals.marks[LEADER] == -1
     assert reached == 99.0
 
 
 @pytest.mark.parametrize(("stamp_ns", "begins"), [(249_999_999, False), (250_000_000, True)])
 def test_a_rival_begins_from_time_to_time(stamp_ns: int, begins: bool) -> None:
     """Of single measurements that fit, and of none where nothing was accepted."""
-    rows, (_, _, odds, marks) = linear_rows(np.zeros(2), R, H, 0), no_rivals(6, 0)
-    assert matter(stamp_ns, rows, 1.0, 2, odds, marks) is begins
-    assert not matter(stamp_ns, rows, 0.0, 0, odds, marks)
+    fits, rivals = wrong_epoch(linear_rows(np.zeros(2), R, H, 0), nis=1.0), no_rivals(6, 0)
+    assert matter(stamp_ns, fits, rivals) is begins
+    assert not matter(stamp_ns, fits._replace(nis=0.0, dof=0), rivals)
 
 
 def test_rivals_are_held_while_nothing_is_accepted() -> None:
     """They move on, and the level with them."""
     rivals, rows = no_rivals(6, 0), linear_rows(np.array([3.0, 3.0]), R, H, 0)
-    before, rest = (np.zeros(6), np.eye(6) * 0.01), (MOTION, NO_BIAS, OPTIONS, RISK, rivals)
-    levels = []
-    for k, taken in enumerate((1.0, 0.0, 0.0)):
-        epoch = (100_000_000 * (k + 1), DT, *before, rows, np.full(1, taken), DT)
-        fit = (200.0, 2) if taken else (0.0, 0)
-        levels.append(rival_level(1.0, *epoch, *fit, np.zeros(6), *rest))
+    levels, epoch = [], wrong_epoch(rows)
+    nothing = epoch._replace(accepted=np.zeros(1), nis=0.0, dof=0)
+    for k, some in enumerate((epoch, nothing, nothing)):
+        stamp_ns = 100_000_000 * (k + 1)
+        levels.append(rival_level(1.0, stamp_ns, DT, some, MOTION, NO_BIAS, OPTIONS, rivals))
     assert 1.0 < levels[0] < levels[1] < levels[2]
 
 
@@ -224,8 +228,8 @@ def _turned(estimate: Single, rivals: Rivals, away: float, stamps: range) -> Non
         rows, stamp_ns = linear_rows(np.array([away, 0.0]), R, H, 0), 100_000_000 * k
         before = estimate.mean.copy(), estimate.cov.copy()
         nis, dof, taken = estimate.step(stamp_ns, DT, 0, rows, NO_BIAS)
-        epoch = (stamp_ns, estimate, rows, taken.copy(), DT, (nis, dof), NO_BIAS)
-        rivals.level(1.0, *epoch)
+        epoch = FusedEpoch(*estimate.prior, rows, taken.copy(), DT, estimate.mean, nis, dof)
+        rivals.level(1.0, stamp_ns, estimate, epoch, NO_BIAS)
         estimate.mean[:], estimate.cov[:] = before
 
 
@@ -268,28 +272,28 @@ def test_a_rival_leads_from_certain_to_even(odds: list[float], before: int, afte
 
 @pytest.mark.parametrize(("nis", "begins"), [(5.99, False), (6.01, True)])
 def test_a_rival_begins_where_twice_the_usual_is_exceeded(nis: float, begins: bool) -> None:
-    rows, (_, _, odds, marks) = linear_rows(np.zeros(2), R, H, 0), no_rivals(6, 0)
-    assert matter(1, rows, nis, 3, odds, marks) is begins
-    odds[1] = 0.0
-    assert matter(1, rows, nis, 3, odds, marks)
+    rows, rivals, mean = linear_rows(np.zeros(2), R, H, 0), no_rivals(6, 0), np.zeros(6)
+    epoch = FusedEpoch(mean, np.eye(6), rows, np.ones(1), DT, mean, nis, 3)
+    assert matter(1, epoch, rivals) is begins
+    rivals.odds[1] = 0.0
+    assert matter(1, epoch, rivals)
 
 
 def test_a_turn_that_shows_at_once_may_lie_since_the_last_beginning() -> None:
     """0.1 s, where 5 ms are enough to show one of 500 m/s and 20 ms have passed unheard."""
     rivals, z, mean, cov = no_rivals(6, 900_000_000), np.full(2, 3.0), np.zeros(6), np.eye(6) / 100
-    options, rows = OPTIONS.copy(), linear_rows(z, R, H, 0)
-    options[Option.MANOEUVRE_SPEED] = 500.0
-    epoch = (1_000_000_000, DT, mean, cov, rows, np.ones(1), 0.02, 200.0, 2, mean)
-    rival_level(0.0, *epoch, MOTION, NO_BIAS, options, RISK, rivals)
+    options, rows = OPTIONS._replace(manoeuvre_speed_sd=500.0), linear_rows(z, R, H, 0)
+    epoch = FusedEpoch(mean, cov, rows, np.ones(1), 0.02, mean, 200.0, 2)
+    rival_level(0.0, 1_000_000_000, DT, epoch, MOTION, NO_BIAS, options, rivals)
     wide = cov + 100.0**2 * (opened(cov, 0.1) - cov)
     odds = math.log(0.1 / 30.0) + (surprise(z, mean, cov) - surprise(z, mean, wide)) / 2.0
-    assert rivals[2].max() == pytest.approx(odds)
+    assert rivals.odds.max() == pytest.approx(odds)
 
 
 def present(mean: Array) -> State:
     """The second rival, at ``mean``."""
     rivals = no_rivals(6, 0)
-    rivals[0][1], rivals[1][1], rivals[2][1] = mean, 0.01 * np.eye(6), 3.0
+    rivals.means[1], rivals.covs[1], rivals.odds[1] = mean, 0.01 * np.eye(6), 3.0
     return rivals
 
 
@@ -299,60 +303,58 @@ def test_a_rival_ends_within_the_level(margin: float, ends: bool) -> None:
     rivals = present(mean + np.array([3.0, -4.0, 0.0, 0.0, 0.0, 0.0]))
     level = 5.0 + gaussian_radius(0.01, 0.0, 0.01, RISK) + margin
     rivals_module._dismiss(level, mean, RISK, rivals)
-    assert math.isinf(rivals[2][1]) is ends
+    assert math.isinf(rivals.odds[1]) is ends
 
 
 def test_the_level_about_a_leader_holds_that_about_the_estimate() -> None:
     mean = np.array([700.0, -300.0, 4.0, 1.0, 2.0, 0.1])
     rivals = present(mean + np.array([3.0, -4.0, 0.0, 0.0, 0.0, 0.0]))
-    rivals[3][LEADER] = 1
+    rivals.marks[LEADER] = 1
     assert rivals_module._reach(2.0, mean, RISK, rivals) == pytest.approx(7.0)
 
 
 def test_a_leader_whose_place_is_taken_leads_no_more() -> None:
     rows, cov = linear_rows(np.array([3.0, 3.0]), R, H, 0), np.eye(6) * 0.01
     rivals = no_rivals(6, 0)
-    rivals[2][:] = [0.3, 0.1, *([0.4] * 6)]
+    rivals.odds[:] = [0.3, 0.1, *([0.4] * 6)]
     for leader, after in ((0, 0), (1, -1)):
-        rivals[2][1], rivals[3][LEADER] = 0.1, leader
-        args = (np.zeros(6), cov, rows, 30.0, 100.0, OPTIONS, RISK, rivals)
+        rivals.odds[1], rivals.marks[LEADER] = 0.1, leader
+        args = (np.zeros(6), cov, rows, 30.0, 100.0, OPTIONS, rivals)
         assert rivals_module._begin(*args)
-        assert rivals[3][LEADER] == after
+        assert rivals.marks[LEADER] == after
 
 
 def carried_on(rivals: State, mean: Array, motion: Array, dof: int = 0) -> float:
     """Level of an epoch with all or nothing accepted, an own one of half a metre."""
     rows = linear_rows(np.zeros(2), R, H, 0)
     accepted = np.full(1, 1.0 if dof else 0.0)
-    before = (mean, 0.01 * np.eye(6), rows, accepted, DT, 0.0, dof, mean)
-    return float(
-        rival_level(0.5, 100_000_000, DT, *before, motion, NO_BIAS, OPTIONS, RISK, rivals)
-    )
+    epoch = FusedEpoch(mean, 0.01 * np.eye(6), rows, accepted, DT, mean, 0.0, dof)
+    return float(rival_level(0.5, 100_000_000, DT, epoch, motion, NO_BIAS, OPTIONS, rivals))
 
 
 def test_the_level_reaches_from_the_estimate_to_the_far_side_of_a_rival() -> None:
     """Anywhere; the velocity step of the estimate's own second look is none of the rival's."""
     mean = np.array([700.0, -300.0, 4.0, 1.0, 2.0, 0.1])
     rivals, motion = present(mean), MOTION.copy()
-    rivals[0][1, :4] += 30.0, 40.0, 1.0, -2.0
-    expected, cov = rivals[0][1].copy(), 0.01 * np.eye(6)
+    rivals.means[1, :4] += 30.0, 40.0, 1.0, -2.0
+    expected, cov = rivals.means[1].copy(), 0.01 * np.eye(6)
     ekf.predict(expected, cov, DT, MOTION.copy(), NO_BIAS)
     motion[Parameter.JUMP_SPEED] = 50.0
     kept = motion.copy()
     level = carried_on(rivals, mean, motion)
     apart = math.hypot(30.0 + 5.0 * DT, 40.0 - 1.0 * DT)
     assert level == pytest.approx(apart + gaussian_radius(*cov[[0, 0, 1], [0, 1, 1]], RISK))
-    np.testing.assert_allclose(rivals[0][1], expected, rtol=1e-12)
-    np.testing.assert_allclose(rivals[1][1], cov, rtol=1e-12)
-    assert rivals[2][:3].tolist() == [-math.inf, 3.0, -math.inf]
-    assert rivals[3].tolist() == [-1, 0]
+    np.testing.assert_allclose(rivals.means[1], expected, rtol=1e-12)
+    np.testing.assert_allclose(rivals.covs[1], cov, rtol=1e-12)
+    assert rivals.odds[:3].tolist() == [-math.inf, 3.0, -math.inf]
+    assert rivals.marks.tolist() == [-1, 0]
     np.testing.assert_array_equal(motion, kept)
 
 
 def test_a_rival_that_cannot_be_a_device_is_given_up() -> None:
     rivals = present(np.array([0.0, 0.0, 3.1e8, 0.0, 0.0, 0.0]))
     assert carried_on(rivals, np.zeros(6), MOTION, dof=2) == 0.5
-    assert rivals[2].max() == -math.inf
+    assert rivals.odds.max() == -math.inf
 
 
 def test_an_array_of_many_antennas_is_weighed_by_the_last_bound() -> None:
@@ -362,17 +364,17 @@ def test_an_array_of_many_antennas_is_weighed_by_the_last_bound() -> None:
     wide_H = rng.normal(size=(m, 6))
     z, rivals = wide_H @ np.array([0.0, 0.0, 3.0, -2.0, 0.0, 0.0]), no_rivals(6, 0)
     rows, cov, prior = linear_rows(z, np.eye(m), wide_H, 0), 0.01 * np.eye(6), np.zeros(6)
-    before = (prior, cov, rows, np.ones(1), DT, 1e4, m, prior)
-    rival_level(1.0, 100_000_000, DT, *before, MOTION, NO_BIAS, OPTIONS, RISK, rivals)
-    _, longest_s = unnoticed_s(prior, cov, rows, 0.0, OPTIONS[GATE + 2], 5.0, np.empty(6))
+    epoch = FusedEpoch(prior, cov, rows, np.ones(1), DT, prior, 1e4, m)
+    rival_level(1.0, 100_000_000, DT, epoch, MOTION, NO_BIAS, OPTIONS, rivals)
+    _, longest_s = unnoticed_s(prior, cov, rows, 0.0, OPTIONS.gate_nis[2], 5.0, np.empty(6))
     window_s, sizes = max(DT, longest_s), []
     for P in (cov, opened(cov, window_s)):
         S = wide_H @ P @ wide_H.T + np.eye(m)
-        distance = min(z @ np.linalg.solve(S, z), OPTIONS[GATE + GATE_SIZE - 1])
+        distance = min(z @ np.linalg.solve(S, z), OPTIONS.gate_nis[GATE_SIZE - 1])
         sizes.append(distance + np.linalg.slogdet(2.0 * math.pi * S)[1])
     gained = (sizes[0] - sizes[1]) / 2.0
     assert gained > 0.0
-    assert rivals[2][0] == pytest.approx(gained + math.log(window_s / 30.0), rel=1e-9)
+    assert rivals.odds[0] == pytest.approx(gained + math.log(window_s / 30.0), rel=1e-9)
 
 
 def test_a_copy_goes_its_own_way_and_a_new_state_starts_anew() -> None:
@@ -382,7 +384,8 @@ def test_a_copy_goes_its_own_way_and_a_new_state_starts_anew() -> None:
         rows, stamp_ns = linear_rows(np.array([z, 0.0]), R, H, 0), 100_000_000 * k
         bias = np.tile([[1.0], [100.0]], (1, on.mean.size - 6))
         nis, dof, taken = on.step(stamp_ns, DT, 0, rows, bias)
-        return of.level(1.0, stamp_ns, on, rows, taken.copy(), DT, (nis, dof), bias)
+        fused = FusedEpoch(*on.prior, rows, taken.copy(), DT, on.mean, nis, dof)
+        return of.level(1.0, stamp_ns, on, fused, bias)
 
     for k in (1, 2):
         epoch(rivals, estimate, k, 1.2)

@@ -24,7 +24,7 @@ def test_a_turn_along_the_bearing_is_held_and_ended(
     alone: list[Array] = []
 
     def spy(*args: Any) -> Any:
-        alone.append(args[3].copy())
+        alone.append(args[1].means.copy())
         return reported(*args)
 
     monkeypatch.setattr(segments, "reported", spy)

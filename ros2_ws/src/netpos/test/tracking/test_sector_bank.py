@@ -23,7 +23,6 @@ from netpos.filters.motion import NO_BIAS
 from netpos.filters.sigma import innovation_cov, regress
 from netpos.messages.values import Array
 from netpos.tracking import TrackerConfig, sector_bank
-from netpos.tracking.engine import GATE
 from netpos.tracking.models import options_of, pose_state
 from netpos.tracking.sectors import Sectors, phase_place, sectors_of
 from scipy.special import logsumexp
@@ -125,7 +124,7 @@ def test_a_fix_says_as_much_as_range_and_phase_do() -> None:
         own[1, KIND], own[1, VALUE] = Kind.UNWRAPPED_PHASE, rows[1, VALUE] + 2 * math.pi * turns
         innovation, G, E = regress(mean, L, own, 0.0)
         S = innovation_cov(G, E, own[:, VARIANCE].copy())
-        gate = options[GATE:]
+        gate = options.gate_nis
         expected = sector_bank._evidence(own, innovation, S, gate, np.zeros(2))
         ours = sector_bank._fix_evidence(mean, L, rows, 1, turns, options)
         assert ours == pytest.approx(expected, abs=0.1)

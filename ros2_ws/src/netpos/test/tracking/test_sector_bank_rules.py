@@ -15,9 +15,10 @@ from netpos.filters.rows import linear_rows
 from netpos.filters.sigma import innovation_cov, regress
 from netpos.messages.values import Array
 from netpos.tracking import TrackerConfig, engine, sector_bank
-from netpos.tracking.engine import GATE, GATE_SIZE
+from netpos.tracking.engine import GATE_SIZE
 from netpos.tracking.models import motions_of, options_of
 from netpos.tracking.phase_fix import place, spawn
+from netpos.tracking.sector_bank import Bank, BankResult
 from scipy.special import logsumexp
 
 SLOTS, MIDDLE = 11, 5
@@ -53,18 +54,18 @@ def test_weights_follow_the_likelihood_and_outliers_decide_nothing() -> None:
         for g, m in enumerate(sizes):
             S, off = H[g] @ P @ H[g].T + np.eye(m), z[g] - H[g] @ x
             distance = off @ np.linalg.solve(S, off)
-            bound = options[GATE + min(m, GATE_SIZE - 1)]
+            bound = options.gate_nis[min(m, GATE_SIZE - 1)]
             assert bool(distance > bound) is (g > 0)
             logs[s] -= 0.5 * (min(distance, bound) + np.linalg.slogdet(S)[1])
             nis_expected[s] = distance if g == 0 else nis_expected[s]
         all_H, off = np.vstack(H), np.concatenate(z) - np.vstack(H) @ x
         S, flags = all_H @ P @ all_H.T + np.eye(len(rows)), np.zeros(3)
-        evidence = sector_bank._evidence(rows, off, S, options[GATE:], flags)
+        evidence = sector_bank._evidence(rows, off, S, options.gate_nis, flags)
         assert evidence == pytest.approx(logs[s] - weights[s], rel=1e-9)
         expected[s] = informed(x, P, z[0], H[0])
     accepted, nis, used = np.full((3, 3), 9.0), np.full(3, 9.0), np.full(3, 9.0)
-    work = ekf.workspace(6, len(rows))
-    sector_bank.weigh(means, covs, weights, rows, options, accepted, nis, used, work)
+    bank, result = Bank(means, covs, weights), BankResult(accepted, nis, used)
+    sector_bank.weigh(bank, rows, options, result, ekf.workspace(6, len(rows)))
     np.testing.assert_allclose(weights[1:], (logs - logsumexp(logs))[1:], rtol=1e-7, atol=1e-9)
     assert weights[0] == -math.inf
     assert accepted.tolist() == [[9.0] * 3, [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
@@ -85,7 +86,8 @@ def test_all_filters_that_are_there_move(jump_sd: float) -> None:
     for s in (0, 2):
         ekf.predict(expected[s], spread[s], 0.2, motion, NO_BIAS)
         spread[s] = opened(spread[s], jump_sd, 1.7)
-    sector_bank.advance(means, covs, weights, 0.2, jump_sd, 1.7, motion, NO_BIAS, options)
+    bank = Bank(means, covs, weights)
+    sector_bank.advance(bank, 0.2, jump_sd, 1.7, motion, NO_BIAS, options)
     np.testing.assert_allclose(means, expected, rtol=1e-12)
     np.testing.assert_allclose(covs, spread, rtol=1e-12, atol=1e-14)
 
@@ -139,9 +141,9 @@ class Epoch:
 
     def resolve(self) -> None:
         before = self.rows.copy()
-        told = (self.heirs, self.accepted, self.nis, self.used, ekf.workspace(6, len(before)))
-        state = (self.means, self.covs, self.weights, self.rows)
-        sector_bank.resolve(*state, 1, self.options, 1e-4, *told)
+        bank = Bank(self.means, self.covs, self.weights)
+        result, work = BankResult(self.accepted, self.nis, self.used), ekf.workspace(6, 4)
+        sector_bank.resolve(bank, self.rows, 1, self.options, 1e-4, self.heirs, result, work)
         np.testing.assert_array_equal(self.rows, before)
 
     def placed(self, slot: int) -> tuple[Array, Array] | None:
@@ -208,7 +210,7 @@ def test_sectors_nobody_knows_of_are_placed_anew(name: str, sd: float, height_m:
 def test_a_tangent_reaches_as_far_as_a_radian(variance: float, is_wide: float) -> None:
     """Of the prior alone, without the noise of the phase; beyond it, the fix is weighed."""
     epoch = Epoch(0.03, 0.0)
-    rows, gate = epoch.turned(epoch.leader), epoch.options[GATE:]
+    rows, gate = epoch.turned(epoch.leader), epoch.options.gate_nis
 
     def phase_variance() -> float:
         L = np.linalg.cholesky(epoch.covs[epoch.home])
@@ -218,8 +220,8 @@ def test_a_tangent_reaches_as_far_as_a_radian(variance: float, is_wide: float) -
     for _ in range(9):
         epoch.covs[epoch.home][:2, :2] *= variance / phase_variance()
     assert phase_variance() == pytest.approx(variance, abs=1e-6)
-    state = (epoch.means, epoch.covs, epoch.weights)
-    gains, wide = sector_bank._gains(*state, epoch.turned(MIDDLE), 1, epoch.options)
+    bank = Bank(epoch.means, epoch.covs, epoch.weights)
+    gains, wide = sector_bank._gains(bank, epoch.turned(MIDDLE), 1, epoch.options)
     assert wide[epoch.home] == is_wide
     L, turns = np.linalg.cholesky(epoch.covs[epoch.home]), epoch.leader - MIDDLE
     innovation, G, E = regress(epoch.prior, L, rows, 0.0)
@@ -273,7 +275,7 @@ def test_the_whole_bank_has_the_moments_of_its_filters(name: str) -> None:
     spreads = np.array([engine.to_spread(P, options) for P in covs])
     means[1], spreads[1] = np.nan, np.nan
     weights = np.array([math.log(0.3), -math.inf, math.log(0.7)])
-    mean, cov = sector_bank.combine(means, spreads, weights, options)
+    mean, cov = sector_bank.combine(Bank(means, spreads, weights), options)
     means[1], covs[1] = 0.0, 0.0
     np.testing.assert_allclose(mean, share @ means, rtol=1e-12, atol=1e-14)
     expected = np.einsum("k,kab->ab", share, covs) + np.cov(away.T, aweights=share, ddof=0)

@@ -9,7 +9,8 @@ import pytest
 from netpos.filters.position_fix import FixStatus
 from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
-from netpos.tracking.strapdown_engine import Epochs, fix_each
+from netpos.tracking.engine import Epochs
+from netpos.tracking.strapdown_engine import fix_each
 from scipy.optimize import least_squares
 
 RANGE_SD_M = 0.5

@@ -22,8 +22,9 @@ from netpos.messages.values import Array, RsuInfo
 from netpos.radio.noise import generator
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.engine import Epochs
 from netpos.tracking.models import gate_thresholds
-from netpos.tracking.strapdown_engine import Drive, Epochs, Fixes, drive, fix_each
+from netpos.tracking.strapdown_engine import Drive, Fixes, drive, fix_each
 from netpos.tracking.strapdown_models import nav_of, sensors_of, start_sd, with_clock
 
 VUE = "vue_1"

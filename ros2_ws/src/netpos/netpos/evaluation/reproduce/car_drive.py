@@ -34,8 +34,9 @@ from netpos.messages.values import Array
 from netpos.scenario.along_path import FIELDS
 from netpos.scenario.recorded_drive import VUE, station_drive
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.engine import Epochs
 from netpos.tracking.models import gate_thresholds
-from netpos.tracking.strapdown_engine import Drive, Epochs, drive, fix_each
+from netpos.tracking.strapdown_engine import Drive, drive, fix_each
 from netpos.tracking.strapdown_models import sensors_of
 from netpos.tracking.strapdown_start import SampleBuffer, StrapdownStart
 

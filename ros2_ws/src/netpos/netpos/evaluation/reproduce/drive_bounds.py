@@ -35,8 +35,9 @@ from netpos.filters.space import linearise_in_space
 from netpos.filters.state import NAV_POSITION
 from netpos.messages.values import Array
 from netpos.scenario import Simulation, load_scenario
+from netpos.tracking.engine import Epochs
 from netpos.tracking.models import gate_thresholds
-from netpos.tracking.strapdown_engine import Drive, Epochs, drive
+from netpos.tracking.strapdown_engine import Drive, drive
 from netpos.tracking.strapdown_models import nav_of, sensors_of, start_sd
 from netpos.tracking.strapdown_smoothing import smoothed_drive
 

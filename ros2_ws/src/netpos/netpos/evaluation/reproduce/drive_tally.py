@@ -16,7 +16,8 @@ from netpos.filters.position_fix import FixStatus
 from netpos.filters.state import NAV_POSITION, NAV_QUATERNION, NAV_VELOCITY, Err, Nav
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.strapdown_engine import Drive, Epochs, Fixes
+from netpos.tracking.engine import Epochs
+from netpos.tracking.strapdown_engine import Drive, Fixes
 
 LARGE_ERROR_M = 5.0
 NEES_STATES = (3, 9, 1)

@@ -14,42 +14,35 @@ from netpos.filters.measurement import GROUP
 from netpos.filters.motion import Parameter
 from netpos.filters.state import X
 from netpos.messages.values import Array
-from netpos.tracking.engine import GATE, GATE_SIZE, Option
-from netpos.tracking.protection import gaussian_radius, level_in, level_scratch, radius_limit
+from netpos.tracking.engine import GATE_SIZE, Epochs, FilterOptions, Run
+from netpos.tracking.protection import (
+    FusedEpoch,
+    gaussian_radius,
+    level_in,
+    level_scratch,
+    radius_limit,
+)
 from netpos.tracking.rivals import LEADER, matter, no_rivals, rival_level
 
-_Epochs = tuple[Array, Array, Array, Array, Array, Array, Array, Array]  # as ``reported`` has them
 _WINDOW, _TAIL = 50, 1e-3  # of ``NisWindow``
 _BOUND = np.append(0.0, chdtri(np.arange(1.0, 64.0 * _WINDOW), _TAIL))
 
 
 @kernel
 def reported(
-    stamps_ns: Array,
-    row_start: Array,
-    rows: Array,
-    means: Array,
-    covs: Array,
-    nis: Array,
-    dof: Array,
-    taken: Array,
-    motions: Array,
-    bias: Array,
-    options: Array,
-    risk: float,
+    epochs: Epochs, run: Run, motions: Array, bias: Array, options: FilterOptions
 ) -> tuple[Array, Array, Array]:
-    """Means (N, n), covariances (N, n, n) and levels [m] (N,) reported of the epochs of
-    ``engine.run_epochs``, inputs and results of which these are; every epoch has rows, its groups
-    equally many.
+    """Means (N, n), covariances (N, n, n) and levels [m] (N,) reported of the ``epochs``
+    of which ``engine.run_epochs`` made ``run``; every epoch has rows, its groups equally many.
 
     motions : (N, Parameter) of each epoch, or (1, Parameter) of all. Where part of the groups was
     refused, which ones is not known here, and the level of a manoeuvre takes them all.
     """
+    means, covs, risk = run.means, run.covs, options.integrity_risk
     level = np.zeros(means.shape[0])
-    if options[Option.MANOEUVRE_SPEED] > 0.0:
-        epochs = (stamps_ns, row_start, rows, means, covs, nis, dof, taken)
-        means, covs = _allow_for_manoeuvres(epochs, motions, bias, options, risk, level)
-    optimism = _optimism(row_start, rows, nis, taken, options)
+    if options.manoeuvre_speed_sd > 0.0:
+        means, covs = _allow_for_manoeuvres(epochs, run, motions, bias, options, level)
+    optimism = _optimism(epochs, run, options)
     for k in range(level.size):
         xx, xy, yy = covs[k, X.PX, X.PX], covs[k, X.PX, X.PY], covs[k, X.PY, X.PY]
         if level[k] < optimism[k] * radius_limit(xx, xy, yy, risk):
@@ -59,16 +52,17 @@ def reported(
 
 @kernel
 def _allow_for_manoeuvres(
-    epochs: _Epochs,
+    epochs: Epochs,
+    run: Run,
     motions: Array,
     bias: Array,
-    options: Array,
-    risk: float,
+    options: FilterOptions,
     level: Array,
 ) -> tuple[Array, Array]:
     """Fill ``level`` (N,) with those of a manoeuvre nobody has noticed, rivals of the estimate
     included; means and covariances reported."""
-    stamps_ns, row_start, rows, means, covs, nis, dof, taken = epochs
+    stamps_ns, row_start, rows = epochs
+    means, covs, nis, dof, groups = run
     told_means, told_covs, led = means, covs, False
     x, P, motion = means[0].copy(), covs[0].copy(), motions[0].copy()
     scratch = level_scratch(x.size, np.diff(row_start).max())
@@ -80,37 +74,37 @@ def _allow_for_manoeuvres(
             x[:], P[:], motion[:] = means[k - 1], covs[k - 1], motions[min(k, len(motions) - 1)]
             motion[Parameter.JUMP_SPEED] = 0.0
             ekf.predict(x, P, dt, motion, bias)
-            accepted[:] = 1.0 if taken[k] > 0 else 0.0
-            own, fit = rows[row_start[k] : row_start[k + 1]], (nis[k], int(dof[k]))
-            epoch = (x, P, own, accepted, unheard_s)
-            level[k] = level_in(*epoch, means[k], options, risk, scratch)
-            if matter(stamps_ns[k], own, *fit, rivals[2], rivals[3]):
-                rest = (motion, bias, options, risk, rivals)
-                at = stamps_ns[k], dt
-                level[k] = rival_level(level[k], *at, *epoch, *fit, means[k], *rest)
-                leader = rivals[3][LEADER]
+            accepted[:] = 1.0 if groups[k] > 0 else 0.0
+            own = rows[row_start[k] : row_start[k + 1]]
+            epoch = FusedEpoch(x, P, own, accepted, unheard_s, means[k], nis[k], int(dof[k]))
+            level[k] = level_in(epoch, options, scratch)
+            if matter(stamps_ns[k], epoch, rivals):
+                level[k] = rival_level(
+                    level[k], stamps_ns[k], dt, epoch, motion, bias, options, rivals
+                )
+                leader = rivals.marks[LEADER]
                 if leader >= 0:
                     if not led:
                         told_means, told_covs, led = means.copy(), covs.copy(), True
-                    told_means[k], told_covs[k] = rivals[0][leader], rivals[1][leader]
-            if taken[k] == 0:
-                level[k] += options[Option.MANOEUVRE_SPEED] * unheard_s
-        if taken[k] > 0:
+                    told_means[k], told_covs[k] = rivals.means[leader], rivals.covs[leader]
+            if groups[k] == 0:
+                level[k] += options.manoeuvre_speed_sd * unheard_s
+        if groups[k] > 0:
             heard_ns = stamps_ns[k]
     return told_means, told_covs
 
 
 @kernel
-def _optimism(row_start: Array, rows: Array, nis: Array, taken: Array, options: Array) -> Array:
+def _optimism(epochs: Epochs, run: Run, options: FilterOptions) -> Array:
     """Factor on the sd (N,) of a ``NisWindow`` after each epoch."""
-    count = nis.size
+    row_start, count = epochs.row_start, run.nis.size
     factor, full_nis = np.ones(count), np.empty(count)
     sum_nis = sum_dof = 0.0
     for k in range(count):
         m = row_start[k + 1] - row_start[k]
-        groups = int(rows[row_start[k + 1] - 1, GROUP]) + 1
-        refused = options[GATE + min(m // groups, GATE_SIZE - 1)]
-        full_nis[k] = nis[k] + (groups - taken[k]) * refused
+        groups = int(epochs.rows[row_start[k + 1] - 1, GROUP]) + 1
+        refused = options.gate_nis[min(m // groups, GATE_SIZE - 1)]
+        full_nis[k] = run.nis[k] + (groups - run.groups[k]) * refused
         sum_nis, sum_dof = sum_nis + full_nis[k], sum_dof + m
         if k >= _WINDOW:
             old = k - _WINDOW

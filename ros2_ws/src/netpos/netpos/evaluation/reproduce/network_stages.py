@@ -26,7 +26,7 @@ from netpos.scenario.schema import NS
 from netpos.tracking import estimates
 from netpos.tracking.batch import batch_of
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.engine import run_epochs
+from netpos.tracking.engine import Epochs, Run, run_epochs
 from netpos.tracking.models import motions_of, options_of
 from netpos.tracking.networks.common_instant import TRACK_STATES, at_common_instant, step_matrices
 from netpos.tracking.networks.secondary import OwnNoise, Secondary
@@ -132,23 +132,11 @@ class Pass:
         n = self._epochs.size
         mean = np.zeros(8)
         mean[TRACK_STATES] = start
-        means, covs = np.empty((n, 8)), np.empty((n, 8, 8))
-        spare = [np.empty(n) for _ in range(3)]
-        run_epochs(
-            self._epochs,
-            self._row_start,
-            position_rows(fixes, self._sd),
-            mean,
-            self._start_cov,
-            self._motion,
-            NO_BIAS,
-            self._options,
-            means,
-            covs,
-            *spare,
-        )
+        run = Run(np.empty((n, 8)), np.empty((n, 8, 8)), *np.empty((3, n)))
+        epochs = Epochs(self._epochs, self._row_start, position_rows(fixes, self._sd))
+        run_epochs(epochs, mean, self._start_cov, self._motion, NO_BIAS, self._options, run)
         kept = np.ix_(np.arange(1, n), TRACK_STATES, TRACK_STATES)
-        return means[1:, TRACK_STATES], covs[kept]
+        return run.means[1:, TRACK_STATES], run.covs[kept]
 
     def own_covs(self) -> Array:
         """(n, 6, 6) what the fixes' own noise makes of the covariances."""

@@ -12,9 +12,9 @@ from netpos.evaluation.reproduce.integrity import reported
 from netpos.filters.measurement import BIAS
 from netpos.filters.state import N_CORE
 from netpos.messages.values import Array, ImuSample
-from netpos.tracking import estimates
+from netpos.tracking import engine, estimates
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.engine import run_epochs
+from netpos.tracking.engine import Run, run_epochs
 from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser
 from netpos.tracking.models import grown, initial_extra_sd, motions_of, options_of
@@ -33,6 +33,11 @@ class Epochs(NamedTuple):
     rows: Array
     bias: Array
     rsu: Ints
+
+    @property
+    def measured(self) -> engine.Epochs:
+        """What the engine takes of them."""
+        return engine.Epochs(self.stamps_ns, self.row_start, self.rows)
 
     def since(self, first: int, *, fixed: bool) -> Epochs:
         """The epochs from ``first`` on; without the rows of that one where a first fix has used
@@ -62,22 +67,13 @@ class Followed(NamedTuple):
     losses: int
 
 
-class _Room(NamedTuple):
-    """Arrays that a segment fills, an entry an epoch; the names are those of ``Followed``."""
+def _empty_run(epochs: int, n: int) -> Run:
+    figures = np.zeros((3, epochs))
+    return Run(np.full((epochs, n), np.nan), np.full((epochs, n, n), np.nan), *figures)
 
-    means: Array
-    covs: Array
-    nis: Array
-    dof: Array
-    groups: Array
 
-    @classmethod
-    def of(cls, epochs: int, n: int) -> _Room:
-        figures = np.zeros((3, epochs))
-        return cls(np.full((epochs, n), np.nan), np.full((epochs, n, n), np.nan), *figures)
-
-    def part(self, first: int, end: int | None = None) -> _Room:
-        return _Room(*(array[first:end] for array in self))
+def _part(run: Run, first: int, end: int | None = None) -> Run:
+    return Run(*(array[first:end] for array in run))
 
 
 class Follower:
@@ -108,28 +104,28 @@ class Follower:
         ``samples`` of the IMU for a motion model that uses one, None for every other.
         """
         count = epochs.stamps_ns.size
-        room = _Room.of(count, self.first_bias + epochs.bias.shape[1])
+        run = _empty_run(count, self.first_bias + epochs.bias.shape[1])
         level, tracked = np.full(count, np.nan), np.zeros(count, dtype=np.bool_)
         motions, imu = self._run_motions(count, samples is not None), _buffer(samples)
         start: tuple[int, Array, Array] | None = (0, mean, cov)
         losses = 0
         while start is not None:
             first, mean, cov = start
-            part, own = epochs.since(first, fixed=losses > 0), room.part(first)
+            part, own = epochs.since(first, fixed=losses > 0), _part(run, first)
             own_motions = motions[first:] if imu is not None else motions
             if imu is None and self._config.motion_model != "interacting":
                 done = self._compiled(part, mean, cov, own)
             else:
                 done = self._stepped(part, mean, cov, own, imu, own_motions)
             end = first + done
-            self._report(part, own.part(0, done), own_motions, level[first:end])
+            self._report(part, _part(own, 0, done), own_motions, level[first:end])
             lost = end < count
             tracked[first : end - lost] = True  # nothing is published of the epoch of the loss
             losses += lost
             start = self._first_fix(epochs, end) if lost else None
-        for array in (room.means, room.covs, level):
+        for array in (run.means, run.covs, level):
             array[~tracked] = np.nan
-        return Followed(room.means, room.covs, level, *room[2:], motions, tracked, losses)
+        return Followed(run.means, run.covs, level, *run[2:], motions, tracked, losses)
 
     def _run_motions(self, count: int, driven: bool) -> Array:
         """(1 or N, Parameter): the N of a run that the IMU drives are filled on the way. Of models
@@ -138,11 +134,11 @@ class Follower:
             return np.tile(self._motions[0], (count, 1))
         return self._motions[1:2] if self._config.motion_model == "interacting" else self._motions
 
-    def _compiled(self, epochs: Epochs, mean: Array, cov: Array, room: _Room) -> int:
+    def _compiled(self, epochs: Epochs, mean: Array, cov: Array, run: Run) -> int:
         """Epochs done: all in one kernel."""
         mean, cov = self.grown(mean, cov, epochs.bias)
         done: int = run_epochs(
-            *epochs[:3], mean, cov, self._motions[0], epochs.bias, self._options, *room
+            epochs.measured, mean, cov, self._motions[0], epochs.bias, self._options, run
         )
         return done
 
@@ -151,7 +147,7 @@ class Follower:
         epochs: Epochs,
         mean: Array,
         cov: Array,
-        room: _Room,
+        run: Run,
         imu: ImuBuffer | None,
         motions: Array,
     ) -> int:
@@ -172,29 +168,21 @@ class Follower:
                     estimate.drive(yaw, speed, config.gyro_noise_density)
                 unheard_s, bias = (stamp - heard_ns) / NS, epochs.bias[:, : known - first].copy()
                 step = estimate.step(stamp, unheard_s, rejected, rows, bias)
-                room.nis[k], room.dof[k], taken = step
-                room.groups[k] = taken.sum()
+                run.nis[k], run.dof[k], taken = step
+                run.groups[k] = taken.sum()
                 rejected = 0 if 2 * taken.sum() >= taken.size else rejected + 1
-                heard_ns = stamp if room.dof[k] else heard_ns
-            room.means[k], room.covs[k] = grown(estimate.mean, estimate.cov, sd)
+                heard_ns = stamp if run.dof[k] else heard_ns
+            run.means[k], run.covs[k] = grown(estimate.mean, estimate.cov, sd)
             if imu is not None:
                 motions[k] = estimate.motion
             if rejected >= config.max_rejected_epochs:
                 return k + 1
         return epochs.stamps_ns.size
 
-    def _report(self, epochs: Epochs, room: _Room, motions: Array, level: Array) -> None:
+    def _report(self, epochs: Epochs, run: Run, motions: Array, level: Array) -> None:
         """Put what a tracker publishes of a segment in its place, and fill ``level``."""
-        risk, figures = self._config.integrity_risk, (room.nis, room.dof, room.groups)
-        room.means[:], room.covs[:], level[:] = reported(
-            *epochs[:3],
-            room.means,
-            room.covs,
-            *figures,
-            motions,
-            epochs.bias,
-            self._options,
-            risk,
+        run.means[:], run.covs[:], level[:] = reported(
+            epochs.measured, run, motions, epochs.bias, self._options
         )
 
     def _first_fix(self, epochs: Epochs, first: int) -> tuple[int, Array, Array] | None:

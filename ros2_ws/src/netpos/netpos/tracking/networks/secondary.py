@@ -16,7 +16,6 @@ from netpos.filters import kf
 from netpos.filters.motion import Parameter, add_jump, transition
 from netpos.messages.values import Array, NetworkTrack
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.engine import GATE, Option
 from netpos.tracking.estimates import Estimate
 from netpos.tracking.models import options_of
 from netpos.tracking.networks.common_instant import TRACK_STATES
@@ -73,9 +72,9 @@ class Secondary:
         motion = estimate.motion
         jump = Parameter.JUMP_SPEED, Parameter.JUMP_TIME, Parameter.JUMP_SPREAD
         add_jump(*(motion[part] for part in jump), cov)
-        floor, height_m = self._options[Option.POSITION_GAIN : GATE], self._config.device_height_m
-        accepted = np.zeros(len(rows))
-        kf.update_shared(mean, cov, rows, height_m, self._options[GATE:], accepted, floor, share)
+        options, accepted = self._options, np.zeros(len(rows))
+        floor, gate, height_m = options.gain_floor, options.gate_nis, options.height_m
+        kf.update_shared(mean, cov, rows, height_m, gate, accepted, floor, share)
         return OwnNoise(stamp_ns, share)
 
     def track(

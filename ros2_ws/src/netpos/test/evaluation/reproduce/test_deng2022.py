@@ -28,8 +28,9 @@ from netpos.evaluation.reproduce.frame import Work
 from netpos.filters.measurement import ORIGIN, ROW_WIDTH
 from netpos.filters.position_fix import FixStatus
 from netpos.filters.state import Err, Nav
+from netpos.tracking.engine import Epochs
 from netpos.tracking.models import gate_thresholds
-from netpos.tracking.strapdown_engine import Drive, Epochs, drive
+from netpos.tracking.strapdown_engine import Drive, drive
 from netpos.tracking.strapdown_models import sensors_of
 from scipy.spatial.transform import Rotation
 
