@@ -55,12 +55,12 @@ TESTS_OF = {
     "srukf": "test_srukf.py -knot+ten_thousand",
     "step_velocity": "test_step_velocity.py test_measurement.py",
     "tracking/engine": "test_engine_parts.py test_engine.py -knot+equals_the_tracker",
-    "tracking/fit": "test_protection.py -kfits_and_level+or+is_not_sound",
+    "tracking/fit": "test_protection.py -kinnovations_and_level+or+is_not_sound",
     "tracking/initialise": "test_initialise.py test_initialise_fit.py",
     "tracking/output": "test_output.py",
     "tracking/phase_fix": "test_phase_fix.py",
     "tracking/protection": "test_protection.py",
-    "tracking/rivals": "test_rivals.py",
+    "tracking/manoeuvre_hypotheses": "test_manoeuvre_hypotheses.py",
     "tracking/sectors": "test_sector_bank.py -kwhere_a_phase",
     "tracking/sector_bank": "test_sector_bank_rules.py test_sector_bank.py",
     "ukf": "test_ukf.py test_gate.py",
@@ -85,7 +85,7 @@ EQUIVALENT = {
     ("sigma", "_regress", "operator swapped: E[i, n] *= _SHIFT_WEIGHT"),
     ("ekf", "_passes", "operator swapped: stop - start"),
     # its mirror
-    ("manoeuvre", "unnoticed_s", "operator swapped: xy += h[X.PX] * h[X.PY] / variance"),
+    ("manoeuvre", "detection_delay_s", "operator swapped: xy += h[X.PX] * h[X.PY] / variance"),
     ("error_state", "correct", "left out: posterior = cov"),  # set anew by the first iteration
     *(  # starts lie symmetrically around
         (

@@ -25,7 +25,7 @@ _LEVELS = {
 _RSU_LEVELS = {
     RsuState.OK: DiagnosticStatus.OK,
     RsuState.SUSPECT: DiagnosticStatus.WARN,
-    RsuState.ISOLATED: DiagnosticStatus.ERROR,
+    RsuState.EXCLUDED: DiagnosticStatus.ERROR,
 }
 
 

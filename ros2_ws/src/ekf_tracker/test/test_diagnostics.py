@@ -96,7 +96,7 @@ def test_diagnostics_stamp_and_missing_rsus() -> None:
 def test_diagnostics_of_an_rsu_that_lies() -> None:
     report = RsuReport(
         rsu_id="b",
-        state=RsuState.ISOLATED,
+        state=RsuState.EXCLUDED,
         text="isolated: azimuth off by 20.1 deg",
         age_s=0.25,
         rate_hz=10.0,

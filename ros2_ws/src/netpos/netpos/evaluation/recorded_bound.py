@@ -11,8 +11,8 @@ from netpos.evaluation.bounds import bound_rmse, run_bound
 from netpos.evaluation.pairing import Stamps, Trajectory
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages.values import Array, InitialPose, RsuInfo, RsuMeasurement
-from netpos.tracking.batch import batch_of
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.epoch_rows import epoch_rows_of
 from netpos.tracking.models import motions_of, pose_state
 from netpos.tracking.rsus import Rsu
 
@@ -42,7 +42,7 @@ def recorded_bound_m(
     if len(epochs) < 2:
         return None
     stamps = np.array(sorted(epochs), dtype=np.int64)
-    blocks = [batch_of(epochs[int(s)], known, None, -1).rows for s in stamps]
+    blocks = [epoch_rows_of(epochs[int(s)], known, None, -1).rows for s in stamps]
     bounds = run_bound(
         stamps,
         np.cumsum([0, *map(len, blocks)]),

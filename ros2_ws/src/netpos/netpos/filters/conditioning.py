@@ -50,15 +50,17 @@ class RobustOptions(NamedTuple):
 
 
 @leaf
-def unblock(row: Array, innovation: float, spread: float, prior: float, excess_m: float) -> None:
+def nlos_correct(
+    row: Array, innovation: float, innovation_var: float, prior: float, excess_m: float
+) -> None:
     """Replace a range or time by the measurement equivalent to the mixture of a direct and a
     blocked path; its column BLOCKED, the prior where it is > 0, becomes the posterior.
 
-    spread : variance of the innovation
+    innovation_var : variance of the innovation
     """
     prior, noise = row[BLOCKED] if row[BLOCKED] > 0.0 else prior, row[VARIANCE]
     row[BLOCKED], shift, variance = nlos_mixture_exponential(
-        innovation, spread, noise, prior, excess_m
+        innovation, innovation_var, noise, prior, excess_m
     )
     row[VALUE] -= shift
     added = max(min(variance, _LARGEST_VAR) - noise, 0.0)
@@ -73,22 +75,22 @@ def may_be_late(row: Array) -> bool:
 
 
 @kernel
-def weigh(
+def m_estimate(
     cov: Array,
     rows: Array,
     innovation: Array,
     H: Array,
-    bend: Array,
+    second_order_var: Array,
     options: RobustOptions,
 ) -> None:
     """Widen, in place, groups of ``rows`` (m, ROW_WIDTH) by how badly they fit: innovation (m,),
-    Jacobian H (m, n), variance ``bend`` (m,) of what linearising leaves out."""
+    Jacobian H (m, n), variance ``second_order_var`` (m,) of what linearising leaves out."""
     m, start = rows.shape[0], 0
     while start < m:
         stop = start + 1
         while stop < m and rows[stop, GROUP] == rows[start, GROUP]:
             stop += 1
-        variance = rows[start:stop, GATE_VARIANCE] + bend[start:stop]
+        variance = rows[start:stop, GATE_VARIANCE] + second_order_var[start:stop]
         d2 = group_nis(cov, innovation[start:stop], H[start:stop], variance)
         if options.kind == Robust.HUBER:
             factor = huber_factor(d2, stop - start, options.parameter)
@@ -101,7 +103,7 @@ def weigh(
 
 
 @kernel
-def condition(
+def reweight(
     mean: Array,
     cov: Array,
     rows: Array,
@@ -119,12 +121,18 @@ def condition(
             row = rows[i]
             if may_be_late(row):
                 innovation = innovation_row(row, mean, height_m, h)
-                spread = innovation_variance(row, mean, cov, height_m, row[VARIANCE], h)
-                unblock(row, innovation, spread, options.nlos_probability, options.nlos_excess_m)
+                innovation_var = innovation_variance(row, mean, cov, height_m, row[VARIANCE], h)
+                nlos_correct(
+                    row,
+                    innovation,
+                    innovation_var,
+                    options.nlos_probability,
+                    options.nlos_excess_m,
+                )
     if options.kind == Robust.NONE:
         return
     innovations, H = linearise(rows, mean, height_m)
-    bend = np.empty(m)
+    second_order_var = np.empty(m)
     for i in range(m):
-        bend[i] = curvature_variance(rows[i], mean, cov, height_m)
-    weigh(cov, rows, innovations, H, bend, options)
+        second_order_var[i] = curvature_variance(rows[i], mean, cov, height_m)
+    m_estimate(cov, rows, innovations, H, second_order_var, options)

@@ -9,7 +9,7 @@ import numpy as np
 
 from netpos.filters.bearing import fuse_around, on_top
 from netpos.filters.compile import inlined, kernel, leaf, local_array
-from netpos.filters.fit import misfit
+from netpos.filters.fit import map_cost
 from netpos.filters.fusion import (
     W_COV,
     W_GATE_VARIANCE,
@@ -26,7 +26,7 @@ from netpos.filters.fusion import (
 )
 from netpos.filters.gate import leave_odd_out
 from netpos.filters.iteration import (
-    bends,
+    is_curved,
     is_wide,
     iterate,
     iterate_from,
@@ -170,7 +170,7 @@ def _passes(
     """Whether one group, (first row, row after its last), lies within ``threshold`` of squared
     Mahalanobis distance of the prediction.
 
-    Where the linear distance says no and iterating is allowed, the misfit of the group's most
+    Where the linear distance says no and iterating is allowed, the ``map_cost`` of the most
     probable state decides.
     """
     start, stop = group
@@ -182,11 +182,11 @@ def _passes(
         return True
     if iterations <= 1:
         return False
-    return bool(_least_misfit(mean, cov, rows, group, height_m, iterations, work) <= threshold)
+    return bool(_least_cost(mean, cov, rows, group, height_m, iterations, work) <= threshold)
 
 
 @kernel
-def _least_misfit(
+def _least_cost(
     mean: Array,
     cov: Array,
     rows: Array,
@@ -195,11 +195,11 @@ def _least_misfit(
     iterations: int,
     work: Array,
 ) -> float:
-    """``misfit`` of the most probable state of one group."""
+    """``map_cost`` of the most probable state of one group."""
     some = rows[group[0] : group[1]]
     variance = work[W_GATE_VARIANCE, group[0] : group[1]].copy()
     x, _ = iterate(mean, cov, some, variance, height_m, iterations, work)
-    return float(misfit(mean, cov, some, variance, height_m, x))
+    return float(map_cost(mean, cov, some, variance, height_m, x))
 
 
 @inlined
@@ -284,14 +284,14 @@ def update(
                     cov[a, b] = work[W_COV + a, b]
             nis = _fuse_used(mean, cov, rows, work)
     if iterations > 1:
-        bent, wide = bends(rows, mean, height_m, work), is_wide(rows, work)
-        if bent or wide:
+        curved, wide = is_curved(rows, mean, height_m, work), is_wide(rows, work)
+        if curved or wide:
             iterate_used(mean, cov, rows, height_m, iterations, work)
             if on_top(mean, cov, rows, work):
                 fuse_around(mean, cov, rows, height_m, work)
         if wide:
             refine_used(mean, cov, rows, height_m, work)
-        if (bent or wide) and not is_definite(cov, work):
+        if (curved or wide) and not is_definite(cov, work):
             fuse_by_factor(mean, cov, rows.shape[0], work)
     return nis, used
 

@@ -238,7 +238,9 @@ def _stands(nav: Array, memory: Array, constraints: Constraints, chunk: Array) -
 
 
 @kernel
-def hold(nav: Array, cov: Array, memory: Array, sensors: Sensors, chunk: Array) -> None:
+def apply_constraints(
+    nav: Array, cov: Array, memory: Array, sensors: Sensors, chunk: Array
+) -> None:
     """Apply the constraints after a ``chunk`` (7,), the mean of ``Chunk``, in place."""
     constraints = sensors.constraints
     standing = _stands(nav, memory, constraints, chunk)
@@ -397,5 +399,5 @@ def advance(
         now, dark_s = predict_chunk(nav, cov, memory, now, to_ns, imu, sensors, chunk)
         blind_s += dark_s
         if dark_s == 0.0:
-            hold(nav, cov, memory, sensors, chunk.mean)
+            apply_constraints(nav, cov, memory, sensors, chunk.mean)
     return blind_s

@@ -38,21 +38,22 @@ def distance2(cov: Array, d: Array) -> float:
 
 
 @kernel
-def misfit(
+def map_cost(
     mean: Array, cov: Array, rows: Array, variance: Array, height_m: float, x: Array
 ) -> float:
     """Twice the negative log posterior of ``x`` (n,) but for a constant: prior and measurement
     terms.
 
     At the most probable ``x`` of a linear model this is the NIS, chi-square with one degree of
-    freedom per row; unlike the NIS it stays so where the model bends over the width of the prior.
+    freedom per row; unlike the NIS it stays so where the model bends over the width of the
+    prior.
     """
     innovation, _ = linearise(rows, x, height_m)
     return float(distance2(cov, x - mean) + (innovation * innovation / variance).sum())
 
 
 @kernel
-def surprise(
+def neg2_log_likelihood(
     mean: Array, cov: Array, rows: Array, height_m: float, at_its_largest: bool
 ) -> tuple[float, float]:
     """Squared Mahalanobis distance of ``rows`` (m, ROW_WIDTH) from what mean (n,), cov (n, n)

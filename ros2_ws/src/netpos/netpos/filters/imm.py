@@ -13,7 +13,7 @@ import numpy as np
 
 from netpos.filters import ekf
 from netpos.filters.compile import kernel
-from netpos.filters.fit import surprise
+from netpos.filters.fit import neg2_log_likelihood
 from netpos.filters.gate import accepted_rows
 from netpos.messages.values import Array
 
@@ -117,7 +117,7 @@ def _keep_alive(weights: Array) -> None:
 def log_likelihood(mean: Array, cov: Array, rows: Array, height_m: float) -> float:
     """Log density of ``rows`` (m, ROW_WIDTH) as the extended Kalman filter at mean, cov sees
     them."""
-    distance, size = surprise(mean, cov, rows, height_m, True)
+    distance, size = neg2_log_likelihood(mean, cov, rows, height_m, True)
     return float(-0.5 * (distance + size))
 
 

@@ -53,8 +53,8 @@ def fuse_pair(cov_a: Array, own_a: Array, cov_b: Array, own_b: Array, method: st
     """
     if method not in METHODS:
         raise ValueError(f"fusion method must be one of {', '.join(METHODS)}, got {method!r}")
-    spread = {"independent": _independent, "ci": _ci, "ici": _ici, "split_ci": _split_ci}[method]
-    weight, gain_a, gain_b, cov = spread(cov_a, own_a, cov_b, own_b)
+    gains_of = {"independent": _independent, "ci": _ci, "ici": _ici, "split_ci": _split_ci}[method]
+    weight, gain_a, gain_b, cov = gains_of(cov_a, own_a, cov_b, own_b)
     own = gain_a @ own_a @ gain_a.T + gain_b @ own_b @ gain_b.T
     return Pair(gain_a, gain_b, _symmetric(cov), _symmetric(own), weight)
 

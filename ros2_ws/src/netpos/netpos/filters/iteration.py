@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from netpos.filters.compile import kernel, leaf
-from netpos.filters.fit import misfit
+from netpos.filters.fit import map_cost
 from netpos.filters.fusion import W_COV, W_INNOVATION, W_PH, W_PRIOR, W_USE, W_VARIANCE, fuse
 from netpos.filters.measurement import VARIANCE, curvature_variance, innovation_row, linearise
 from netpos.filters.state import X
@@ -23,7 +23,7 @@ _NARROWS = 0.25
 _STARTS, _SEARCH = 8, 30
 _APART_M = 0.1
 # Odds of e^-7 against it rule out another place; more than this per row is no fit.
-_RIVAL, _FITS = 15.0, 8.0
+_COST_GAP, _FITS = 15.0, 8.0
 
 
 @kernel
@@ -66,18 +66,18 @@ def iterate_from(
     when they move less than 1 % of the sd or no longer downhill: the result is never less
     probable than the start."""
     use = np.ones(rows.shape[0])
-    last, last_cost = start, misfit(mean, cov, rows, variance, height_m, start)
+    last, last_cost = start, map_cost(mean, cov, rows, variance, height_m, start)
     x, P = mean.copy(), cov.copy()
     for remaining in range(iterations - 1, -1, -1):
         innovation, H = linearise(rows, last, height_m)
         innovation += H @ (last - mean)
         x, P = mean.copy(), cov.copy()
         fuse(x, P, innovation, H, variance, use, work)
-        cost = misfit(mean, cov, rows, variance, height_m, x)
+        cost = map_cost(mean, cov, rows, variance, height_m, x)
         halvings = 0
         while cost > last_cost and halvings < 6:
             x = (x + last) / 2.0
-            cost = misfit(mean, cov, rows, variance, height_m, x)
+            cost = map_cost(mean, cov, rows, variance, height_m, x)
             halvings += 1
         if cost > last_cost:
             return last.copy(), P
@@ -89,7 +89,7 @@ def iterate_from(
 
 
 @leaf
-def bends(rows: Array, mean: Array, height_m: float, work: Array) -> bool:
+def is_curved(rows: Array, mean: Array, height_m: float, work: Array) -> bool:
     """Whether a row used in the update leaves its tangent at the prior by more than a small share
     of its noise when evaluated at the posterior ``mean`` (n,)."""
     n = mean.size
@@ -147,8 +147,8 @@ def refine_used(mean: Array, cov: Array, rows: Array, height_m: float, work: Arr
     if narrowed[X.PX, X.PX] + narrowed[X.PY, X.PY] > _NARROWS * width:
         return
     x, P = iterate_from(mean, prior, prior_cov, kept, variance, height_m, _SEARCH, work)
-    cost = misfit(prior, prior_cov, kept, variance, height_m, x)
-    rival = math.inf
+    cost = map_cost(prior, prior_cov, kept, variance, height_m, x)
+    second_cost = math.inf
     for k in range(_STARTS):
         start = prior.copy()
         start[X.PX] += (
@@ -158,15 +158,15 @@ def refine_used(mean: Array, cov: Array, rows: Array, height_m: float, work: Arr
             1.5 * math.sqrt(prior_cov[X.PY, X.PY]) * math.sin(2.0 * math.pi * k / _STARTS)
         )
         y, Y = iterate_from(start, prior, prior_cov, kept, variance, height_m, _SEARCH, work)
-        other = misfit(prior, prior_cov, kept, variance, height_m, y)
+        other = map_cost(prior, prior_cov, kept, variance, height_m, y)
         apart = math.hypot(y[X.PX] - x[X.PX], y[X.PY] - x[X.PY]) > _APART_M
         if other < cost - 1e-3:
             if apart:
-                rival = cost
+                second_cost = cost
             x, P, cost = y, Y, other
         elif apart:
-            rival = min(rival, other)
-    if rival - cost < _RIVAL or cost > _FITS * kept.shape[0]:
+            second_cost = min(second_cost, other)
+    if second_cost - cost < _COST_GAP or cost > _FITS * kept.shape[0]:
         return
     for i in range(kept.shape[0]):
         curved = variance[i] + curvature_variance(kept[i], x, P, height_m)

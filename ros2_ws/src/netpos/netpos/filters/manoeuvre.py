@@ -13,7 +13,7 @@ import math
 from netpos.filters.compile import leaf
 from netpos.filters.factor import eigenvalues
 from netpos.filters.measurement import GATE_VARIANCE, innovation_row, innovation_variance
-from netpos.filters.motion import add_jump
+from netpos.filters.motion import add_velocity_step
 from netpos.filters.state import X
 from netpos.messages.values import Array
 
@@ -22,7 +22,7 @@ _FOLLOWED = 2.0
 
 
 @leaf
-def unnoticed_s(
+def detection_delay_s(
     mean: Array, cov: Array, rows: Array, height_m: float, gate: float, speed: float, h: Array
 ) -> tuple[float, float]:
     """Time [s] until a velocity step of ``speed`` [m/s] takes ``rows`` (m, ROW_WIDTH) as far off
@@ -49,4 +49,4 @@ def unnoticed_s(
 def add_manoeuvre(speed: float, within_s: float, cov: Array) -> None:
     """Add, in place, a velocity step of sd ``speed`` [m/s] per axis at any time of the last
     ``within_s`` seconds, and the position it led to."""
-    add_jump(speed, within_s / 2.0, speed * within_s / math.sqrt(12.0), cov)
+    add_velocity_step(speed, within_s / 2.0, speed * within_s / math.sqrt(12.0), cov)

@@ -122,7 +122,7 @@ def will_split(
     """Whether one of ``rows`` finds the Gaussian too wide once it is moved by ``dt`` seconds;
     arguments as for ``ekf.predict``, nothing is changed."""
     moved, P, straight = mean.copy(), cov.copy(), motion.copy()
-    straight[Parameter.JUMP_SPEED] = 0.0
+    straight[Parameter.VELOCITY_STEP_SD] = 0.0
     ekf.predict(moved, P, dt, straight, bias)
     start = 0
     while start < rows.shape[0]:

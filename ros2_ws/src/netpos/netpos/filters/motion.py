@@ -56,9 +56,9 @@ class Parameter(IntEnum):
     ACCEL_BIAS = 13  # INERTIAL: random walk of the acceleration bias [m/s^2/sqrt(s)]
     YAW_INCREMENT = 14  # INERTIAL, input: integrated yaw rate over the step [rad]
     SPEED_INCREMENT = 15  # INERTIAL, input: integrated forward acceleration over the step [m/s]
-    JUMP_SPEED = 16  # sd [m/s] of a velocity step the filter allowed for in this step; 0: none
-    JUMP_TIME = 17  # how long ago it happened [s]
-    JUMP_SPREAD = 18  # sd [m] of the position it led to, beside that: its time is not known
+    VELOCITY_STEP_SD = 16  # [m/s] of a velocity step that the filter allowed for; 0: none
+    VELOCITY_STEP_AGE = 17  # how long ago it happened [s]
+    VELOCITY_STEP_POSITION_SD = 18  # [m] of the position it led to: its time is not known
 
 
 _EXTRAS = {
@@ -258,8 +258,11 @@ def add_noise(mean: Array, dt: float, motion: Array, bias: Array, cov: Array) ->
     else:
         _add_acceleration(dt, motion, cov)
     _add_clock(dt, motion, cov)
-    time_s, spread_m = motion[Parameter.JUMP_TIME], motion[Parameter.JUMP_SPREAD]
-    add_jump(motion[Parameter.JUMP_SPEED], time_s, spread_m, cov)
+    age_s, position_sd = (
+        motion[Parameter.VELOCITY_STEP_AGE],
+        motion[Parameter.VELOCITY_STEP_POSITION_SD],
+    )
+    add_velocity_step(motion[Parameter.VELOCITY_STEP_SD], age_s, position_sd, cov)
     if model == Model.CONSTANT_TURN:
         cov[X.TURN_RATE, X.TURN_RATE] += motion[Parameter.TURN_RATE] ** 2 * dt
     elif model == Model.RIGID_BODY:
@@ -275,14 +278,14 @@ def add_noise(mean: Array, dt: float, motion: Array, bias: Array, cov: Array) ->
 
 
 @inlined
-def add_jump(sd: float, time_s: float, spread_m: float, cov: Array) -> None:
+def add_velocity_step(sd: float, time_s: float, position_sd: float, cov: Array) -> None:
     """Add, in place, a velocity step of ``sd`` [m/s] per axis ``time_s`` ago, and the position it
-    leads to, known but for ``spread_m`` (sd). Nothing happens for sd 0."""
+    leads to, known but for ``position_sd`` (sd). Nothing happens for sd 0."""
     if sd == 0.0:
         return
     for p in range(2):
         v = X.VX + p
-        cov[p, p] += (sd * time_s) ** 2 + spread_m**2
+        cov[p, p] += (sd * time_s) ** 2 + position_sd**2
         cov[p, v] += sd * sd * time_s
         cov[v, p] += sd * sd * time_s
         cov[v, v] += sd * sd

@@ -98,24 +98,24 @@ def _rotate(first: Array, second: Array, start: int, c: float, s: float) -> None
 
 
 @kernel
-def predict(mean: Array, spread: Array, dt: float, motion: Array, bias: Array) -> None:
-    """Move mean (n,) and factor ``spread`` (n, n) by ``dt`` seconds; as ``ukf.predict``."""
+def predict(mean: Array, L: Array, dt: float, motion: Array, bias: Array) -> None:
+    """Move mean (n,) and factor ``L`` (n, n) by ``dt`` seconds; as ``ukf.predict``."""
     if dt <= 0.0:
         return
-    D = move(mean, spread, dt, motion, bias)
-    Q = np.empty_like(spread)
+    D = move(mean, L, dt, motion, bias)
+    Q = np.empty_like(L)
     noise(mean, dt, motion, bias, Q)
-    spread[:] = factor(Q)
+    L[:] = factor(Q)
     for j in range(D.shape[0]):
-        _up_date(spread, D[j])
+        _up_date(L, D[j])
 
 
 @kernel
 def update(
-    mean: Array, spread: Array, rows: Array, height_m: float, gate_nis: Array, accepted: Array
+    mean: Array, L: Array, rows: Array, height_m: float, gate_nis: Array, accepted: Array
 ) -> tuple[float, int]:
-    """One epoch, in place; as ``ukf.update`` with the factor ``spread`` (n, n) for cov."""
-    innovation, G, E = regress(mean, spread, rows, height_m)
+    """One epoch, in place; as ``ukf.update`` with the factor ``L`` (n, n) for cov."""
+    innovation, G, E = regress(mean, L, rows, height_m)
     S = innovation_cov(G, E, rows[:, GATE_VARIANCE].copy())
     gate_groups(rows, innovation, S, gate_nis, accepted)
     index, nis = select_rows(rows, innovation, S, gate_nis, accepted)
@@ -123,14 +123,12 @@ def update(
         return 0.0, 0
     if index.size < rows.shape[0]:
         innovation, G, E = innovation[index], G[index], E[index]
-    fuse(mean, spread, innovation, G, E, rows[index, VARIANCE])
+    fuse(mean, L, innovation, G, E, rows[index, VARIANCE])
     return nis, index.size
 
 
 @kernel
-def fuse(
-    mean: Array, spread: Array, innovation: Array, G: Array, E: Array, variance: Array
-) -> None:
+def fuse(mean: Array, L: Array, innovation: Array, G: Array, E: Array, variance: Array) -> None:
     """Update mean (n,) and factor (n, n) with rows as ``sigma.regress`` returns them; ``G`` and
     ``innovation`` are used up."""
     n, m = mean.size, innovation.size
@@ -142,7 +140,7 @@ def fuse(
         column[:] = E[:, j]
         _up_date(S, column)
     for i in range(m):
-        _eliminate(i, S, G, spread, gain)
+        _eliminate(i, S, G, L, gain)
         for k in range(i):
             innovation[i] -= S[i, k] * innovation[k]
         innovation[i] /= S[i, i]
@@ -151,7 +149,7 @@ def fuse(
 
 
 @leaf
-def _eliminate(i: int, S: Array, G: Array, spread: Array, gain: Array) -> None:
+def _eliminate(i: int, S: Array, G: Array, L: Array, gain: Array) -> None:
     """Rotate row ``i`` of G (m, n) into S (m, m), and what of the factor goes with it into
     ``gain`` (n,)."""
     gain[:] = 0.0
@@ -161,4 +159,4 @@ def _eliminate(i: int, S: Array, G: Array, spread: Array, gain: Array) -> None:
         length = math.hypot(S[i, i], G[i, j])
         c, s = S[i, i] / length, G[i, j] / length
         _rotate(S[:, i], G[:, j], i, c, s)
-        _rotate(gain, spread[:, j], j, c, s)
+        _rotate(gain, L[:, j], j, c, s)

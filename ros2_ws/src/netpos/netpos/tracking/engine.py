@@ -1,5 +1,7 @@
-"""One epoch of one track, compiled: predict, gate, second look, recover. The same kernel serves
-the live track, the replay and Monte Carlo runs of thousands of routes."""
+"""One epoch of one track, compiled: predict, gate, update, re-update, recover.
+
+The same kernel serves the live track, the replay and Monte Carlo runs of thousands of routes.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +15,9 @@ import numpy.typing as npt
 from netpos.filters import conditioning, ekf, kf, srukf, ukf
 from netpos.filters.compile import kernel, leaf
 from netpos.filters.conditioning import Robust, RobustOptions
-from netpos.filters.manoeuvre import add_manoeuvre, unnoticed_s
+from netpos.filters.manoeuvre import add_manoeuvre, detection_delay_s
 from netpos.filters.measurement import GROUP
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS, Parameter, add_jump
+from netpos.filters.motion import SPEED_OF_LIGHT_MPS, Parameter, add_velocity_step
 from netpos.filters.state import X
 from netpos.messages.values import Array
 
@@ -45,7 +47,7 @@ class FilterOptions(NamedTuple):
     inflate_after: int  # epochs rejected in a row
     lost_after: int  # epochs rejected in a row
     initial_speed_sd: float  # [m/s] to which the velocity opens then
-    manoeuvre_speed_sd: float  # [m/s] of the second look; 0: none
+    manoeuvre_speed_sd: float  # [m/s] of a manoeuvre in a re-update; 0: none
     integrity_risk: float  # share of errors that may exceed the protection level
     robust: RobustOptions
     gain_floor: Array  # (3,) as for ``kf.update``
@@ -71,15 +73,15 @@ class StepResult(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of ``step``: of ``ekf.workspace``, groups accepted by each look (2, groups), the
-    prediction (n,), (n, n) and the state of the second look."""
+    """Memory of ``step``: of ``ekf.workspace``, groups accepted by update and re-update
+    (2, groups), the prediction (n,), (n, n) and the state of the re-update."""
 
     work: Array
     accepted: Array
     prior_mean: Array
-    prior_spread: Array
-    second_mean: Array
-    second_spread: Array
+    prior_cov_or_sqrt: Array
+    reupdate_mean: Array
+    reupdate_cov_or_sqrt: Array
 
 
 class Epochs(NamedTuple):
@@ -105,12 +107,14 @@ class Run(NamedTuple):
 @kernel
 def scratch(n: int, m: int) -> Scratch:
     """Memory for ``step`` with ``n`` states and up to ``m`` rows."""
-    means, spreads = np.zeros((2, n)), np.zeros((2, n, n))
+    means, covs_or_sqrts = np.zeros((2, n)), np.zeros((2, n, n))
     accepted = np.zeros((2, m))
-    return Scratch(ekf.workspace(n, m), accepted, means[0], spreads[0], means[1], spreads[1])
+    return Scratch(
+        ekf.workspace(n, m), accepted, means[0], covs_or_sqrts[0], means[1], covs_or_sqrts[1]
+    )
 
 
-def to_spread(cov: Array, options: FilterOptions) -> Array:
+def to_cov_or_sqrt(cov: Array, options: FilterOptions) -> Array:
     """What the filter carries instead of the covariance: its lower Cholesky factor where it is a
     square-root filter, a copy otherwise."""
     if options.filter == Filter.SRUKF:
@@ -119,115 +123,124 @@ def to_spread(cov: Array, options: FilterOptions) -> Array:
     return cov.copy()
 
 
-def to_cov(spread: Array, options: FilterOptions) -> Array:
+def to_cov(cov_or_sqrt: Array, options: FilterOptions) -> Array:
     """Covariance (n, n) of what the filter carries."""
     if options.filter == Filter.SRUKF:
-        cov: Array = srukf.covariance(spread)
+        cov: Array = srukf.covariance(cov_or_sqrt)
         return cov
-    return spread
+    return cov_or_sqrt
 
 
 @leaf
 def predict(
-    mean: Array, spread: Array, dt: float, motion: Array, bias: Array, options: FilterOptions
+    mean: Array, cov_or_sqrt: Array, dt: float, motion: Array, bias: Array, options: FilterOptions
 ) -> None:
-    """Move mean (n,) and spread (n, n) by ``dt`` seconds in place; nothing happens for dt <= 0.
-    A velocity step noted in ``motion`` is over."""
-    motion[Parameter.JUMP_SPEED] = 0.0
+    """Move mean (n,) and cov_or_sqrt (n, n) by ``dt`` seconds in place; nothing happens for dt <=
+    0. A velocity step noted in ``motion`` is over."""
+    motion[Parameter.VELOCITY_STEP_SD] = 0.0
     kind = options.filter
     if kind == Filter.UKF:
-        ukf.predict(mean, spread, dt, motion, bias)
+        ukf.predict(mean, cov_or_sqrt, dt, motion, bias)
     elif kind == Filter.SRUKF:
-        srukf.predict(mean, spread, dt, motion, bias)
+        srukf.predict(mean, cov_or_sqrt, dt, motion, bias)
     else:
-        ekf.predict(mean, spread, dt, motion, bias)
+        ekf.predict(mean, cov_or_sqrt, dt, motion, bias)
 
 
 @leaf
 def update(
-    mean: Array, spread: Array, rows: Array, options: FilterOptions, accepted: Array, work: Array
+    mean: Array,
+    cov_or_sqrt: Array,
+    rows: Array,
+    options: FilterOptions,
+    accepted: Array,
+    work: Array,
 ) -> tuple[float, int]:
     """Gate and apply one epoch, in place: NIS of the accepted rows and their number; ``accepted``
     (groups,) is filled."""
     kind, height_m, gate = options.filter, options.height_m, options.gate_nis
     if kind == Filter.UKF:
-        nis, used = ukf.update(mean, spread, rows, height_m, gate, accepted)
+        nis, used = ukf.update(mean, cov_or_sqrt, rows, height_m, gate, accepted)
     elif kind == Filter.SRUKF:
-        nis, used = srukf.update(mean, spread, rows, height_m, gate, accepted)
+        nis, used = srukf.update(mean, cov_or_sqrt, rows, height_m, gate, accepted)
     elif kind == Filter.KF:
-        nis, used = kf.update(mean, spread, rows, height_m, gate, accepted, options.gain_floor)
+        nis, used = kf.update(
+            mean, cov_or_sqrt, rows, height_m, gate, accepted, options.gain_floor
+        )
     else:
         iterations = options.iterations
-        nis, used = ekf.update(mean, spread, rows, height_m, gate, iterations, accepted, work)
+        nis, used = ekf.update(mean, cov_or_sqrt, rows, height_m, gate, iterations, accepted, work)
     return nis, used
 
 
 @leaf
-def open_velocity(spread: Array, sd: float, unheard_s: float, options: FilterOptions) -> None:
+def open_velocity(cov_or_sqrt: Array, sd: float, unheard_s: float, options: FilterOptions) -> None:
     """Add, in place, a velocity step of ``sd`` [m/s] per axis at some time in the last
     ``unheard_s`` seconds, and the position it leads to."""
     if options.filter == Filter.SRUKF:
-        _open_factor(spread, sd, unheard_s)
+        _open_factor(cov_or_sqrt, sd, unheard_s)
         return
-    add_jump(sd, unheard_s, 0.0, spread)
+    add_velocity_step(sd, unheard_s, 0.0, cov_or_sqrt)
 
 
 @kernel
-def _open_factor(spread: Array, sd: float, unheard_s: float) -> None:
+def _open_factor(cov_or_sqrt: Array, sd: float, unheard_s: float) -> None:
     for p in range(2):
-        x = np.zeros(spread.shape[0])
+        x = np.zeros(cov_or_sqrt.shape[0])
         x[X.PX + p], x[X.VX + p] = sd * unheard_s, sd
-        srukf.cholesky_update(spread, x, 1.0)
+        srukf.cholesky_update(cov_or_sqrt, x, 1.0)
 
 
 @kernel
 def manoeuvre_s(
-    mean: Array, spread: Array, rows: Array, unheard_s: float, options: FilterOptions
+    mean: Array, cov_or_sqrt: Array, rows: Array, unheard_s: float, options: FilterOptions
 ) -> float:
     """Time [s] in which a manoeuvre may have begun, seen from the prediction: since the last
     accepted measurement, or for as long as it goes unnoticed. A step of the velocity that its own
     sd allows for is followed, and no manoeuvre."""
-    cov = spread
+    cov = cov_or_sqrt
     if options.filter == Filter.SRUKF:
-        cov = srukf.covariance(spread)
+        cov = srukf.covariance(cov_or_sqrt)
     h, height_m = np.empty(mean.size), options.height_m
     speed, gate = options.manoeuvre_speed_sd, options.gate_nis[2]
     if 2.0 * speed * speed <= cov[X.VX, X.VX] + cov[X.VY, X.VY]:
         return unheard_s
-    typical_s, _ = unnoticed_s(mean, cov, rows, height_m, gate, speed, h)
+    typical_s, _ = detection_delay_s(mean, cov, rows, height_m, gate, speed, h)
     return max(unheard_s, typical_s if math.isfinite(typical_s) else 0.0)
 
 
 @kernel
-def allow_manoeuvre(spread: Array, within_s: float, options: FilterOptions) -> None:
+def inflate_for_manoeuvre(cov_or_sqrt: Array, within_s: float, options: FilterOptions) -> None:
     """Add, in place, a velocity step of the manoeuvre speed at any time of the last ``within_s``
     seconds."""
     speed = options.manoeuvre_speed_sd
     if options.filter != Filter.SRUKF:
-        add_manoeuvre(speed, within_s, spread)
+        add_manoeuvre(speed, within_s, cov_or_sqrt)
         return
-    _open_factor(spread, speed, within_s / 2.0)
+    _open_factor(cov_or_sqrt, speed, within_s / 2.0)
     for p in range(2):
-        x = np.zeros(spread.shape[0])
+        x = np.zeros(cov_or_sqrt.shape[0])
         x[X.PX + p] = speed * within_s / math.sqrt(12.0)
-        srukf.cholesky_update(spread, x, 1.0)
+        srukf.cholesky_update(cov_or_sqrt, x, 1.0)
 
 
 @leaf
-def note_jump(
+def set_velocity_step_noise(
     motion: Array, opened_sd: float, unheard_s: float, manoeuvre_sd: float, within_s: float
 ) -> None:
     """Leave in ``motion`` the velocity steps allowed for, one ``unheard_s`` ago and one at any
     time of the last ``within_s`` seconds, as one."""
     opened2, manoeuvre2 = opened_sd * opened_sd, manoeuvre_sd * manoeuvre_sd
     speed2 = opened2 + manoeuvre2
-    motion[Parameter.JUMP_SPEED] = math.sqrt(speed2)
+    motion[Parameter.VELOCITY_STEP_SD] = math.sqrt(speed2)
     if speed2 == 0.0:
         return
     time_s = (opened2 * unheard_s + manoeuvre2 * within_s / 2.0) / speed2
     position2 = opened2 * unheard_s * unheard_s + manoeuvre2 * within_s * within_s / 3.0
-    motion[Parameter.JUMP_TIME] = time_s
-    motion[Parameter.JUMP_SPREAD] = math.sqrt(max(position2 - speed2 * time_s * time_s, 0.0))
+    motion[Parameter.VELOCITY_STEP_AGE] = time_s
+    motion[Parameter.VELOCITY_STEP_POSITION_SD] = math.sqrt(
+        max(position2 - speed2 * time_s * time_s, 0.0)
+    )
 
 
 @leaf
@@ -246,11 +259,11 @@ def is_sound(mean: Array, cov: Array) -> bool:
 
 
 @leaf
-def _copy(mean: Array, spread: Array, to_mean: Array, to_spread: Array) -> None:
+def _copy(mean: Array, cov_or_sqrt: Array, to_mean: Array, to_cov_or_sqrt: Array) -> None:
     for a in range(mean.size):
         to_mean[a] = mean[a]
         for b in range(mean.size):
-            to_spread[a, b] = spread[a, b]
+            to_cov_or_sqrt[a, b] = cov_or_sqrt[a, b]
 
 
 @leaf
@@ -264,7 +277,7 @@ def _count(accepted: Array, groups: int) -> int:
 @leaf
 def step(
     mean: Array,
-    spread: Array,
+    cov_or_sqrt: Array,
     epoch: EpochInput,
     motion: Array,
     bias: Array,
@@ -273,75 +286,77 @@ def step(
 ) -> StepResult:
     """Predict and apply one epoch, in place.
 
-    A first look gates with the prediction. Where it rejects something, a second look that allows
-    for a manoeuvre in the time it may have gone unnoticed is taken if it accepts more. After
+    The update gates with the prediction. Where it rejects something, a re-update that allows for a
+    manoeuvre in the time it may have gone unnoticed is taken if it accepts more. After
     ``inflate_after`` epochs rejected in a row the velocity opens to its initial sd. Nothing
     accepted leaves the prediction.
 
     ``scratch`` keeps the prediction, and in the first row of ``accepted`` 0 or 1 of each group.
     The robust options re-weight the rows in place. The velocity step allowed for is left in
-    ``motion`` (``note_jump``), for a smoother to know.
+    ``motion`` (``set_velocity_step_noise``), for a smoother to know.
     """
     rows, unheard_s, accepted = epoch.rows, epoch.unheard_s, scratch.accepted[0]
     groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
-    predict(mean, spread, epoch.dt_s, motion, bias, options)
-    _copy(mean, spread, scratch.prior_mean, scratch.prior_spread)
+    predict(mean, cov_or_sqrt, epoch.dt_s, motion, bias, options)
+    _copy(mean, cov_or_sqrt, scratch.prior_mean, scratch.prior_cov_or_sqrt)
     opened = epoch.rejected_in_row >= options.inflate_after
-    jump = options.initial_speed_sd if opened else 0.0
-    turn, within_s = 0.0, 0.0
+    opened_sd = options.initial_speed_sd if opened else 0.0
+    manoeuvre_sd, within_s = 0.0, 0.0
     if opened:
-        open_velocity(spread, jump, unheard_s, options)
+        open_velocity(cov_or_sqrt, opened_sd, unheard_s, options)
     if options.robust.kind != Robust.NONE or options.robust.nlos_probability > 0.0:
-        condition(mean, spread, rows, options, scratch.work)
-    nis, used = update(mean, spread, rows, options, accepted, scratch.work)
+        reweight(mean, cov_or_sqrt, rows, options, scratch.work)
+    nis, used = update(mean, cov_or_sqrt, rows, options, accepted, scratch.work)
     taken = _count(accepted, groups)
     manoeuvre = options.manoeuvre_speed_sd
     if taken < groups and manoeuvre > 0.0:
-        within_s = manoeuvre_s(scratch.prior_mean, scratch.prior_spread, rows, unheard_s, options)
-        second = _look_again(rows, jump, unheard_s, within_s, options, scratch)
+        within_s = manoeuvre_s(
+            scratch.prior_mean, scratch.prior_cov_or_sqrt, rows, unheard_s, options
+        )
+        second = _reupdate(rows, opened_sd, unheard_s, within_s, options, scratch)
         if second.groups > taken:
             nis, used, taken = second
-            _copy(scratch.second_mean, scratch.second_spread, mean, spread)
+            _copy(scratch.reupdate_mean, scratch.reupdate_cov_or_sqrt, mean, cov_or_sqrt)
             for g in range(groups):
                 accepted[g] = scratch.accepted[1, g]
-            turn = manoeuvre
+            manoeuvre_sd = manoeuvre
     if taken == 0:
-        _copy(scratch.prior_mean, scratch.prior_spread, mean, spread)
+        _copy(scratch.prior_mean, scratch.prior_cov_or_sqrt, mean, cov_or_sqrt)
     else:
-        note_jump(motion, jump, unheard_s, turn, within_s)
+        set_velocity_step_noise(motion, opened_sd, unheard_s, manoeuvre_sd, within_s)
     return StepResult(nis, used, taken)
 
 
 @leaf
-def _look_again(
+def _reupdate(
     rows: Array,
-    jump: float,
+    opened_sd: float,
     unheard_s: float,
     within_s: float,
     options: FilterOptions,
     scratch: Scratch,
 ) -> StepResult:
-    """The second look of ``step``: from the prediction, with a manoeuvre in the last ``within_s``
-    seconds."""
-    mean, spread, accepted = scratch.second_mean, scratch.second_spread, scratch.accepted[1]
-    _copy(scratch.prior_mean, scratch.prior_spread, mean, spread)
-    if jump > 0.0:
-        open_velocity(spread, jump, unheard_s, options)
-    allow_manoeuvre(spread, within_s, options)
-    nis, used = update(mean, spread, rows, options, accepted, scratch.work)
+    """Update once more from the prediction, with a manoeuvre in the last ``within_s`` seconds."""
+    mean, cov_or_sqrt = scratch.reupdate_mean, scratch.reupdate_cov_or_sqrt
+    accepted = scratch.accepted[1]
+    _copy(scratch.prior_mean, scratch.prior_cov_or_sqrt, mean, cov_or_sqrt)
+    if opened_sd > 0.0:
+        open_velocity(cov_or_sqrt, opened_sd, unheard_s, options)
+    inflate_for_manoeuvre(cov_or_sqrt, within_s, options)
+    nis, used = update(mean, cov_or_sqrt, rows, options, accepted, scratch.work)
     groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
     return StepResult(nis, used, _count(accepted, groups))
 
 
 @kernel
-def condition(
-    mean: Array, spread: Array, rows: Array, options: FilterOptions, work: Array
+def reweight(
+    mean: Array, cov_or_sqrt: Array, rows: Array, options: FilterOptions, work: Array
 ) -> None:
     """Re-weight the rows in place as the robust options say."""
-    cov = spread
+    cov = cov_or_sqrt
     if options.filter == Filter.SRUKF:
-        cov = srukf.covariance(spread)
-    conditioning.condition(mean, cov, rows, options.height_m, options.robust, work[0])
+        cov = srukf.covariance(cov_or_sqrt)
+    conditioning.reweight(mean, cov, rows, options.height_m, options.robust, work[0])
 
 
 @kernel

@@ -1,7 +1,7 @@
 """Mean and covariance of one device, carried from epoch to epoch by the chosen filter.
 
-``Single`` runs one motion model in the compiled engine, ``Interacting`` several at once, and
-``Reference`` one on FilterPy.
+``KalmanEstimate`` runs one motion model in the compiled engine, ``ImmEstimate`` several at once,
+and ``FilterpyEstimate`` one on FilterPy.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from netpos.messages.values import Array, TrackMode
 from netpos.tracking import engine
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.engine import EpochInput, FilterOptions
-from netpos.tracking.models import grown, initial_extra_sd, motions_of, options_of
+from netpos.tracking.models import augmented, initial_extra_sd, motions_of, options_of
 
 
 class Estimate(Protocol):
@@ -35,13 +35,13 @@ class Estimate(Protocol):
     def cov(self) -> Array:
         """Covariance (n, n)."""
 
-    def grow(self, sd: Array) -> None:
+    def augment(self, sd: Array) -> None:
         """Append independent states of mean 0 until there are 6 + len(sd)."""
 
-    def drive(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
+    def set_imu_increment(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
         """Set what the IMU integrated since ``stamp_ns``, and how good its yaw rate was."""
 
-    def shake(self, accel_density: float) -> None:
+    def set_process_noise(self, accel_density: float) -> None:
         """Set the density of the white acceleration [m/s^2/sqrt(Hz)] from ``stamp_ns`` on."""
 
     def predict(self, stamp_ns: int, bias: Array) -> None:
@@ -74,7 +74,7 @@ class Estimate(Protocol):
         """An independent copy."""
 
 
-class OnePlace:
+class UnimodalEstimate:
     """An estimate that is one Gaussian."""
 
     @property
@@ -94,12 +94,12 @@ class OneModel:
     def motion(self) -> Array:
         return self._motion
 
-    def drive(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
+    def set_imu_increment(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
         self._motion[Parameter.YAW_INCREMENT] = yaw_rad
         self._motion[Parameter.SPEED_INCREMENT] = speed_mps
         self._motion[Parameter.GYRO] = gyro_density
 
-    def shake(self, accel_density: float) -> None:
+    def set_process_noise(self, accel_density: float) -> None:
         self._motion[Parameter.ACCEL] = accel_density
 
     def set_motion(self, motion: Array) -> None:
@@ -107,7 +107,7 @@ class OneModel:
         self._motion = motion.copy()
 
 
-class Single(OnePlace, OneModel):
+class KalmanEstimate(UnimodalEstimate, OneModel):
     """One motion model in the compiled engine."""
 
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
@@ -115,8 +115,8 @@ class Single(OnePlace, OneModel):
         self._options = options_of(config)
         self._factored = config.filter == "srukf"
         self._motion: Array = motions_of(config)[0].copy()
-        mean, cov = grown(mean, cov, initial_extra_sd(config))
-        self.mean, self._spread = mean.copy(), engine.to_spread(cov, self._options)
+        mean, cov = augmented(mean, cov, initial_extra_sd(config))
+        self.mean, self._cov_or_sqrt = mean.copy(), engine.to_cov_or_sqrt(cov, self._options)
         self._rows = 0
         self._make_room(4)
 
@@ -127,23 +127,27 @@ class Single(OnePlace, OneModel):
 
     @property
     def cov(self) -> Array:
-        return engine.to_cov(self._spread, self._options) if self._factored else self._spread
+        return (
+            engine.to_cov(self._cov_or_sqrt, self._options)
+            if self._factored
+            else self._cov_or_sqrt
+        )
 
     @property
     def prior(self) -> tuple[Array, Array]:
-        spread = self._scratch.prior_spread
-        cov = engine.to_cov(spread, self._options) if self._factored else spread
+        cov_or_sqrt = self._scratch.prior_cov_or_sqrt
+        cov = engine.to_cov(cov_or_sqrt, self._options) if self._factored else cov_or_sqrt
         return self._scratch.prior_mean, cov
 
-    def grow(self, sd: Array) -> None:
+    def augment(self, sd: Array) -> None:
         if self.mean.size < N_CORE + sd.size:
-            mean, cov = grown(self.mean, self.cov, sd)
-            self.mean, self._spread = mean, engine.to_spread(cov, self._options)
+            mean, cov = augmented(self.mean, self.cov, sd)
+            self.mean, self._cov_or_sqrt = mean, engine.to_cov_or_sqrt(cov, self._options)
             self._make_room(self._rows)
 
     def predict(self, stamp_ns: int, bias: Array) -> None:
         dt = (stamp_ns - self.stamp_ns) * 1e-9
-        engine.predict(self.mean, self._spread, dt, self._motion, bias, self._options)
+        engine.predict(self.mean, self._cov_or_sqrt, dt, self._motion, bias, self._options)
         self.stamp_ns = stamp_ns
 
     def step(
@@ -155,7 +159,7 @@ class Single(OnePlace, OneModel):
         epoch = EpochInput(dt_s, unheard_s, rejected_in_row, rows)
         nis, dof, _ = engine.step(
             self.mean,
-            self._spread,
+            self._cov_or_sqrt,
             epoch,
             self._motion,
             bias,
@@ -165,16 +169,16 @@ class Single(OnePlace, OneModel):
         self.stamp_ns = stamp_ns
         return nis, dof, self._scratch.accepted[0, : int(rows.item(-1, GROUP)) + 1]
 
-    def copy(self) -> Single:
-        twin = Single.__new__(Single)
+    def copy(self) -> KalmanEstimate:
+        twin = KalmanEstimate.__new__(KalmanEstimate)
         twin.__dict__.update(self.__dict__)
-        twin.mean, twin._spread = self.mean.copy(), self._spread.copy()
+        twin.mean, twin._cov_or_sqrt = self.mean.copy(), self._cov_or_sqrt.copy()
         twin._motion = self._motion.copy()
         return twin
 
 
-class _Looks(OnePlace):
-    """The looks of ``engine.step`` for estimates that are not one compiled step."""
+class GatedEstimate(UnimodalEstimate):
+    """Update and re-update of ``engine.step`` for estimates that are not one compiled step."""
 
     stamp_ns: int
     mean: Array
@@ -197,11 +201,11 @@ class _Looks(OnePlace):
     def _set_state(self, state: tuple[Array, ...]) -> None:
         raise NotImplementedError
 
-    def _allow(self, within_s: float) -> None:
+    def _inflate(self, within_s: float) -> None:
         raise NotImplementedError
 
-    def _note_jump(self, *steps: float) -> None:
-        """Keep the velocity steps allowed for, arguments of ``engine.note_jump``."""
+    def _set_velocity_step_noise(self, *steps: float) -> None:
+        """Keep the velocity steps allowed for, arguments of ``engine.set_velocity_step_noise``."""
 
     @property
     def prior(self) -> tuple[Array, Array]:
@@ -222,7 +226,7 @@ class _Looks(OnePlace):
         before = tuple(part.copy() for part in self._state())
         opened = rejected_in_row >= self._options.inflate_after
         speed = self._options.initial_speed_sd
-        turn = within_s = 0.0
+        manoeuvre_sd = within_s = 0.0
         if opened:
             self._open(speed, unheard_s)
         accepted = np.zeros(int(rows[-1, GROUP]) + 1)
@@ -233,23 +237,26 @@ class _Looks(OnePlace):
             self._restore(before)
             if opened:
                 self._open(speed, unheard_s)
-            within_s = engine.manoeuvre_s(*self._prior, rows, unheard_s, self._options)
-            self._allow(within_s)
+            mean, cov = self._prior
+            within_s = engine.manoeuvre_s(mean, cov, rows, unheard_s, self._options)
+            self._inflate(within_s)
             second = np.zeros_like(accepted)
             second_nis, second_used = self._update(rows, second)
             if second.sum() > accepted.sum():
                 nis, used, accepted = second_nis, second_used, second
-                turn = manoeuvre
+                manoeuvre_sd = manoeuvre
             else:
                 self._set_state(first)
         if accepted.any():
-            self._note_jump(speed if opened else 0.0, unheard_s, turn, within_s)
+            self._set_velocity_step_noise(
+                speed if opened else 0.0, unheard_s, manoeuvre_sd, within_s
+            )
         else:
             self._restore(before)
         return nis, used, accepted
 
 
-class Interacting(_Looks):
+class ImmEstimate(GatedEstimate):
     """Interacting models stop, straight and turn, each an extended Kalman filter."""
 
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
@@ -258,7 +265,7 @@ class Interacting(_Looks):
         self._motions = motions_of(config)
         count = len(self._motions)
         self._sojourn_s = np.full(count, config.sojourn_s)
-        mean, cov = grown(mean, cov, initial_extra_sd(config))
+        mean, cov = augmented(mean, cov, initial_extra_sd(config))
         self._prior = (mean, cov)
         means, covs = np.tile(mean, (count, 1)), np.tile(cov, (count, 1, 1))
         self._set_state((means, covs, np.full(count, 1.0 / count)))
@@ -277,10 +284,10 @@ class Interacting(_Looks):
         self.cov = np.empty_like(models.covs[0])
         imm.combine(models.means, models.covs, models.weights, self.mean, self.cov)
 
-    def grow(self, sd: Array) -> None:
+    def augment(self, sd: Array) -> None:
         if self.mean.size < N_CORE + sd.size:
             models = self._models
-            pairs = [grown(m, c, sd) for m, c in zip(models.means, models.covs, strict=True)]
+            pairs = [augmented(m, c, sd) for m, c in zip(models.means, models.covs, strict=True)]
             means = np.array([mean for mean, _ in pairs])
             self._set_state((means, np.array([cov for _, cov in pairs]), models.weights))
 
@@ -288,10 +295,10 @@ class Interacting(_Looks):
     def motion(self) -> Array:
         raise NotImplementedError("interacting models have no single motion")
 
-    def drive(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
+    def set_imu_increment(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
         raise NotImplementedError("interacting models take no IMU")
 
-    def shake(self, accel_density: float) -> None:
+    def set_process_noise(self, accel_density: float) -> None:
         raise NotImplementedError("interacting models have several accelerations")
 
     def _move(self, stamp_ns: int, bias: Array) -> None:
@@ -317,17 +324,17 @@ class Interacting(_Looks):
         for cov in self._models.covs:
             engine.open_velocity(cov, sd, unheard_s, self._options)
 
-    def _allow(self, within_s: float) -> None:
+    def _inflate(self, within_s: float) -> None:
         for cov in self._models.covs:
-            engine.allow_manoeuvre(cov, within_s, self._options)
+            engine.inflate_for_manoeuvre(cov, within_s, self._options)
 
-    def copy(self) -> Interacting:
+    def copy(self) -> ImmEstimate:
         twin = copy.copy(self)
         twin._restore(self._state())
         return twin
 
 
-class Reference(OneModel, _Looks):
+class FilterpyEstimate(OneModel, GatedEstimate):
     """One motion model on FilterPy: slow, for comparison."""
 
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
@@ -341,7 +348,7 @@ class Reference(OneModel, _Looks):
         self._update_with = (
             filterpy_backend.ukf_update if unscented else filterpy_backend.ekf_update
         )
-        self._set_state(grown(mean, cov, initial_extra_sd(config)))
+        self._set_state(augmented(mean, cov, initial_extra_sd(config)))
         self._prior = (self.mean, self.cov)
 
     def _state(self) -> tuple[Array, ...]:
@@ -350,15 +357,15 @@ class Reference(OneModel, _Looks):
     def _set_state(self, state: tuple[Array, ...]) -> None:
         self.mean, self.cov = state
 
-    def grow(self, sd: Array) -> None:
-        self.mean, self.cov = grown(self.mean, self.cov, sd)
+    def augment(self, sd: Array) -> None:
+        self.mean, self.cov = augmented(self.mean, self.cov, sd)
 
-    def _note_jump(self, *steps: float) -> None:
-        engine.note_jump(self._motion, *steps)
+    def _set_velocity_step_noise(self, *steps: float) -> None:
+        engine.set_velocity_step_noise(self._motion, *steps)
 
     def _move(self, stamp_ns: int, bias: Array) -> None:
         dt = (stamp_ns - self.stamp_ns) * 1e-9
-        self._motion[Parameter.JUMP_SPEED] = 0.0
+        self._motion[Parameter.VELOCITY_STEP_SD] = 0.0
         self._predict_with(self.mean, self.cov, dt, self._motion, bias)
         self.stamp_ns = stamp_ns
 
@@ -369,10 +376,10 @@ class Reference(OneModel, _Looks):
     def _open(self, sd: float, unheard_s: float) -> None:
         engine.open_velocity(self.cov, sd, unheard_s, self._options)
 
-    def _allow(self, within_s: float) -> None:
-        engine.allow_manoeuvre(self.cov, within_s, self._options)
+    def _inflate(self, within_s: float) -> None:
+        engine.inflate_for_manoeuvre(self.cov, within_s, self._options)
 
-    def copy(self) -> Reference:
+    def copy(self) -> FilterpyEstimate:
         twin = copy.copy(self)
         twin._motion = self._motion.copy()
         twin._restore(self._state())
@@ -382,7 +389,7 @@ class Reference(OneModel, _Looks):
 def start(config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> Estimate:
     """Estimate of the configured kind from mean (6,) and covariance (6, 6) at ``stamp_ns``."""
     if config.backend == "filterpy":
-        return Reference(config, stamp_ns, mean, cov)
+        return FilterpyEstimate(config, stamp_ns, mean, cov)
     if config.motion_model == "interacting":
-        return Interacting(config, stamp_ns, mean, cov)
-    return Single(config, stamp_ns, mean, cov)
+        return ImmEstimate(config, stamp_ns, mean, cov)
+    return KalmanEstimate(config, stamp_ns, mean, cov)

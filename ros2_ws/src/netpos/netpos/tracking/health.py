@@ -24,7 +24,7 @@ from dataclasses import dataclass, field, fields
 from enum import IntEnum
 
 from netpos.tracking.health_memory import RsuMemory, Run, Vote
-from netpos.tracking.health_words import medians, misfit, off, rate_hz, words
+from netpos.tracking.health_words import mean_nis, medians, off, rate_hz, words
 from netpos.tracking.observations import FittedEpoch, Observation
 
 _AGREES, _REFUSED = 0.7, 0.3  # accept ratios
@@ -42,12 +42,12 @@ class RsuState(IntEnum):
 
     OK = 0
     SUSPECT = 1
-    ISOLATED = 2
+    EXCLUDED = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HealthConfig:
-    """When an RSU is isolated, re-admitted and called silent.
+    """When an RSU is excluded, re-admitted and called silent.
 
     RSUs are compared within a slot: it must be no shorter than their measurement interval. Raises
     ``ValueError`` for values that are not finite and > 0.
@@ -110,7 +110,7 @@ class RsuHealth:
         self._judged = -(1 << 62)  # slots below are judged
         self._due_ns = -(1 << 62)  # when the next one is
         self._trusted_ns = 0
-        self._accused = False  # an RSU is, or was, isolated
+        self._accused = False  # an RSU is, or was, excluded
 
     def observe(
         self,
@@ -120,7 +120,7 @@ class RsuHealth:
         accepted: bool,
         innovations: Mapping[str, tuple[float, float]],
     ) -> None:
-        """Take what a track found of one measurement; of an isolated RSU: what the gate would have
+        """Take what a track found of one measurement; of an excluded RSU: what the gate would have
         said. A second observation of the same RSU, device and stamp replaces the first.
 
         innovations : (measured minus predicted in m or rad, its sd) by ``Kind`` name, any case
@@ -192,16 +192,16 @@ class RsuHealth:
             self._advance(stamp_ns)
         return not self._accused
 
-    def isolated(self, rsu_id: str, stamp_ns: int) -> bool:
+    def excluded(self, rsu_id: str, stamp_ns: int) -> bool:
         """Whether a measurement of this RSU with this stamp is to be refused."""
         if stamp_ns >= self._due_ns:
             self._advance(stamp_ns)
         rsu = self._rsus.get(rsu_id)
         if rsu is None:
             return False
-        for effective_ns, isolated in reversed(rsu.changes):
+        for effective_ns, excluded in reversed(rsu.changes):
             if effective_ns <= stamp_ns:
-                return isolated
+                return excluded
         return False
 
     # judgement
@@ -226,13 +226,13 @@ class RsuHealth:
         for (vue_id, rsu_id), stream in streams.items():
             entries = list(stream.values())
             ratio = sum([e.accepted for e in entries]) / len(entries)
-            devices.setdefault(vue_id, {})[rsu_id] = Vote(entries, ratio, misfit(entries))
+            devices.setdefault(vue_id, {})[rsu_id] = Vote(entries, ratio, mean_nis(entries))
             heard.setdefault(rsu_id, []).extend(entries)
         for rsu_id, entries in heard.items():
             rsu = self._rsus[rsu_id]
             rsu.window.extend(sorted(entries))
             rsu.measurements += len(entries)
-            if not rsu.isolated:
+            if not rsu.excluded:
                 self._trusted_ns = max(self._trusted_ns, rsu.window[-1].stamp_ns)
         against: dict[str, list[Vote]] = {}
         agree: dict[str, list[Vote]] = {}
@@ -249,11 +249,11 @@ class RsuHealth:
         agree: dict[str, list[Vote]],
     ) -> None:
         """Sort what one device says of the RSUs into votes against and for them."""
-        trusted = [name for name in votes if not self._rsus[name].isolated]
+        trusted = [name for name in votes if not self._rsus[name].excluded]
         taken = frozenset(
             name
             for name in trusted
-            if votes[name].ratio >= _AGREES and votes[name].misfit <= _WITNESS
+            if votes[name].ratio >= _AGREES and votes[name].mean_nis <= _WITNESS
         )
         refused = [name for name in trusted if votes[name].ratio <= _REFUSED]
         for name, vote in votes.items():
@@ -285,7 +285,7 @@ class RsuHealth:
     def _decide(self, against: Mapping[str, list[Vote]], end_ns: int) -> None:
         cfg = self._config
         for rsu in self._rsus.values():
-            if not rsu.isolated:
+            if not rsu.excluded:
                 continue
             consistent = rsu.agrees is not None and rsu.agrees.reaches(
                 cfg.readmit_after_s, cfg.readmit_after_count
@@ -298,19 +298,19 @@ class RsuHealth:
             if run is not None and run.reaches(cfg.isolate_after_s, cfg.isolate_after_count):
                 accused.append((-run.count, name))
         for _, name in sorted(accused):
-            if not self._rsus[name].isolated and any(
-                sum(not self._rsus[w].isolated for w in vote.witnesses) >= 2
+            if not self._rsus[name].excluded and any(
+                sum(not self._rsus[w].excluded for w in vote.witnesses) >= 2
                 for vote in against[name]
             ):
                 self._set(self._rsus[name], True, end_ns)
 
-    def _set(self, rsu: RsuMemory, isolated: bool, end_ns: int) -> None:
-        rsu.isolated = isolated
+    def _set(self, rsu: RsuMemory, excluded: bool, end_ns: int) -> None:
+        rsu.excluded = excluded
         self._accused = True
         rsu.agrees = None
-        if not isolated:
+        if not excluded:
             rsu.against = None
-        rsu.changes.append((end_ns + self._settle_ns, isolated))
+        rsu.changes.append((end_ns + self._settle_ns, excluded))
 
     # reports
 
@@ -357,12 +357,12 @@ class RsuHealth:
         newest_ns = self._heard.get(rsu.last_vue, -1)
         if silent and newest_ns > max(rsu.last_ns, now_ns - self._config.silent_after_s * 1e9):
             faults.append(f"silent for {age_s:.0f} s")
-        if rsu.isolated:
+        if rsu.excluded:
             faults.insert(0, f"isolated: {rsu.cause}")
             if rsu.agrees is not None:
                 consistent_s = (rsu.agrees.last_ns - rsu.agrees.first_ns) * 1e-9
                 faults.append(f"consistent again for {consistent_s:.0f} s")
-            return RsuState.ISOLATED, "; ".join(faults)
+            return RsuState.EXCLUDED, "; ".join(faults)
         if rsu.against is not None and rsu.against.count >= _SPEAKS:
             faults.append(rsu.cause)
         elif len(entries) >= _FEW:

@@ -30,7 +30,7 @@ class RsuMemory:
     last_vue: str = ""
     measurements: int = 0
     late: int = 0
-    isolated: bool = False
+    excluded: bool = False
     cause: str = ""
     against: Run | None = None
     agrees: Run | None = None
@@ -43,5 +43,5 @@ class Vote:
 
     entries: list[Observation]
     ratio: float
-    misfit: float
+    mean_nis: float
     witnesses: frozenset[str] = frozenset()

@@ -21,9 +21,9 @@ def words(entries: Sequence[Observation]) -> str:
     faults = off(entries, _OFF)
     if not faults:
         for kind, values in _by_kind(entries).items():
-            spread = _spread(_normalised(kind, values))
-            if spread >= _SCATTERS:
-                faults.append(f"{kind} scatters {spread:.1f} times as far as stated")
+            scatter = _scatter(_normalised(kind, values))
+            if scatter >= _SCATTERS:
+                faults.append(f"{kind} scatters {scatter:.1f} times as far as stated")
     return ", ".join(faults) or "refused by the gate"
 
 
@@ -35,12 +35,12 @@ def off(entries: Sequence[Observation], limit: float) -> list[str]:
     for kind, values in _by_kind(entries).items():
         normalised = _normalised(kind, values)
         size = abs(median(normalised))
-        if size >= max(limit, _spread(normalised)):
+        if size >= max(limit, _scatter(normalised)):
             found.append((size, _phrase(kind, median(_unwrapped(kind, values)), devices)))
     return [phrase for _, phrase in sorted(found, reverse=True)]
 
 
-def _spread(values: Sequence[float]) -> float:
+def _scatter(values: Sequence[float]) -> float:
     """Standard deviation by the median absolute deviation."""
     centre = median(values)
     return median(abs(v - centre) for v in values) / _NORMAL_QUARTILE
@@ -83,7 +83,7 @@ def medians(entries: Iterable[Observation], normalised: bool = False) -> dict[st
     return {kind: median(values_of(kind, v)) for kind, v in _by_kind(entries).items()}
 
 
-def misfit(entries: Iterable[Observation]) -> float:
+def mean_nis(entries: Iterable[Observation]) -> float:
     """Mean squared normalised innovation; 1 for a consistent track."""
     squares = [
         (values[i] / values[i + 1]) ** 2

@@ -19,7 +19,7 @@ from netpos.common.least_squares import minimise
 from netpos.filters import ekf
 from netpos.filters.chi_square import chi_square_bound
 from netpos.filters.compile import kernel
-from netpos.filters.fit import misfit
+from netpos.filters.fit import map_cost
 from netpos.filters.measurement import (
     AXES,
     BIAS,
@@ -243,7 +243,7 @@ def with_heading(
     for k in range(_HEADINGS):
         start = np.append(mean, 2.0 * math.pi * k / _HEADINGS)
         x, P = ekf.iterate_from(start, start, prior, rows, variance, height_m, 30, work)
-        candidates.append((misfit(x, P, rows, variance, height_m, x), k, x, P))
+        candidates.append((map_cost(x, P, rows, variance, height_m, x), k, x, P))
     candidates.sort(key=lambda c: c[:2])
     cost, _, x, P = candidates[0]
     far = 5.0 * math.sqrt(P[6, 6])

@@ -11,8 +11,8 @@ from netpos.filters.measurement import GROUP
 from netpos.filters.motion import Parameter
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.estimates import Estimate, OneModel, Single
-from netpos.tracking.models import grown, options_of
+from netpos.tracking.estimates import Estimate, KalmanEstimate, OneModel
+from netpos.tracking.models import augmented, options_of
 from netpos.tracking.protection import mixture_radius
 
 
@@ -23,7 +23,7 @@ class MixtureEstimate(OneModel):
     changed, so that copies may share them.
     """
 
-    def __init__(self, config: TrackerConfig, estimate: Single) -> None:
+    def __init__(self, config: TrackerConfig, estimate: KalmanEstimate) -> None:
         """A mixture of one component: ``estimate``."""
         self.stamp_ns = estimate.stamp_ns
         self._risk = config.integrity_risk
@@ -70,17 +70,17 @@ class MixtureEstimate(OneModel):
         held: float = mixture_radius(means, covs, weights, self.mean[:2], self._risk)
         return max(level_m, held)
 
-    def grow(self, sd: Array) -> None:
+    def augment(self, sd: Array) -> None:
         if self.mean.size < 6 + sd.size:
             means, covs, log_weights = self._components
-            pairs = [grown(mean, cov, sd) for mean, cov in zip(means, covs, strict=True)]
+            pairs = [augmented(mean, cov, sd) for mean, cov in zip(means, covs, strict=True)]
             means = np.array([mean for mean, _ in pairs])
             self._set((means, np.array([cov for _, cov in pairs]), log_weights))
 
     def predict(self, stamp_ns: int, bias: Array) -> None:
         if stamp_ns <= self.stamp_ns:
             return
-        self._motion[Parameter.JUMP_SPEED] = 0.0
+        self._motion[Parameter.VELOCITY_STEP_SD] = 0.0
         means, covs, log_weights = self._components
         means, covs = means.copy(), covs.copy()
         mixture.predict(means, covs, (stamp_ns - self.stamp_ns) * 1e-9, self._motion, bias)
@@ -103,7 +103,7 @@ class MixtureEstimate(OneModel):
         means, covs, log_weights = self._components
         if log_weights.size > 1:
             return None
-        single = Single(config, self.stamp_ns, means[0], covs[0])
+        single = KalmanEstimate(config, self.stamp_ns, means[0], covs[0])
         single.set_motion(self._motion)
         return single
 
@@ -120,7 +120,7 @@ def with_components(
     one of ``rows``; a mixture of one component as an estimate of its own."""
     if isinstance(estimate, MixtureEstimate):
         return estimate.as_single(config) or estimate
-    if not isinstance(estimate, Single):
+    if not isinstance(estimate, KalmanEstimate):
         return estimate
     dt, height_m = (stamp_ns - estimate.stamp_ns) * 1e-9, config.device_height_m
     if dt <= config.coast_after_s:

@@ -134,7 +134,7 @@ def pose_state(config: TrackerConfig, position: Array, position_cov: Array) -> t
     return mean, cov
 
 
-def grown(mean: Array, cov: Array, sd: Array) -> tuple[Array, Array]:
+def augmented(mean: Array, cov: Array, sd: Array) -> tuple[Array, Array]:
     """Mean and covariance with the last entries of ``sd`` appended as independent states of mean
     0, so that there are as many as 6 + len(sd)."""
     new = sd[mean.size - N_CORE :]

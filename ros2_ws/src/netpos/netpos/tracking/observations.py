@@ -29,18 +29,18 @@ class Observation(NamedTuple):
 
 class FittedEpoch(NamedTuple):
     """What a track found of one epoch: ``items`` by group, ``rows`` (m, ROW_WIDTH) and how they
-    fitted, ``fits`` (m, 2), and whether they were ``accepted``, by group."""
+    fitted, ``innovations`` (m, 2), and whether they were ``accepted``, by group."""
 
     stamp_ns: int
     vue_id: str
     items: Sequence[RsuMeasurement | Velocity | GroundSpeed]
     rows: Array
-    fits: Array
+    innovations: Array
     accepted: Sequence[float]
 
     def observations(self) -> list[tuple[str, Observation]]:
         """One per measurement of an RSU, which is named with it."""
-        values, found = tuple(self.fits.ravel().tolist()), []
+        values, found = tuple(self.innovations.ravel().tolist()), []
         places = _places_of(self.rows[:, _KIND_AND_GROUP].tobytes())
         for item, taken, place in zip(self.items, self.accepted, places, strict=True):
             if isinstance(item, RsuMeasurement):
@@ -55,7 +55,7 @@ class FittedEpoch(NamedTuple):
 @lru_cache(256)
 def _places_of(kinds_and_groups: bytes) -> list[tuple[tuple[str, ...], int, int]]:
     """Per group: names of the rows that are told of, which follow one another, and where in the
-    flattened fits they begin and end."""
+    flattened innovations they begin and end."""
     kinds, groups = np.frombuffer(kinds_and_groups).reshape(-1, 2).T.tolist()
     places = []
     for group in range(int(max(groups)) + 1):

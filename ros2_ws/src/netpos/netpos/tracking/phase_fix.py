@@ -114,7 +114,7 @@ def _level_gradient(row: Array, state: Array, height_m: float, h: Array) -> None
 
 
 @kernel
-def spawn(
+def init_hypothesis(
     mean: Array,
     cov: Array,
     ranged: Array,

@@ -12,12 +12,12 @@ import numpy as np
 from netpos.filters.measurement import AXES, ORIGIN, VALUE, VARIANCE
 from netpos.messages.values import Array, Velocity
 from netpos.tracking import estimates
-from netpos.tracking.batch import Batch
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.epoch_rows import EpochRows
 from netpos.tracking.estimates import Estimate
 from netpos.tracking.models import by_sectors, pose_state
-from netpos.tracking.phase_fix import TWO_PI, phase_scale, spawn
-from netpos.tracking.sectors import Sectors, phase_place
+from netpos.tracking.phase_fix import TWO_PI, init_hypothesis, phase_scale
+from netpos.tracking.sectors import PhaseAmbiguityBank, phase_place
 from netpos.tracking.step_heading import choose_sector
 
 _WALKING_MPS = 0.1  # a step velocity below this is none
@@ -41,12 +41,12 @@ class PhaseStart:
         twin._epochs = self._epochs.copy()
         return twin
 
-    def heard(self, batch: Batch) -> bool:
+    def heard(self, epoch_rows: EpochRows) -> bool:
         """Take the step velocities of an epoch; whether a track may start from it this way."""
-        for item in batch.items:
+        for item in epoch_rows.items:
             if isinstance(item, Velocity):
                 self.hear(item)
-        return (by_sectors(self.config) or self._by_heading) and phase_place(batch.rows) >= 0
+        return (by_sectors(self.config) or self._by_heading) and phase_place(epoch_rows.rows) >= 0
 
     @property
     def _by_heading(self) -> bool:
@@ -71,14 +71,14 @@ class PhaseStart:
         at = phase_place(rows)
         start = pose_state(self.config, np.zeros(2), np.eye(2))
         if not self._by_heading:
-            return Sectors.begin(self.config, stamp_ns, rows, at, start)
+            return PhaseAmbiguityBank.begin(self.config, stamp_ns, rows, at, start)
         turns = self._turns(rows, at)
         self._epochs.append((stamp_ns, float(rows[at - 1, VALUE]), float(rows[at, VALUE])))
         if turns is None:
             return None
         mean, cov = start
         speed, height = self.config.initial_speed_sd_mps, self.config.device_height_m
-        if spawn(mean, cov, rows[at - 1], rows[at], turns, speed, height) == -math.inf:
+        if init_hypothesis(mean, cov, rows[at - 1], rows[at], turns, speed, height) == -math.inf:
             return None
         return estimates.start(self.config, stamp_ns, mean, cov)
 
@@ -109,19 +109,19 @@ class PhaseStart:
 def with_sectors(config: TrackerConfig, estimate: Estimate | None, rows: Array) -> Estimate:
     """The estimate there is as a bank where ``rows`` hold a phase that it has not met before."""
     assert estimate is not None
-    if isinstance(estimate, Sectors) or not by_sectors(config):
+    if isinstance(estimate, PhaseAmbiguityBank) or not by_sectors(config):
         return estimate
     at = phase_place(rows)
     if at < 0:
         return estimate
-    known = estimate.stamp_ns, estimate.mean, estimate.cov
-    return Sectors.promote(config, *known, rows, at)
+    mean, cov = estimate.mean, estimate.cov
+    return PhaseAmbiguityBank.promote(config, estimate.stamp_ns, mean, cov, rows, at)
 
 
 def corrections(estimate: Estimate, rejected: MutableMapping[str, int]) -> int:
     """How often a decision about the sector was replaced since last asked; counted as
     ``sector_corrected``."""
-    if not isinstance(estimate, Sectors) or not estimate.corrected:
+    if not isinstance(estimate, PhaseAmbiguityBank) or not estimate.corrected:
         return 0
     corrected, estimate.corrected = estimate.corrected, 0
     rejected["sector_corrected"] += corrected

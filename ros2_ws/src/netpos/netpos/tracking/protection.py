@@ -17,7 +17,7 @@ from netpos.filters.chi_square import chi_square_bound
 from netpos.filters.compile import kernel, leaf
 from netpos.filters.factor import eigenvalues
 from netpos.filters.fusion import W_GAIN, fuse
-from netpos.filters.manoeuvre import add_manoeuvre, unnoticed_s
+from netpos.filters.manoeuvre import add_manoeuvre, detection_delay_s
 from netpos.filters.measurement import GROUP, VARIANCE, curvature_variance, innovation_row
 from netpos.filters.state import X
 from netpos.messages.values import Array
@@ -238,7 +238,7 @@ def level_in(epoch: FusedEpoch, options: FilterOptions, scratch: Scratch) -> flo
     n, height_m, speed = mean.size, options.height_m, options.manoeuvre_speed_sd
     x, wide, P = scratch[0][0, :n], scratch[1][0], scratch[1][1]
     gate = options.gate_nis[2]
-    _, longest_s = unnoticed_s(prior_mean, prior_cov, rows, height_m, gate, speed, x)
+    _, longest_s = detection_delay_s(prior_mean, prior_cov, rows, height_m, gate, speed, x)
     if math.isinf(longest_s):
         return math.inf
     for a in range(n):

@@ -36,7 +36,7 @@ class TrackOutput:
 
 
 @dataclass(slots=True)
-class Applied:
+class EpochResult:
     """What became of the measurements of one epoch: NIS, its degrees of freedom and who sent what
     was accepted."""
 
@@ -73,7 +73,7 @@ NO_ESTIMATE = EstimateStatus()
 def track_status(
     config: TrackerConfig,
     vue_id: str,
-    epoch: Applied,
+    epoch: EpochResult,
     accepted: int,
     rejected: dict[str, int],
     estimate: EstimateStatus = NO_ESTIMATE,

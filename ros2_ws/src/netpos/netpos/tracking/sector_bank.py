@@ -25,7 +25,7 @@ from netpos.filters.sigma import innovation_cov, regress
 from netpos.messages.values import Array
 from netpos.tracking import engine
 from netpos.tracking.engine import Filter, FilterOptions
-from netpos.tracking.phase_fix import TWO_PI, admissible, nearest_turns, spawn, to_fix
+from netpos.tracking.phase_fix import TWO_PI, admissible, init_hypothesis, nearest_turns, to_fix
 
 Ints = npt.NDArray[np.int64]
 
@@ -38,7 +38,7 @@ class Bank(NamedTuple):
     """S slots: means (S, n), covariances or their factors (S, n, n), log weights (S,)."""
 
     means: Array
-    spreads: Array
+    covs_or_sqrts: Array
     weights: Array
 
 
@@ -91,19 +91,19 @@ def _evidence(rows: Array, innovation: Array, S: Array, gate: Array, accepted: A
 def advance(
     bank: Bank,
     dt: float,
-    jump_sd: float,
+    velocity_step_sd: float,
     unheard_s: float,
     motion: Array,
     bias: Array,
     options: FilterOptions,
 ) -> None:
-    """Move every filter by ``dt`` seconds; ``jump_sd`` > 0 opens the velocities."""
-    means, spreads, weights = bank
+    """Move every filter by ``dt`` seconds; ``velocity_step_sd`` > 0 opens the velocities."""
+    means, covs_or_sqrts, weights = bank
     for s in range(weights.size):
         if weights[s] > -math.inf:
-            engine.predict(means[s], spreads[s], dt, motion, bias, options)
-            if jump_sd > 0.0:
-                engine.open_velocity(spreads[s], jump_sd, unheard_s, options)
+            engine.predict(means[s], covs_or_sqrts[s], dt, motion, bias, options)
+            if velocity_step_sd > 0.0:
+                engine.open_velocity(covs_or_sqrts[s], velocity_step_sd, unheard_s, options)
 
 
 @leaf
@@ -112,29 +112,31 @@ def _square_root(options: FilterOptions) -> bool:
 
 
 @kernel
-def _factor_of(spread: Array, options: FilterOptions) -> Array:
+def _factor_of(cov_or_sqrt: Array, options: FilterOptions) -> Array:
     if _square_root(options):
-        return spread.copy()
-    L: Array = factor(spread)
+        return cov_or_sqrt.copy()
+    L: Array = factor(cov_or_sqrt)
     return L
 
 
 @kernel
-def weigh(
+def update(
     bank: Bank, rows: Array, options: FilterOptions, result: BankResult, work: Array
 ) -> None:
     """An epoch without an ambiguous phase: every filter takes the rows, weights follow; ``result``
     is filled."""
-    means, spreads, weights = bank
+    means, covs_or_sqrts, weights = bank
     accepted, nis, used = result
     for s in range(weights.size):
         if weights[s] == -math.inf:
             continue
-        L = _factor_of(spreads[s], options)
+        L = _factor_of(covs_or_sqrts[s], options)
         innovation, G, E = regress(means[s], L, rows, options.height_m)
         S = innovation_cov(G, E, rows[:, VARIANCE].copy())
         weights[s] += _evidence(rows, innovation, S, options.gate_nis, accepted[s])
-        nis[s], used[s] = engine.update(means[s], spreads[s], rows, options, accepted[s], work)
+        nis[s], used[s] = engine.update(
+            means[s], covs_or_sqrts[s], rows, options, accepted[s], work
+        )
     normalise(weights, 0.0)
 
 
@@ -163,21 +165,21 @@ def resolve(
     at: int,
     options: FilterOptions,
     floor: float,
-    heir_of: Ints,
+    parent_index: Ints,
     result: BankResult,
     work: Array,
 ) -> None:
     """An epoch whose row ``at`` is an ambiguous phase and ``at - 1`` the range of the same array.
 
-    heir_of (S,) : filled with the slot each filter comes from, -1 for one that was put where the
-    measurements say; result : filled
+    parent_index (S,) : filled with the slot each filter comes from, -1 for one that was put where
+        the measurements say; result : filled
     """
-    means, spreads, weights = bank
+    means, covs_or_sqrts, weights = bank
     accepted, nis, used = result
     rows[at, KIND] = _UNWRAPPED
     gains, wide = _gains(bank, rows, at, options)
-    old_means, old_spreads = means.copy(), spreads.copy()
-    _inherit(gains, weights, rows[at], floor, heir_of)
+    old_means, old_cov_or_sqrt = means.copy(), covs_or_sqrts.copy()
+    _inherit(gains, weights, rows[at], floor, parent_index)
     nis[:], used[:], accepted[:] = 0.0, 0.0, 0.0
     leader = int(np.argmax(weights))
     group = int(rows[at, GROUP])
@@ -187,18 +189,23 @@ def resolve(
         if weights[j] == -math.inf:
             continue
         _unwrap(rows, at, j - weights.size // 2, own)
-        parent = int(heir_of[j])
+        parent = int(parent_index[j])
         if parent >= 0:
-            means[j], spreads[j] = old_means[parent], old_spreads[parent]
+            means[j], covs_or_sqrts[j] = old_means[parent], old_cov_or_sqrt[parent]
             if wide[parent] > 0.0:
                 to_fix(own, at, options.height_m)
-            nis[j], used[j] = engine.update(means[j], spreads[j], own, options, accepted[j], work)
+            nis[j], used[j] = engine.update(
+                means[j], covs_or_sqrts[j], own, options, accepted[j], work
+            )
         lost = parent < 0 or accepted[j, group] == 0.0
         if j != leader and lost and accepted[leader, group] == 1.0:
-            means[j], spreads[j] = old_means[heir_of[leader]], old_spreads[heir_of[leader]]
+            means[j], covs_or_sqrts[j] = (
+                old_means[parent_index[leader]],
+                old_cov_or_sqrt[parent_index[leader]],
+            )
             _unwrap(rows, at, j - weights.size // 2, own)
-            heir_of[j] = -1
-            if not _start_over(means[j], spreads[j], own, at, options, accepted[j], work):
+            parent_index[j] = -1
+            if not _start_over(means[j], covs_or_sqrts[j], own, at, options, accepted[j], work):
                 weights[j] = -math.inf
         elif parent < 0:
             weights[j] = -math.inf
@@ -216,7 +223,7 @@ def _unwrap(rows: Array, at: int, turns: int, own: Array) -> None:
 @kernel
 def _start_over(
     mean: Array,
-    spread: Array,
+    cov_or_sqrt: Array,
     own: Array,
     at: int,
     options: FilterOptions,
@@ -225,9 +232,9 @@ def _start_over(
 ) -> bool:
     """Place a filter anew by range and phase and update it with the rest; False where they have no
     place."""
-    if not _put(mean, spread, own, at, options):
+    if not _put(mean, cov_or_sqrt, own, at, options):
         return False
-    _take_rest(mean, spread, own, int(own[at, GROUP]), options, accepted, work)
+    _take_rest(mean, cov_or_sqrt, own, int(own[at, GROUP]), options, accepted, work)
     return True
 
 
@@ -235,14 +242,14 @@ def _start_over(
 def _gains(bank: Bank, rows: Array, at: int, options: FilterOptions) -> tuple[Array, Array]:
     """Log weight of every number of turns (columns) as each filter (rows) has it, (S, S); and 1
     for a filter that knows the phase too badly for a tangent, (S,)."""
-    means, spreads, weights = bank
+    means, covs_or_sqrts, weights = bank
     count, gate = weights.size, options.gate_nis
     gains, wide = np.full((count, count), -math.inf), np.zeros(count)
     flags = np.zeros(int(rows[rows.shape[0] - 1, GROUP]) + 1)
     for i in range(count):
         if weights[i] == -math.inf:
             continue
-        L = _factor_of(spreads[i], options)
+        L = _factor_of(covs_or_sqrts[i], options)
         innovation, G, E = regress(means[i], L, rows, options.height_m)
         S = innovation_cov(G, E, rows[:, VARIANCE].copy())
         raw = innovation[at]
@@ -280,11 +287,11 @@ def _fix_evidence(
 
 
 @kernel
-def _inherit(gains: Array, weights: Array, phase: Array, floor: float, heir_of: Ints) -> None:
+def _inherit(gains: Array, weights: Array, phase: Array, floor: float, parent_index: Ints) -> None:
     """Weights (S,) of the sectors and the filter each inherits: the one that gives it most."""
     top = gains.max()
     for j in range(weights.size):
-        heir_of[j], weights[j] = -1, -math.inf
+        parent_index[j], weights[j] = -1, -math.inf
         if not admissible(phase, j - weights.size // 2):
             continue
         best = int(np.argmax(gains[:, j]))
@@ -293,29 +300,29 @@ def _inherit(gains: Array, weights: Array, phase: Array, floor: float, heir_of: 
             for i in range(weights.size):
                 total += math.exp(gains[i, j] - gains[best, j])
             weights[j] = gains[best, j] + math.log(total)
-            heir_of[j] = best
+            parent_index[j] = best
         else:
             weights[j] = top + math.log(floor)
 
 
 @kernel
-def _put(mean: Array, spread: Array, own: Array, at: int, options: FilterOptions) -> bool:
+def _put(mean: Array, cov_or_sqrt: Array, own: Array, at: int, options: FilterOptions) -> bool:
     """Place a filter anew where range and phase ``own[at - 1]``, ``own[at]`` say."""
-    cov = srukf.covariance(spread) if _square_root(options) else spread.copy()
+    cov = srukf.covariance(cov_or_sqrt) if _square_root(options) else cov_or_sqrt.copy()
     speed, height = options.initial_speed_sd, options.height_m
-    if spawn(mean, cov, own[at - 1], own[at], 0, speed, height) == -math.inf:
+    if init_hypothesis(mean, cov, own[at - 1], own[at], 0, speed, height) == -math.inf:
         return False
     if _square_root(options):
-        spread[:] = factor(cov)
+        cov_or_sqrt[:] = factor(cov)
     else:
-        spread[:] = cov
+        cov_or_sqrt[:] = cov
     return True
 
 
 @kernel
 def _take_rest(
     mean: Array,
-    spread: Array,
+    cov_or_sqrt: Array,
     own: Array,
     group: int,
     options: FilterOptions,
@@ -327,7 +334,7 @@ def _take_rest(
     accepted[:] = 1.0
     if index.size > 0:
         flags = np.zeros(accepted.size)
-        engine.update(mean, spread, own[index], options, flags, work)
+        engine.update(mean, cov_or_sqrt, own[index], options, flags, work)
         for g in range(accepted.size):
             accepted[g] = 1.0 if g == group else flags[g]
 
@@ -335,7 +342,7 @@ def _take_rest(
 @kernel
 def combine(bank: Bank, options: FilterOptions) -> tuple[Array, Array]:
     """Mean (n,) and covariance (n, n) of the whole bank."""
-    means, spreads, weights = bank
+    means, covs_or_sqrts, weights = bank
     n = means.shape[1]
     mean, cov = np.zeros(n), np.zeros((n, n))
     for s in range(weights.size):
@@ -343,7 +350,11 @@ def combine(bank: Bank, options: FilterOptions) -> tuple[Array, Array]:
             mean += math.exp(weights[s]) * means[s]
     for s in range(weights.size):
         if weights[s] > -math.inf:
-            P = srukf.covariance(spreads[s]) if _square_root(options) else spreads[s].copy()
+            P = (
+                srukf.covariance(covs_or_sqrts[s])
+                if _square_root(options)
+                else covs_or_sqrts[s].copy()
+            )
             w = math.exp(weights[s])
             for a in range(n):
                 for b in range(n):

@@ -15,8 +15,8 @@ from netpos.messages.values import Array, TrackMode
 from netpos.tracking import engine, sector_bank
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimates import OneModel
-from netpos.tracking.models import grown, initial_extra_sd, motions_of, options_of
-from netpos.tracking.phase_fix import TWO_PI, phase_scale, spawn
+from netpos.tracking.models import augmented, initial_extra_sd, motions_of, options_of
+from netpos.tracking.phase_fix import TWO_PI, init_hypothesis, phase_scale
 from netpos.tracking.protection import protection_level
 from netpos.tracking.sector_bank import Bank, BankResult
 
@@ -42,10 +42,10 @@ def sectors_of(phase: Array) -> int:
 
 
 def _copy_of(bank: Bank) -> Bank:
-    return Bank(bank.means.copy(), bank.spreads.copy(), bank.weights.copy())
+    return Bank(bank.means.copy(), bank.covs_or_sqrts.copy(), bank.weights.copy())
 
 
-class Sectors(OneModel):
+class PhaseAmbiguityBank(OneModel):
     """Bank of filters of ``sector_bank`` with the interface of ``estimates.Estimate``.
 
     Decided once a sector has the probability ``sector_probability``: then mean and covariance are
@@ -62,8 +62,8 @@ class Sectors(OneModel):
         self._motion: Array = motions_of(config)[0].copy()
         weights = np.full(slots, -math.inf)
         self._bank = Bank(np.zeros((slots, n)), np.zeros((slots, n, n)), weights)
-        self._heirs = np.full(slots, -1)
-        self._held = -1
+        self._parent_index = np.full(slots, -1)
+        self._locked = -1
         self._decided = False
         self._seen: tuple[Array, Array] | None = None
         self._prior = (np.zeros(n), np.zeros((n, n)))
@@ -71,22 +71,22 @@ class Sectors(OneModel):
     @classmethod
     def begin(
         cls, config: TrackerConfig, stamp_ns: int, rows: Array, at: int, start: tuple[Array, Array]
-    ) -> Sectors | None:
+    ) -> PhaseAmbiguityBank | None:
         """A bank with a filter in every sector of the phase ``rows[at]``, as probable as its area
         is large, the other states from ``start``; None where range and phase have no place.
 
         The rest of the rows is applied to it; their variances have to hold their biases.
         """
-        mean, cov = grown(*start, initial_extra_sd(config))
+        mean, cov = augmented(*start, initial_extra_sd(config))
         bank = cls(config, stamp_ns, sectors_of(rows[at]), mean.size)
         speed, height = config.initial_speed_sd_mps, config.device_height_m
         half = bank._bank.weights.size // 2
         for s in range(bank._bank.weights.size):
             own, P = mean.copy(), cov.copy()
-            weight = spawn(own, P, rows[at - 1], rows[at], s - half, speed, height)
+            weight = init_hypothesis(own, P, rows[at - 1], rows[at], s - half, speed, height)
             if weight > -math.inf:
                 bank._bank.means[s], bank._bank.weights[s] = own, weight
-                bank._bank.spreads[s] = engine.to_spread(P, bank._options)
+                bank._bank.covs_or_sqrts[s] = engine.to_cov_or_sqrt(P, bank._options)
         if not (bank._bank.weights > -math.inf).any():
             return None
         sector_bank.normalise(bank._bank.weights, 0.0)
@@ -94,19 +94,19 @@ class Sectors(OneModel):
         if len(rest):
             rest[:, GROUP] = np.unique(rest[:, GROUP], return_inverse=True)[1]
             rest[:, BIAS] = rest[:, COMMON] = -1  # no states yet
-            bank._weigh(rest)
+            bank._update(rest)
         bank._judge()
         return bank
 
     @classmethod
     def promote(
         cls, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array, rows: Array, at: int
-    ) -> Sectors:
+    ) -> PhaseAmbiguityBank:
         """A bank with the one estimate known so far."""
         bank = cls(config, stamp_ns, sectors_of(rows[at]), mean.size)
         middle = bank._bank.weights.size // 2
         bank._bank.means[middle], bank._bank.weights[middle] = mean, 0.0
-        bank._bank.spreads[middle] = engine.to_spread(cov, bank._options)
+        bank._bank.covs_or_sqrts[middle] = engine.to_cov_or_sqrt(cov, bank._options)
         bank._judge()
         return bank
 
@@ -162,15 +162,15 @@ class Sectors(OneModel):
         if self._seen is None:
             if self._decided:
                 s = self._best
-                cov = engine.to_cov(self._bank.spreads[s], self._options)
+                cov = engine.to_cov(self._bank.covs_or_sqrts[s], self._options)
                 self._seen = self._bank.means[s].copy(), cov.copy()
             else:
                 self._seen = sector_bank.combine(self._bank, self._options)
         return self._seen
 
     def radius(self, level_m: float) -> float:
-        """Radius [m] round ``mean`` that also holds the rivals, all but the integrity risk of
-        them.
+        """Radius [m] round ``mean`` that also holds the other sectors, all but the integrity risk
+        of them.
 
         level_m : protection level of the most probable sector alone
         """
@@ -182,31 +182,33 @@ class Sectors(OneModel):
             weight = math.exp(self._bank.weights[s])
             left -= weight
             if left < 0.0:
-                cov = engine.to_cov(self._bank.spreads[s], self._options)[POSITION, POSITION]
+                cov = engine.to_cov(self._bank.covs_or_sqrts[s], self._options)[POSITION, POSITION]
                 apart = math.hypot(*(self._bank.means[s, POSITION] - centre))
                 radius = max(radius, apart + protection_level(cov, risk))
         return radius
 
-    def grow(self, sd: Array) -> None:
+    def augment(self, sd: Array) -> None:
         n = N_CORE + sd.size
         if self._bank.means.shape[1] >= n:
             return
-        means, spreads = (
+        means, covs_or_sqrts = (
             np.zeros((self._bank.weights.size, n)),
             np.zeros((self._bank.weights.size, n, n)),
         )
         for s in np.flatnonzero(self._bank.weights > -math.inf).tolist():
-            cov = engine.to_cov(self._bank.spreads[s], self._options)
-            means[s], larger = grown(self._bank.means[s], cov, sd)
-            spreads[s] = engine.to_spread(larger, self._options)
-        self._bank, self._seen = Bank(means, spreads, self._bank.weights), None
+            cov = engine.to_cov(self._bank.covs_or_sqrts[s], self._options)
+            means[s], larger = augmented(self._bank.means[s], cov, sd)
+            covs_or_sqrts[s] = engine.to_cov_or_sqrt(larger, self._options)
+        self._bank, self._seen = Bank(means, covs_or_sqrts, self._bank.weights), None
 
-    def _advance(self, stamp_ns: int, jump_sd: float, unheard_s: float, bias: Array) -> None:
+    def _advance(
+        self, stamp_ns: int, velocity_step_sd: float, unheard_s: float, bias: Array
+    ) -> None:
         dt = (stamp_ns - self.stamp_ns) * 1e-9
         sector_bank.advance(
             self._bank,
             dt,
-            jump_sd,
+            velocity_step_sd,
             unheard_s,
             self._motion,
             bias,
@@ -230,41 +232,43 @@ class Sectors(OneModel):
         before = _copy_of(self._bank)
         if self._config.robust != "none" or self._config.nlos_probability > 0.0:
             best, work = self._best, ekf.workspace(before.means.shape[1], len(rows))
-            engine.condition(before.means[best], before.spreads[best], rows, self._options, work)
-        nis, used, accepted = self._look(rows, at)
+            engine.reweight(
+                before.means[best], before.covs_or_sqrts[best], rows, self._options, work
+            )
+        nis, used, accepted = self._apply(rows, at)
         manoeuvre = self._options.manoeuvre_speed_sd
         if manoeuvre > 0.0 and not accepted[self._best].all():
-            first, first_heirs = self._bank, self._heirs
-            self._bank, self._heirs = _copy_of(before), self._heirs.copy()
-            mean, spread = self._bank.means[self._best], self._bank.spreads[self._best]
-            within_s = engine.manoeuvre_s(mean, spread, rows, unheard_s, self._options)
+            first, first_parent_index = self._bank, self._parent_index
+            self._bank, self._parent_index = _copy_of(before), self._parent_index.copy()
+            mean, cov_or_sqrt = self._bank.means[self._best], self._bank.covs_or_sqrts[self._best]
+            within_s = engine.manoeuvre_s(mean, cov_or_sqrt, rows, unheard_s, self._options)
             for s in np.flatnonzero(self._bank.weights > -math.inf).tolist():
-                engine.allow_manoeuvre(self._bank.spreads[s], within_s, self._options)
-            second = self._look(rows, at)
+                engine.inflate_for_manoeuvre(self._bank.covs_or_sqrts[s], within_s, self._options)
+            second = self._apply(rows, at)
             if second[2][self._best].sum() > accepted[int(np.argmax(first.weights))].sum():
                 nis, used, accepted = second
             else:
-                self._bank, self._heirs = first, first_heirs
+                self._bank, self._parent_index = first, first_parent_index
         self._judge()
-        best, parent = self._best, int(self._heirs[self._best])
+        best, parent = self._best, int(self._parent_index[self._best])
         bank, origin = (before, parent) if parent >= 0 else (self._bank, best)
-        self._prior = bank.means[origin], engine.to_cov(bank.spreads[origin], self._options)
+        self._prior = bank.means[origin], engine.to_cov(bank.covs_or_sqrts[origin], self._options)
         return float(nis[best]), int(used[best]), accepted[best]
 
-    def _look(self, rows: Array, at: int) -> tuple[Array, Array, Array]:
+    def _apply(self, rows: Array, at: int) -> tuple[Array, Array, Array]:
         """Apply an epoch, whose phase is in row ``at``, to the predicted bank: NIS (S,), rows used
         (S,), groups accepted (S, groups). Where nothing explains it at all, it is rejected."""
         before = _copy_of(self._bank)
-        nis, used, accepted = self._weigh(rows) if at < 0 else self._resolve(rows, at)
+        nis, used, accepted = self._update(rows) if at < 0 else self._resolve(rows, at)
         alive = self._bank.weights > -math.inf
         sound = alive.any() and math.isfinite(
             self._bank.weights[alive].sum()
             + self._bank.means[alive].sum()
-            + self._bank.spreads[alive].sum()
+            + self._bank.covs_or_sqrts[alive].sum()
         )
         if not sound:
             self._bank = before
-            self._heirs[:] = np.arange(self._bank.weights.size)
+            self._parent_index[:] = np.arange(self._bank.weights.size)
             return np.zeros_like(nis), np.zeros_like(used), np.zeros_like(accepted)
         return nis, used, accepted
 
@@ -274,17 +278,19 @@ class Sectors(OneModel):
         work = ekf.workspace(self._bank.means.shape[1], len(rows))
         return BankResult(np.zeros((slots, groups)), np.zeros(slots), np.zeros(slots)), work
 
-    def _weigh(self, rows: Array) -> tuple[Array, Array, Array]:
+    def _update(self, rows: Array) -> tuple[Array, Array, Array]:
         result, work = self._filled(rows)
-        sector_bank.weigh(self._bank, rows, self._options, result, work)
-        self._heirs[:] = np.arange(self._bank.weights.size)
+        sector_bank.update(self._bank, rows, self._options, result, work)
+        self._parent_index[:] = np.arange(self._bank.weights.size)
         self._seen = None
         return result.nis, result.used, result.accepted
 
     def _resolve(self, rows: Array, at: int) -> tuple[Array, Array, Array]:
         result, work = self._filled(rows)
         slip = self._config.sector_slip_probability
-        sector_bank.resolve(self._bank, rows, at, self._options, slip, self._heirs, result, work)
+        sector_bank.resolve(
+            self._bank, rows, at, self._options, slip, self._parent_index, result, work
+        )
         self._seen = None
         return result.nis, result.used, result.accepted
 
@@ -293,33 +299,35 @@ class Sectors(OneModel):
         more = (slots - self._bank.weights.size) // 2
         if more > 0:
             pad = ((more, more), (0, 0))
-            means, spreads = (
+            means, covs_or_sqrts = (
                 np.pad(self._bank.means, pad),
-                np.pad(self._bank.spreads, (*pad, (0, 0))),
+                np.pad(self._bank.covs_or_sqrts, (*pad, (0, 0))),
             )
             weights = np.pad(self._bank.weights, more, constant_values=-math.inf)
-            self._bank = Bank(means, spreads, weights)
-            self._heirs = np.pad(self._heirs, more, constant_values=-1)
-            self._held += more if self._held >= 0 else 0
+            self._bank = Bank(means, covs_or_sqrts, weights)
+            self._parent_index = np.pad(self._parent_index, more, constant_values=-1)
+            self._locked += more if self._locked >= 0 else 0
 
     def _judge(self) -> None:
         """Decide, keep a decision, or take it back; follow the sector held."""
         best, probability = self._best, math.exp(self._bank.weights[self._best])
-        if self._held >= 0 and self._heirs[best] == self._held:
-            self._held = best
-        elif self._held >= 0:
-            heirs = np.flatnonzero(self._heirs == self._held)
-            self._held = int(heirs[np.argmax(self._bank.weights[heirs])]) if heirs.size else -2
+        if self._locked >= 0 and self._parent_index[best] == self._locked:
+            self._locked = best
+        elif self._locked >= 0:
+            children = np.flatnonzero(self._parent_index == self._locked)
+            self._locked = (
+                int(children[np.argmax(self._bank.weights[children])]) if children.size else -2
+            )
         if probability >= self._config.sector_probability:
-            if self._held not in (-1, best):
+            if self._locked not in (-1, best):
                 self.corrected += 1
-            self._held, self._decided = best, True
-        elif probability < _DOUBT or self._held != best:
+            self._locked, self._decided = best, True
+        elif probability < _DOUBT or self._locked != best:
             self._decided = False
         self._seen = None
 
-    def copy(self) -> Sectors:
+    def copy(self) -> PhaseAmbiguityBank:
         twin = copy.copy(self)
-        twin._bank, twin._heirs = _copy_of(self._bank), self._heirs.copy()
+        twin._bank, twin._parent_index = _copy_of(self._bank), self._parent_index.copy()
         twin._motion = self._motion.copy()
         return twin

@@ -80,7 +80,7 @@ class Sequencer:
 
     def __init__(
         self,
-        hold_ns: int,
+        max_delay_ns: int,
         needs_pose: bool = False,
         history_ns: int = 0,
         future_ns: int = 1 << 62,
@@ -89,18 +89,18 @@ class Sequencer:
     ) -> None:
         """``needs_pose``: nothing is complete before an initial pose, so that it is waited for.
 
-        ``history_ns``: how much older than the newest applied epoch an item may be.
-        ``future_ns``: a stamp this far ahead of all others counts once a second one confirms it.
-        ``live_ns``: a channel this far, or ``hold_ns``, behind the newest stamp is not waited for.
+        ``history_ns``: how much older than the newest applied epoch an item may be. ``future_ns``:
+        a stamp this far ahead of all others counts once a second one confirms it. ``live_ns``: a
+        channel this far, or ``max_delay_ns``, behind the newest stamp is not waited for.
         ``tick_ns``: once an RSU was heard, an epoch, without items if need be, at every multiple
         of it that the IMU reaches; 0: none.
         """
-        self._hold_ns = hold_ns
+        self._max_delay_ns = max_delay_ns
         self._needs_pose = needs_pose
         self._history_ns = history_ns
         self._future_ns = future_ns
         # Between measurements of one a second, and their way here, ticks wait for them.
-        self._live_ns = max(live_ns, hold_ns) + (hold_ns if tick_ns > 0 else 0)
+        self._live_ns = max(live_ns, max_delay_ns) + (max_delay_ns if tick_ns > 0 else 0)
         self._tick_ns = tick_ns
         self._pending: dict[int, Epoch] = {}
         self._applied: dict[int, Epoch] = {}
@@ -142,7 +142,7 @@ class Sequencer:
             epoch = self._pending[stamp] = Epoch(stamp)
         epoch.put(key, item)
         self.mark(key[0], stamp)
-        alone = len(self._pending) == 1 and stamp == self.newest_ns and self._hold_ns > 0
+        alone = len(self._pending) == 1 and stamp == self.newest_ns and self._max_delay_ns > 0
         self.idle = alone and not epoch.rsu_complete()
         return None
 
@@ -237,7 +237,7 @@ class Sequencer:
 
     def _ready(self, epoch: Epoch) -> bool:
         stamp, newest = epoch.stamp_ns, self.newest_ns
-        if newest >= stamp + self._hold_ns:
+        if newest >= stamp + self._max_delay_ns:
             return True
         if self._needs_pose and POSE not in self._watermark:
             return False

@@ -14,7 +14,7 @@ from netpos.messages.values import Array, Odometry
 from netpos.tracking import output
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimates import Estimate
-from netpos.tracking.models import grown, heading_index, initial_extra_sd
+from netpos.tracking.models import augmented, heading_index, initial_extra_sd
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ def _stacked(
     """Arguments of ``smooth.rts``; a bias not yet heard of has its stationary variance."""
     bias = posteriors[-1].bias
     sd = np.append(extra_sd, bias[0])
-    pairs = [grown(p.mean, p.cov, sd) for p in posteriors]
+    pairs = [augmented(p.mean, p.cov, sd) for p in posteriors]
     stamps = np.array([p.stamp_ns for p in posteriors])
     motions = np.array([p.motion for p in posteriors[1:]]).reshape(-1, posteriors[0].motion.size)
     means, covs = np.array([m for m, _ in pairs]), np.array([c for _, c in pairs])

@@ -72,7 +72,7 @@ def with_clock(config: TrackerConfig, nav: Array, cov: Array) -> tuple[Array, Ar
     return np.append(nav, [0.0, c * config.clock_drift_mean]), block_diag(cov, np.diag(sd**2))
 
 
-def grown_in_space(nav: Array, cov: Array, sd: Array) -> tuple[Array, Array]:
+def augmented_3d(nav: Array, cov: Array, sd: Array) -> tuple[Array, Array]:
     """State with a clock, nav (n + 1,), cov (n, n), and those of the biases of standard deviations
     ``sd`` (k,), in the order of the states, that it lacks."""
     new = sd[len(cov) - ERR_BIASES :]

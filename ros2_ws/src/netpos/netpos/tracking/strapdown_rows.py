@@ -11,7 +11,7 @@ from netpos.filters.measurement import GATE_VARIANCE
 from netpos.filters.rows import UNCOUPLED, rsu_rows
 from netpos.filters.space import SpaceKind, direction_rows, linearise_in_space, place_rows
 from netpos.messages.values import Array, Field, GroundSpeed, RsuMeasurement
-from netpos.tracking.batch import Batch
+from netpos.tracking.epoch_rows import EpochRows
 from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sequencer import Item
 
@@ -28,9 +28,9 @@ def usable(item: Item) -> bool:
     return isinstance(item, GroundSpeed)
 
 
-def batch_in_space(
+def epoch_rows_3d(
     items: Sequence[Source], rsus: Mapping[str, Rsu], biases: BiasStates | None
-) -> Batch:
+) -> EpochRows:
     """Rows of the items, one group each; biases heard for the first time are added to ``biases``
     (None: rows without)."""
     blocks = []
@@ -47,10 +47,10 @@ def batch_in_space(
             blocks.append(rsu_rows(scalars, rsu.info, rsu.axes, group, coupling))
         if item.fields & Field.POSITION:
             blocks.append(place_rows(item.position, item.position_cov, item.lever_arm, group))
-    return Batch(np.vstack(blocks), tuple(items))
+    return EpochRows(np.vstack(blocks), tuple(items))
 
 
-def fits_in_space(rows: Array, nav: Array, cov: Array) -> Array:
+def innovations_with_sd_3d(rows: Array, nav: Array, cov: Array) -> Array:
     """Innovation of each row (m, ROW_WIDTH) at nav (n + 1,) and its standard deviation under cov
     (n, n): (m, 2)."""
     innovation, H, bend = linearise_in_space(rows, nav, cov)

@@ -22,9 +22,9 @@ from netpos.filters.error_state import (
     Chunk,
     Imu,
     Sensors,
+    apply_constraints,
     correct,
     doubt_standstill,
-    hold,
     predict_chunk,
 )
 from netpos.filters.factor import factor, solve_factored
@@ -33,7 +33,7 @@ from netpos.filters.state import ERR_BIASES
 from netpos.inertial.strapdown import ACCEL_BIAS, ATTITUDE_ERR, QUATERNION, inject
 from netpos.messages.values import Array
 from netpos.tracking.engine import Epochs
-from netpos.tracking.strapdown_models import grown_in_space
+from netpos.tracking.strapdown_models import augmented_3d
 
 
 @dataclass(slots=True)
@@ -84,7 +84,7 @@ class Recorder:
             now, blind_s = predict_chunk(nav, cov, memory, now, to_ns, imu, sensors, chunk)
             predicted = (nav.copy(), cov.copy(), chunk.transition)
             if blind_s == 0.0:
-                hold(nav, cov, memory, sensors, chunk.mean)
+                apply_constraints(nav, cov, memory, sensors, chunk.mean)
             self._passages[-1].append(Instant(now, nav.copy(), cov.copy(), predicted))
 
     def note(self, nav: Array, cov: Array, rate: Array | None, bias_sd: Array) -> None:
@@ -125,7 +125,7 @@ def _step_back(instant: Instant, later: Instant, nav_s: Array, cov_s: Array, sd:
     """Smooth ``instant`` in place by the smoothed nav_s, cov_s of the ``later`` one."""
     assert later.predicted is not None
     nav_p, cov_p, Phi = later.predicted
-    instant.nav, instant.cov = grown_in_space(
+    instant.nav, instant.cov = augmented_3d(
         instant.nav, instant.cov, sd[: len(cov_p) - ERR_BIASES]
     )
     gain_t = Phi @ instant.cov

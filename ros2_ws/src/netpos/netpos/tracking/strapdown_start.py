@@ -158,7 +158,7 @@ def sound_fix(rows: Array, height_m: float) -> tuple[Array, Array] | None:
     fix = fix_position(rows, start_of(rows, height_m))
     if fix.status != FixStatus.CONVERGED:
         return None
-    cost, limit, dof = _misfit(rows, fix.position)
+    cost, limit, dof = _residual_cost(rows, fix.position)
     if cost <= limit:
         return fix.position, fix.cov
     best, least = None, math.inf
@@ -167,13 +167,13 @@ def sound_fix(rows: Array, height_m: float) -> tuple[Array, Array] | None:
         other = fix_position(others, start_of(others, height_m))
         if other.status != FixStatus.CONVERGED:
             continue
-        cost_without, limit_without, dof_without = _misfit(others, other.position)
+        cost_without, limit_without, dof_without = _residual_cost(others, other.position)
         if dof_without > 0 and cost_without <= limit_without and cost_without < least:
             best, least = (other.position, other.cov), cost_without
     return best or (fix.position, fix.cov * cost / dof)
 
 
-def _misfit(rows: Array, position: Array) -> tuple[float, float, int]:
+def _residual_cost(rows: Array, position: Array) -> tuple[float, float, int]:
     """Sum of squared residuals over their variances, what a true fix stays below but for one in a
     thousand, and the degrees of freedom."""
     nav, at = np.zeros(NAV), rows.copy()

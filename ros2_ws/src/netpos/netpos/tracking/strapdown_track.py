@@ -19,27 +19,27 @@ from netpos.filters.conditioning import Robust
 from netpos.filters.error_state import MEMORY, Imu, Sensors, advance, correct, doubt_standstill
 from netpos.filters.measurement import GROUP, KIND, VARIANCE, Kind
 from netpos.filters.space import SpaceKind, place_rows
-from netpos.filters.space_conditioning import condition_in_space
+from netpos.filters.space_conditioning import reweight_3d
 from netpos.filters.state import ERR_BIASES, ERR_CLOCK_DRIFT, NAV_CLOCK_DRIFT, POSITION
 from netpos.inertial.strapdown import ERR, NAV
 from netpos.messages.values import Array, InitialPose, Odometry, RsuMeasurement
 from netpos.tracking import output
-from netpos.tracking.batch import Batch, mostly_accepted
-from netpos.tracking.blockage import Blockage
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.fit import observe_isolated, with_refused, without_isolated
+from netpos.tracking.epoch_rows import EpochRows, mostly_accepted
+from netpos.tracking.fit import observe_excluded, with_refused, without_excluded
 from netpos.tracking.health import RsuHealth
 from netpos.tracking.history import History, merge
 from netpos.tracking.models import gate_thresholds, robust_options_of
+from netpos.tracking.nlos_rate import NlosRate
 from netpos.tracking.observations import FittedEpoch
 from netpos.tracking.protection import NisWindow, protection_level
-from netpos.tracking.report import Applied, EstimateStatus, TrackOutput, total, track_status
+from netpos.tracking.report import EpochResult, EstimateStatus, TrackOutput, total, track_status
 from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sequencer import Epoch, Item
 from netpos.tracking.strapdown_engine import compile_kernels
-from netpos.tracking.strapdown_models import grown_in_space, sensors_of, with_clock
+from netpos.tracking.strapdown_models import augmented_3d, sensors_of, with_clock
 from netpos.tracking.strapdown_output import odometry_of
-from netpos.tracking.strapdown_rows import Source, batch_in_space, fits_in_space, usable
+from netpos.tracking.strapdown_rows import Source, epoch_rows_3d, innovations_with_sd_3d, usable
 from netpos.tracking.strapdown_smoothing import Recorder
 from netpos.tracking.strapdown_start import SampleBuffer, StrapdownStart
 
@@ -63,7 +63,7 @@ class _State:
     """All of a track that changes with an epoch."""
 
     start: StrapdownStart
-    blockage: Blockage
+    nlos_rate: NlosRate
     biases: BiasStates = field(default_factory=lambda: BiasStates(ERR_BIASES))
     estimate: _Estimate | None = None
     posed: bool = False
@@ -81,7 +81,7 @@ class _State:
         else:
             twin.estimate = self.estimate.copy()
         twin.biases = self.biases.copy()
-        twin.blockage = self.blockage.copy()
+        twin.nlos_rate = self.nlos_rate.copy()
         twin.nis_window = self.nis_window.copy()
         twin.rejected = self.rejected.copy()
         return twin
@@ -92,9 +92,9 @@ def warm_up(config: TrackerConfig) -> None:
     compile_kernels(sensors_of(config))
     nav, cov = with_clock(config, np.zeros(NAV), np.eye(ERR))
     rows = place_rows(np.zeros(3), np.eye(3), (0.0, 0.0, 0.0))
-    fits_in_space(rows, nav, cov)
+    innovations_with_sd_3d(rows, nav, cov)
     if config.robust != "none" or config.nlos_probability > 0.0:
-        condition_in_space(nav, cov, rows, robust_options_of(config))
+        reweight_3d(nav, cov, rows, robust_options_of(config))
 
 
 def track_of(
@@ -138,7 +138,7 @@ class StrapdownTrack:
         self._state = self._fresh()
 
     def _fresh(self) -> _State:
-        return _State(StrapdownStart(self._config), Blockage.of(self._config))
+        return _State(StrapdownStart(self._config), NlosRate.of(self._config))
 
     @property
     def rejected(self) -> Counter[str]:
@@ -184,7 +184,7 @@ class StrapdownTrack:
         if estimate is not None:
             estimate = estimate.copy()
             self._advance(estimate, stamp_ns, None)
-        return self._report(estimate, Applied(stamp_ns))
+        return self._report(estimate, EpochResult(stamp_ns))
 
     def revise(self, late: list[tuple[int, Item]]) -> tuple[list[Epoch], TrackOutput]:
         """Go back to the oldest of the late items and apply all epochs since then once more; the
@@ -201,49 +201,64 @@ class StrapdownTrack:
 
     # measurements
 
-    def _apply(self, stamp_ns: int, items: list[Source]) -> Applied:
+    def _apply(self, stamp_ns: int, items: list[Source]) -> EpochResult:
         watched: list[RsuMeasurement] = []
         if self._config.isolate_rsus:
-            items, watched = without_isolated(self._health, stamp_ns, items)
+            items, watched = without_excluded(self._health, stamp_ns, items)
             self._state.rejected.update(["isolated_rsu"] * len(watched))
-        batch = batch_in_space(items, self._rsus, self._state.biases) if items else None
+        epoch_rows = epoch_rows_3d(items, self._rsus, self._state.biases) if items else None
         estimate = self._state.estimate
         if estimate is None:
-            return Applied(stamp_ns, sources=self._try_start(stamp_ns, batch) if batch else ())
+            return EpochResult(
+                stamp_ns, sources=self._try_start(stamp_ns, epoch_rows) if epoch_rows else ()
+            )
         self._grow(estimate)
         self._advance(estimate, stamp_ns, self.recorder)
         for item in watched:
-            alone = batch_in_space([item], self._rsus, None)
-            fits, rsu = fits_in_space(alone.rows, estimate.nav, estimate.cov), item.rsu_id
-            observe_isolated(
-                self._health, self._vue_id, stamp_ns, alone, fits, self._rsus[rsu], self._gate
+            alone = epoch_rows_3d([item], self._rsus, None)
+            innovations, rsu = (
+                innovations_with_sd_3d(alone.rows, estimate.nav, estimate.cov),
+                item.rsu_id,
             )
-        return self._update(stamp_ns, estimate, batch) if batch else Applied(stamp_ns)
+            observe_excluded(
+                self._health,
+                self._vue_id,
+                stamp_ns,
+                alone,
+                innovations,
+                self._rsus[rsu],
+                self._gate,
+            )
+        return (
+            self._update(stamp_ns, estimate, epoch_rows) if epoch_rows else EpochResult(stamp_ns)
+        )
 
-    def _update(self, stamp_ns: int, estimate: _Estimate, batch: Batch) -> Applied:
+    def _update(self, stamp_ns: int, estimate: _Estimate, epoch_rows: EpochRows) -> EpochResult:
         state, nav, cov = self._state, estimate.nav, estimate.cov
-        state.blockage.expect(batch)
-        self._condition(batch, nav, cov)
-        state.blockage.learn(batch)
-        fits = fits_in_space(batch.rows, nav, cov)
-        accepted = np.zeros(len(batch.items))
-        nis, dof = correct(nav, cov, batch.rows, self._gate, accepted)
+        state.nlos_rate.expect(epoch_rows)
+        self._reweight(epoch_rows, nav, cov)
+        state.nlos_rate.learn(epoch_rows)
+        innovations = innovations_with_sd_3d(epoch_rows.rows, nav, cov)
+        accepted = np.zeros(len(epoch_rows.items))
+        nis, dof = correct(nav, cov, epoch_rows.rows, self._gate, accepted)
         taken = accepted.tolist()
         refused = taken.count(0.0)
         if refused:
             state.rejected["gate"] += refused
-        state.nis_window.add(*with_refused(batch, taken, self._gate, nis, dof))
+        state.nis_window.add(*with_refused(epoch_rows, taken, self._gate, nis, dof))
         if self._config.isolate_rsus:
-            epoch = FittedEpoch(stamp_ns, self._vue_id, batch.items, batch.rows, fits, taken)
+            epoch = FittedEpoch(
+                stamp_ns, self._vue_id, epoch_rows.items, epoch_rows.rows, innovations, taken
+            )
             self._health.hear(epoch)
         sources: tuple[str, ...] = ()
         if dof > 0:
-            sources = self._note_accepted(stamp_ns, batch, accepted)
-            state.has_clock = state.has_clock or batch.has_time
+            sources = self._note_accepted(stamp_ns, epoch_rows, accepted)
+            state.has_clock = state.has_clock or epoch_rows.has_time
         else:
             doubt_standstill(estimate.memory)
-        applied = Applied(stamp_ns, nis, dof, sources)
-        if mostly_accepted(batch, taken):
+        applied = EpochResult(stamp_ns, nis, dof, sources)
+        if mostly_accepted(epoch_rows, taken):
             state.rejected_in_row = 0
             return applied
         state.rejected_in_row += 1
@@ -252,14 +267,16 @@ class StrapdownTrack:
             self._forget()
         return applied
 
-    def _condition(self, batch: Batch, nav: Array, cov: Array) -> None:
+    def _reweight(self, epoch_rows: EpochRows, nav: Array, cov: Array) -> None:
         """Re-weight the rows of an epoch as the robust options say."""
         if self._robust.kind != Robust.NONE or self._robust.nlos_probability > 0.0:
-            condition_in_space(nav, cov, batch.rows, self._robust)
+            reweight_3d(nav, cov, epoch_rows.rows, self._robust)
 
-    def _note_accepted(self, stamp_ns: int, batch: Batch, accepted: Array) -> tuple[str, ...]:
+    def _note_accepted(
+        self, stamp_ns: int, epoch_rows: EpochRows, accepted: Array
+    ) -> tuple[str, ...]:
         state, sources = self._state, []
-        for item, taken in zip(batch.items, accepted, strict=True):
+        for item, taken in zip(epoch_rows.items, accepted, strict=True):
             if not taken:
                 continue
             if isinstance(item, RsuMeasurement):
@@ -277,16 +294,16 @@ class StrapdownTrack:
         cov = pose.cov + np.diag([0.0, 0.0, _POSE_VAR_MIN if pose.cov[2, 2] == 0.0 else 0.0])
         self._state.start.add_fix(stamp_ns, pose.position.copy(), cov, np.zeros(3))
 
-    def _try_start(self, stamp_ns: int, batch: Batch) -> tuple[str, ...]:
+    def _try_start(self, stamp_ns: int, epoch_rows: EpochRows) -> tuple[str, ...]:
         state = self._state
         if self._config.require_initial_pose and not state.posed and not state.accepted:
-            state.rejected["no_initial_pose"] += len(batch.items)
+            state.rejected["no_initial_pose"] += len(epoch_rows.items)
             return ()
-        rsus = [item for item in batch.items if isinstance(item, RsuMeasurement)]
+        rsus = [item for item in epoch_rows.items if isinstance(item, RsuMeasurement)]
         if not rsus:
             return ()
-        rows = batch.rows[batch.rows[:, KIND] != SpaceKind.BODY_VELOCITY]
-        rows[:, VARIANCE] += replace(batch, rows=rows).slow_variance(state.biases)
+        rows = epoch_rows.rows[epoch_rows.rows[:, KIND] != SpaceKind.BODY_VELOCITY]
+        rows[:, VARIANCE] += replace(epoch_rows, rows=rows).slow_variance(state.biases)
         state.start.add_rows(stamp_ns, rows, np.array(rsus[0].lever_arm))
         found = state.start.solve(self.imu)
         if found is None or found[0] != stamp_ns:
@@ -297,7 +314,7 @@ class StrapdownTrack:
         self._set_clock(state.estimate, rows)
         if self.recorder is not None:
             self.recorder.begin(stamp_ns, state.estimate.nav, state.estimate.cov)
-        return self._note_accepted(stamp_ns, batch, np.ones(len(batch.items)))
+        return self._note_accepted(stamp_ns, epoch_rows, np.ones(len(epoch_rows.items)))
 
     def _set_clock(self, estimate: _Estimate, rows: Array) -> None:
         """Read the clock's offset off one time of arrival: the place is in the start already."""
@@ -311,7 +328,7 @@ class StrapdownTrack:
 
     def _grow(self, estimate: _Estimate) -> None:
         sd = np.array(self._state.biases.sd)
-        estimate.nav, estimate.cov = grown_in_space(estimate.nav, estimate.cov, sd)
+        estimate.nav, estimate.cov = augmented_3d(estimate.nav, estimate.cov, sd)
 
     def _advance(self, estimate: _Estimate, stamp_ns: int, recorder: Recorder | None) -> None:
         """Move ``estimate`` to ``stamp_ns``; it has states for all biases heard of."""
@@ -319,8 +336,8 @@ class StrapdownTrack:
             return
         imu = Imu(*self.imu.between(estimate.stamp_ns, stamp_ns))
         move = advance if recorder is None else recorder.advance
-        span = (estimate.stamp_ns, stamp_ns)
-        move(estimate.nav, estimate.cov, estimate.memory, *span, imu, self._sensors_now())
+        nav, cov, memory = estimate.nav, estimate.cov, estimate.memory
+        move(nav, cov, memory, estimate.stamp_ns, stamp_ns, imu, self._sensors_now())
         estimate.stamp_ns = stamp_ns
 
     def _sensors_now(self) -> Sensors:
@@ -349,7 +366,7 @@ class StrapdownTrack:
             for i in self.recorder.smoothed()
         ]
 
-    def _report(self, estimate: _Estimate | None, epoch: Applied) -> TrackOutput:
+    def _report(self, estimate: _Estimate | None, epoch: EpochResult) -> TrackOutput:
         state, stamp_ns = self._state, epoch.stamp_ns
         position_sd, level, heard_ns = 0.0, -1.0, None
         odometry, clock = None, None

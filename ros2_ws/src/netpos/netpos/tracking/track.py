@@ -13,34 +13,40 @@ from netpos.filters.measurement import VARIANCE
 from netpos.filters.state import N_CORE
 from netpos.messages.values import Array, InitialPose, Odometry, RsuMeasurement, Velocity
 from netpos.tracking import estimates, output
-from netpos.tracking.batch import Batch, Source, batch_of, mostly_accepted, velocity_inflation
-from netpos.tracking.blockage import Blockage
+from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.epoch_rows import (
+    EpochRows,
+    Source,
+    epoch_rows_of,
+    mostly_accepted,
+    velocity_inflation,
+)
 from netpos.tracking.estimates import Estimate
 from netpos.tracking.fit import (
-    fits_and_level,
-    observe_isolated,
-    row_fits,
+    innovations_and_level,
+    innovations_with_sd,
+    observe_excluded,
     with_refused,
-    without_isolated,
+    without_excluded,
 )
 from netpos.tracking.health import RsuHealth
 from netpos.tracking.history import History, merge
 from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser, with_heading
-from netpos.tracking.memory import TrackMemory
+from netpos.tracking.manoeuvre_hypotheses import ManoeuvreHypotheses
 from netpos.tracking.mixture import MixtureEstimate, with_components
 from netpos.tracking.models import heading_index, initial_extra_sd, options_of, pose_state
 from netpos.tracking.networks.secondary import Secondary
+from netpos.tracking.nlos_rate import NlosRate
 from netpos.tracking.observations import FittedEpoch
 from netpos.tracking.phase_start import PhaseStart, corrections, with_sectors
 from netpos.tracking.protection import FusedEpoch
-from netpos.tracking.report import Applied, EstimateStatus, TrackOutput, total, track_status
-from netpos.tracking.rivals import Rivals
+from netpos.tracking.report import EpochResult, EstimateStatus, TrackOutput, total, track_status
 from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sequencer import Epoch, Item
 from netpos.tracking.smoothing import FixedLag, Posterior, Smoother
-from netpos.tracking.steadiness import Steadiness
+from netpos.tracking.snapshot import TrackSnapshot
 
 _IMU_HOLE_S = 0.05
 _LEVEL_MAX_M = 1e6
@@ -67,7 +73,7 @@ class Track:
         self._heading = heading_index(config)
         self._use_imu, self._calibrates_steps = config.use_imu, config.calibrates_steps
         self._secondary = Secondary(vue_id, config) if config.network else None
-        self._history: History[TrackMemory] = History(int(config.history_s * 1e9))
+        self._history: History[TrackSnapshot] = History(int(config.history_s * 1e9))
         self._fixed_lag = FixedLag(vue_id, config) if config.fixed_lag_s > 0.0 else None
         self.posteriors: list[Posterior] | None = None
         """Where every epoch's posterior is kept, for a smoother; None: nowhere."""
@@ -76,14 +82,14 @@ class Track:
         """Measurements refused at the door, by reason."""
         self._state = self._fresh()
 
-    def _fresh(self) -> TrackMemory:
-        return TrackMemory(
+    def _fresh(self) -> TrackSnapshot:
+        return TrackSnapshot(
             BiasStates(N_CORE + self._extra_sd.size, self._config.step_errors),
             Initialiser(self._config),
-            Blockage.of(self._config),
+            NlosRate.of(self._config),
             PhaseStart(self._config),
-            Steadiness(self._config),
-            Rivals(self._config),
+            AdaptiveProcessNoise(self._config),
+            ManoeuvreHypotheses(self._config),
         )
 
     @property
@@ -113,7 +119,7 @@ class Track:
                 self._start_from_pose(epoch.stamp_ns, item)
             else:
                 items.append(item)
-        applied = Applied(epoch.stamp_ns)
+        applied = EpochResult(epoch.stamp_ns)
         if items:
             estimate = self._state.estimate
             if estimate is not None:
@@ -161,32 +167,32 @@ class Track:
         new = [epoch for epoch in made if epoch is not None]
         return new, replace(result, revised=True, smoothed=tuple(smoothed))
 
-    def _apply(self, stamp_ns: int, items: list[Source]) -> Applied:
-        batch = self._batch(items)
+    def _apply(self, stamp_ns: int, items: list[Source]) -> EpochResult:
+        epoch_rows = self._epoch_rows(items)
         if self._state.estimate is None:
-            return Applied(stamp_ns, sources=self._try_first_fix(stamp_ns, batch))
-        return self._update(stamp_ns, batch)
+            return EpochResult(stamp_ns, sources=self._try_first_fix(stamp_ns, epoch_rows))
+        return self._update(stamp_ns, epoch_rows)
 
     def _sorted_out(
         self, stamp_ns: int, items: list[Source]
     ) -> tuple[list[Source], list[RsuMeasurement]]:
-        """What may be fused, and what comes from an isolated RSU and is only looked at."""
+        """What may be fused, and what comes from an excluded RSU and is only looked at."""
         if not self._config.isolate_rsus:
             return items, []
-        used, watched = without_isolated(self._health, stamp_ns, items)
+        used, watched = without_excluded(self._health, stamp_ns, items)
         if watched:
             self._state.rejected["isolated_rsu"] += len(watched)
         return used, watched
 
-    def _batch(self, items: list[Source]) -> Batch:
+    def _epoch_rows(self, items: list[Source]) -> EpochRows:
         biases = self._state.biases
         inflation = velocity_inflation(
             items, self._state.velocity_ns, self._config.velocity_correlation_s
         )
-        batch = batch_of(items, self._rsus, biases, self._heading, inflation)
+        epoch_rows = epoch_rows_of(items, self._rsus, biases, self._heading, inflation)
         if len(biases.sd) > self._state.bias.shape[1]:
             self._state.bias = biases.arrays()
-        return batch
+        return epoch_rows
 
     def _start_from_pose(self, stamp_ns: int, pose: InitialPose) -> None:
         self._forget()
@@ -197,63 +203,67 @@ class Track:
         self._state.estimate = estimates.start(self._config, stamp_ns, mean, cov)
         self._state.last_accepted_ns = stamp_ns
 
-    def _try_first_fix(self, stamp_ns: int, batch: Batch) -> tuple[str, ...]:
+    def _try_first_fix(self, stamp_ns: int, epoch_rows: EpochRows) -> tuple[str, ...]:
         state = self._state
         if self._config.require_initial_pose and not state.accepted and state.pose is None:
-            state.rejected["no_initial_pose"] += len(batch.items)
+            state.rejected["no_initial_pose"] += len(epoch_rows.items)
             return ()
-        heard = tuple(self._rsus[i.rsu_id] for i in batch.items if isinstance(i, RsuMeasurement))
-        bias_var = batch.slow_variance(state.biases)
-        if state.phase_start.heard(batch):
-            state.estimate = state.phase_start.add(stamp_ns, batch.rows, bias_var)
-            return self._note_accepted(stamp_ns, batch) if state.estimate is not None else ()
+        heard = tuple(
+            self._rsus[i.rsu_id] for i in epoch_rows.items if isinstance(i, RsuMeasurement)
+        )
+        bias_var = epoch_rows.slow_variance(state.biases)
+        if state.phase_start.heard(epoch_rows):
+            state.estimate = state.phase_start.add(stamp_ns, epoch_rows.rows, bias_var)
+            return self._note_accepted(stamp_ns, epoch_rows) if state.estimate is not None else ()
         solution = state.pose
         if solution is None:
-            state.initialiser.add(stamp_ns, batch.rows, bias_var, heard)
+            state.initialiser.add(stamp_ns, epoch_rows.rows, bias_var, heard)
             solution = state.initialiser.solve()
         if solution is None:
             return ()
         if self._heading >= 0:
-            rows = batch.rows.copy()
+            rows = epoch_rows.rows.copy()
             rows[:, VARIANCE] += bias_var
             solution = with_heading(*solution, rows, self._config.device_height_m)
             if solution is None:
-                state.rejected["heading_open"] += len(batch.items)
+                state.rejected["heading_open"] += len(epoch_rows.items)
                 return ()
         state.estimate = estimates.start(self._config, stamp_ns, *solution)
-        state.has_clock = batch.has_time
-        return self._note_accepted(stamp_ns, batch)
+        state.has_clock = epoch_rows.has_time
+        return self._note_accepted(stamp_ns, epoch_rows)
 
-    def _update(self, stamp_ns: int, batch: Batch) -> Applied:
+    def _update(self, stamp_ns: int, epoch_rows: EpochRows) -> EpochResult:
         state = self._state
-        state.estimate = with_sectors(self._config, state.estimate, batch.rows)
-        estimate = self._split(stamp_ns, self._prepare(stamp_ns, batch.items), batch.rows)
+        state.estimate = with_sectors(self._config, state.estimate, epoch_rows.rows)
+        estimate = self._split(
+            stamp_ns, self._prepare(stamp_ns, epoch_rows.items), epoch_rows.rows
+        )
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
         blocked = self._config.nlos_probability > 0.0
         if blocked:
-            state.blockage.expect(batch)
+            state.nlos_rate.expect(epoch_rows)
         nis, dof, flags = estimate.step(
-            stamp_ns, unheard_s, state.rejected_in_row, batch.rows, state.bias
+            stamp_ns, unheard_s, state.rejected_in_row, epoch_rows.rows, state.bias
         )
         accepted = flags.tolist()
         if blocked:
-            state.blockage.learn(batch)
+            state.nlos_rate.learn(epoch_rows)
         if self._secondary is not None:
             state.own = self._secondary.after(
-                state.own, stamp_ns, estimate, batch.rows, state.bias
+                state.own, stamp_ns, estimate, epoch_rows.rows, state.bias
             )
         state.segment += corrections(estimate, state.rejected)
-        state.has_clock = state.has_clock or (dof > 0 and batch.has_time)
-        if not self._note_fit(stamp_ns, batch, flags, accepted, nis, dof):
+        state.has_clock = state.has_clock or (dof > 0 and epoch_rows.has_time)
+        if not self._note_fit(stamp_ns, epoch_rows, flags, accepted, nis, dof):
             state.rejected["diverged"] += 1
             self._forget()
-            return Applied(stamp_ns)
+            return EpochResult(stamp_ns)
         refused = accepted.count(0.0)
         if refused:
             state.rejected["gate"] += refused
-        sources = self._note_accepted(stamp_ns, batch, accepted) if dof > 0 else ()
-        self._note_misfit(not refused or mostly_accepted(batch, accepted))
-        return Applied(stamp_ns, nis, dof, sources)
+        sources = self._note_accepted(stamp_ns, epoch_rows, accepted) if dof > 0 else ()
+        self._count_rejected(not refused or mostly_accepted(epoch_rows, accepted))
+        return EpochResult(stamp_ns, nis, dof, sources)
 
     def _split(self, stamp_ns: int, estimate: Estimate, rows: Array) -> Estimate:
         """The estimate as a mixture where it is too wide for ``rows``; a smoother does not reach
@@ -262,13 +272,13 @@ class Track:
         state.estimate = with_components(self._config, estimate, stamp_ns, rows, state.bias)
         if state.estimate is not estimate:
             state.segment += 1
-            state.rivals = Rivals(self._config)
+            state.hypotheses = ManoeuvreHypotheses(self._config)
         return state.estimate
 
-    def _note_misfit(self, fits: bool) -> None:
+    def _count_rejected(self, accepted: bool) -> None:
         """Count the epochs in a row that did not fit; too many, and the track is lost."""
         state = self._state
-        state.rejected_in_row = 0 if fits else state.rejected_in_row + 1
+        state.rejected_in_row = 0 if accepted else state.rejected_in_row + 1
         if state.rejected_in_row >= self._config.max_rejected_epochs:
             state.rejected["track_lost"] += 1
             self._forget()
@@ -279,22 +289,24 @@ class Track:
         estimate = self._state.estimate
         assert estimate is not None
         if estimate.mean.size < self._state.biases.first + len(self._state.biases.sd):
-            estimate.grow(np.append(self._extra_sd, self._state.bias[0]))
+            estimate.augment(np.append(self._extra_sd, self._state.bias[0]))
         if self._use_imu:
             yaw, speed, uncovered_s = self.imu.increments(estimate.stamp_ns, stamp_ns)
             blind = uncovered_s > _IMU_HOLE_S
-            estimate.drive(yaw, speed, _BLIND_GYRO if blind else self._config.gyro_noise_density)
+            estimate.set_imu_increment(
+                yaw, speed, _BLIND_GYRO if blind else self._config.gyro_noise_density
+            )
         if self._config.steady_accel_density_mps2_sqrthz > 0.0:
             velocities = (item for item in items if isinstance(item, Velocity))
-            density = self._state.steadiness.density(stamp_ns, velocities)
+            density = self._state.process_noise.density(stamp_ns, velocities)
             if density is not None:
-                estimate.shake(density)
+                estimate.set_process_noise(density)
         return estimate
 
     def _note_fit(
         self,
         stamp_ns: int,
-        batch: Batch,
+        epoch_rows: EpochRows,
         flags: Array,
         accepted: Sequence[float],
         nis: float,
@@ -302,49 +314,57 @@ class Track:
     ) -> bool:
         """Tell the protection level and the health of the RSUs how the epoch fitted, unless the
         estimate is not sound; ``flags`` (groups,) and ``accepted`` are the same."""
-        state, fits = self._state, np.empty((len(batch.rows), 2))
+        state, innovations = self._state, np.empty((len(epoch_rows.rows), 2))
         assert state.estimate is not None
         estimate, (prior_mean, prior_cov) = state.estimate, state.estimate.prior
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
         fused = FusedEpoch(
-            prior_mean, prior_cov, batch.rows, flags, unheard_s, estimate.mean, nis, dof
+            prior_mean, prior_cov, epoch_rows.rows, flags, unheard_s, estimate.mean, nis, dof
         )
-        unnoticed_m: float = fits_and_level(fused, estimate.cov, self._options, fits)
-        if math.isnan(unnoticed_m):
+        undetected_m: float = innovations_and_level(
+            fused, estimate.cov, self._options, innovations
+        )
+        if math.isnan(undetected_m):
             return False
-        state.unnoticed_m = unnoticed_m
+        state.undetected_m = undetected_m
         alone = len(accepted) == 1 and not isinstance(estimate, MixtureEstimate)
-        if state.rivals.present or alone:
-            state.unnoticed_m = state.rivals.level(
-                unnoticed_m, stamp_ns, estimate, fused, state.bias
+        if state.hypotheses.present or alone:
+            state.undetected_m = state.hypotheses.level(
+                undetected_m, stamp_ns, estimate, fused, state.bias
             )
-        nis, dof = with_refused(batch, accepted, self._gate, nis, dof)
+        nis, dof = with_refused(epoch_rows, accepted, self._gate, nis, dof)
         if math.isfinite(nis):
             state.nis_window.add(nis, dof)
         if self._config.isolate_rsus:
-            epoch = FittedEpoch(stamp_ns, self._vue_id, batch.items, batch.rows, fits, accepted)
+            epoch = FittedEpoch(
+                stamp_ns, self._vue_id, epoch_rows.items, epoch_rows.rows, innovations, accepted
+            )
             self._health.hear(epoch)
         return True
 
     def _watch(self, stamp_ns: int, watched: list[RsuMeasurement]) -> None:
-        """Compare what isolated RSUs say with the estimate, without fusing it."""
+        """Compare what excluded RSUs say with the estimate, without fusing it."""
         if self._state.estimate is None:
             return
         self._predict(stamp_ns)
         mean, cov = self._state.estimate.mean, self._state.estimate.cov
         for item in watched:
-            batch = batch_of([item], self._rsus, None, self._heading)
-            fits = row_fits(mean, cov, batch.rows, self._config.device_height_m)
+            epoch_rows = epoch_rows_of([item], self._rsus, None, self._heading)
+            innovations = innovations_with_sd(
+                mean, cov, epoch_rows.rows, self._config.device_height_m
+            )
             rsu = self._rsus[item.rsu_id]
-            observe_isolated(self._health, self._vue_id, stamp_ns, batch, fits, rsu, self._gate)
+            observe_excluded(
+                self._health, self._vue_id, stamp_ns, epoch_rows, innovations, rsu, self._gate
+            )
 
     def _note_accepted(
-        self, stamp_ns: int, batch: Batch, accepted: Sequence[float] | None = None
+        self, stamp_ns: int, epoch_rows: EpochRows, accepted: Sequence[float] | None = None
     ) -> tuple[str, ...]:
         """Count what was ``accepted`` (None: all of it); who sent it."""
         state = self._state
         sources = []
-        for i, item in enumerate(batch.items):
+        for i, item in enumerate(epoch_rows.items):
             if accepted is not None and not accepted[i]:
                 continue
             if isinstance(item, RsuMeasurement):
@@ -362,14 +382,14 @@ class Track:
         if estimate is not None and stamp_ns > estimate.stamp_ns:
             self._prepare(stamp_ns).predict(stamp_ns, self._state.bias)
 
-    def _report(self, epoch: Applied) -> TrackOutput:
+    def _report(self, epoch: EpochResult) -> TrackOutput:
         self._predict(epoch.stamp_ns)
         state, config = self._state, self._config
-        estimate, counts = state.estimate, (state.accepted, total(self.refused, state.rejected))
+        estimate, rejected = state.estimate, total(self.refused, state.rejected)
         if estimate is None:
-            status = track_status(config, self._vue_id, epoch, *counts)
+            status = track_status(config, self._vue_id, epoch, state.accepted, rejected)
             return TrackOutput(None, None, status, network=config.network)
-        mean, cov = state.rivals.reported(epoch.stamp_ns, estimate, state.bias)
+        mean, cov = state.hypotheses.reported(epoch.stamp_ns, estimate, state.bias)
         odometry, clock, state.yaw, sd_m, radius_m = output.describe(
             epoch.stamp_ns,
             self._vue_id,
@@ -387,7 +407,7 @@ class Track:
             modes=estimate.modes,
             steps=state.biases.step_calibration(mean, cov) if self._calibrates_steps else None,
         )
-        status = track_status(config, self._vue_id, epoch, *counts, known)
+        status = track_status(config, self._vue_id, epoch, state.accepted, rejected, known)
         track = None
         if self._secondary is not None:
             track = self._secondary.track(state.own, state.segment, estimate, state.bias)
@@ -404,6 +424,6 @@ class Track:
         state, config = self._state, self._config
         level = state.nis_window.inflation() * radius_m
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
-        moved = state.unnoticed_m + config.manoeuvre_speed_sd_mps * unheard_s
+        moved = state.undetected_m + config.manoeuvre_speed_sd_mps * unheard_s
         level = max(level, min(moved, _LEVEL_MAX_M))
         return estimate.radius(level)

@@ -11,8 +11,8 @@ from netpos.filters.rows import linear_rows
 from netpos.messages.values import Field, GroundSpeed, InitialPose, RsuInfo, RsuMeasurement
 from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.manoeuvre_hypotheses import ManoeuvreHypotheses
 from netpos.tracking.protection import FusedEpoch
-from netpos.tracking.rivals import Rivals
 from netpos.tracking.tracker import Tracker
 
 
@@ -20,14 +20,14 @@ def warm_up(network: str | None = None) -> None:
     """Run tiny tracks through the kernels: first fix, prediction, gate, update.
 
     network : of the tracker, "" where it takes all; None: every kernel, as at set-up. Those for
-        anchors follow with the first anchor (``warm_up_anchors``), those for rivals with the first
-        one (9 MB, as much of the compiler, 50 to 80 ms): a kernel that is only loaded costs a
-        tracker memory and time, too.
+        anchors follow with the first anchor (``warm_up_anchors``), those of manoeuvre hypotheses
+        with the first one (9 MB, as much of the compiler, 50 to 80 ms): a kernel that is only
+        loaded costs a tracker memory and time, too.
     """
     _angles_and_ranges()
     if network is None:
         warm_up_anchors()
-        _rivals()
+        _hypotheses()
         Tracker(TrackerConfig(motion_model="strapdown", robust="huber"))
     if network != "":
         _fixes_of_a_network()
@@ -100,12 +100,12 @@ def _angles_and_ranges() -> None:
         tracker.process()
 
 
-def _rivals() -> None:
-    """An epoch that fits so badly that rivals of the estimate are looked for."""
+def _hypotheses() -> None:
+    """An epoch that fits so badly that manoeuvre hypotheses begin."""
     config, stamp_ns, interval_s = TrackerConfig(manoeuvre_speed_sd_mps=1.0), 100_000_000, 0.1
     estimate = estimates.start(config, 0, np.zeros(6), np.eye(6))
     rows = linear_rows(np.full(2, 4.0), np.eye(2), np.eye(6)[:2], 0)
     _, dof, accepted = estimate.step(stamp_ns, interval_s, 0, rows, NO_BIAS)
     mean, cov = estimate.prior
     epoch = FusedEpoch(mean, cov, rows, accepted, interval_s, estimate.mean, 99.0, dof)
-    Rivals(config).level(1.0, stamp_ns, estimate, epoch, NO_BIAS)
+    ManoeuvreHypotheses(config).level(1.0, stamp_ns, estimate, epoch, NO_BIAS)

@@ -100,7 +100,7 @@ def test_only_tracking_is_ready() -> None:
         ("TTCCTT", 0),
         ("TCAAT", 0),
         ("TCAIT", 0),
-        ("TTIT", 0),  # the sd has grown
+        ("TTIT", 0),  # the sd has augmented
         ("TTWWIT", 1),
         ("TCCIT", 0),
         ("TWITCW", 2),

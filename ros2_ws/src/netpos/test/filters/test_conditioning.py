@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from filter_rows import NO_GATE, random_spd
 from netpos.filters import ekf, robust
-from netpos.filters.conditioning import Robust, RobustOptions, condition
+from netpos.filters.conditioning import Robust, RobustOptions, reweight
 from netpos.filters.measurement import (
     AXES,
     BLOCKED,
@@ -44,11 +44,11 @@ def conditioned(
     late: tuple[float, float] = (0.0, 0.0),
     height_m: float = 0.0,
 ) -> Array:
-    """``condition`` on a copy of the rows; mean and cov are left alone."""
+    """``reweight`` on a copy of the rows; mean and cov are left alone."""
     out, before = rows.copy(), (mean.copy(), cov.copy())
     # one signature to compile
     options = RobustOptions(int(weights[0]), float(weights[1]), float(late[0]), float(late[1]))
-    condition(mean, cov, out, height_m, options, np.full(mean.size, np.nan))
+    reweight(mean, cov, out, height_m, options, np.full(mean.size, np.nan))
     np.testing.assert_array_equal(mean, before[0])
     np.testing.assert_array_equal(cov, before[1])
     return out

@@ -64,13 +64,13 @@ def test_gate_threshold_itself_is_inside_and_one_iteration_decides_by_the_tangen
     nis = innovation[0] ** 2 / (4.0 + (H @ (H @ cov).T).item())
     assert nis == pytest.approx(ekf.group_nis(cov, innovation, H, np.array([4.0])), rel=1e-14)
     x, _ = iterated(mean, cov, rows, rows[:, VARIANCE].copy(), 1)
-    assert fit.misfit(mean, cov, rows, rows[:, VARIANCE].copy(), 0.0, x) < 0.6 * nis
+    assert fit.map_cost(mean, cov, rows, rows[:, VARIANCE].copy(), 0.0, x) < 0.6 * nis
     for iterations in (0, 1):
         assert passes(mean, cov, rows, nis, iterations)
         assert not passes(mean, cov, rows, np.nextafter(nis, 0), iterations)
     for iterations in (2, 8):
         x, _ = iterated(mean, cov, rows, rows[:, VARIANCE].copy(), iterations)
-        cost = fit.misfit(mean, cov, rows, rows[:, VARIANCE].copy(), 0.0, x)
+        cost = fit.map_cost(mean, cov, rows, rows[:, VARIANCE].copy(), 0.0, x)
         assert cost < 0.6 * nis
         assert passes(mean, cov, rows, cost, iterations)
         assert not passes(mean, cov, rows, np.nextafter(cost, 0), iterations)

@@ -1,4 +1,4 @@
-"""Iterated updates: the most probable state, its misfit, gates where the model bends."""
+"""Iterated updates: the most probable state, its map_cost, gates where the model bends."""
 
 from __future__ import annotations
 

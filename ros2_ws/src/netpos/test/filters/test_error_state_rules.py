@@ -12,9 +12,9 @@ from netpos.filters.error_state import (
     REST_FORCE,
     Constraints,
     Sensors,
+    apply_constraints,
     correct,
     doubt_standstill,
-    hold,
 )
 from netpos.filters.measurement import GATE_VARIANCE, GROUP, VALUE, VARIANCE, Kind
 from netpos.filters.space import SpaceKind, bend_variance, direction_rows, place_rows
@@ -132,7 +132,7 @@ def test_how_long_it_has_been_quiet(what: str, share: float, quiet: float, seed:
         rate += 0.05 * share * way
     else:
         force += 0.2 * share * way
-    hold(nav, cov, memory, still(), chunk_of(rate, force))
+    apply_constraints(nav, cov, memory, still(), chunk_of(rate, force))
     assert memory[QUIET] == quiet
 
 
@@ -142,10 +142,10 @@ def test_the_first_force_is_compared_with_none() -> None:
     nav, cov = vehicle(rng)
     memory, forces = np.zeros(MEMORY), [0.0, 0.0, 9.8] + 0.05 * rng.normal(size=(6, 3))
     for k, force in enumerate(forces):
-        hold(nav, cov, memory, still(), chunk_of(np.zeros(3), force))
+        apply_constraints(nav, cov, memory, still(), chunk_of(np.zeros(3), force))
         assert memory[QUIET] == k + 1
         np.testing.assert_allclose(memory[REST_FORCE:], forces[: k + 1].mean(axis=0), rtol=1e-12)
-    hold(nav, cov, memory, still(), chunk_of(np.ones(3), np.full(3, 9.0)))
+    apply_constraints(nav, cov, memory, still(), chunk_of(np.ones(3), np.full(3, 9.0)))
     assert memory[QUIET] == 0.0
     np.testing.assert_array_equal(memory[REST_FORCE:], 9.0)  # where the next rest begins
 
@@ -155,11 +155,11 @@ def test_after_a_doubt_nothing_stands_for_a_hundred_chunks() -> None:
     memory, rest = np.zeros(MEMORY), chunk_of(np.zeros(3), np.array([0.0, 0.0, 9.8]))
     doubt_standstill(memory)
     for k in range(100):
-        hold(nav, cov, memory, still(), rest if k % 7 else rest + 5.0)
+        apply_constraints(nav, cov, memory, still(), rest if k % 7 else rest + 5.0)
         assert memory[QUIET] == k - 99
-    hold(nav, cov, memory, still(), rest)
+    apply_constraints(nav, cov, memory, still(), rest)
     assert memory[QUIET] == 1.0
-    hold(nav, cov, memory, still(), rest + 5.0)
+    apply_constraints(nav, cov, memory, still(), rest + 5.0)
     assert memory[QUIET] == 0.0
 
 
@@ -172,7 +172,9 @@ def held(quiet: float, speed: float, sensors: Sensors) -> tuple[Array, Array, Ar
     before = nav.copy(), cov.copy()
     memory = np.zeros(MEMORY)
     memory[QUIET], memory[REST_FORCE:] = quiet, 1.0
-    hold(nav, cov, memory, sensors, chunk_of(np.array([0.01, 0.02, -0.015]), np.ones(3), 0.08))
+    apply_constraints(
+        nav, cov, memory, sensors, chunk_of(np.array([0.01, 0.02, -0.015]), np.ones(3), 0.08)
+    )
     return (*before, nav, cov)
 
 

@@ -1,4 +1,4 @@
-"""How well a state fits: distances and misfits."""
+"""How well a state fits: distances and costs."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_misfit_is_twice_the_negative_log_posterior(seed: int) -> None:
     mean, cov, rows = range_problem(seed)
     x = mean + np.random.default_rng(seed).normal(size=6)
     expected = log_posterior_cost(rows, mean, cov, 0.0, x)
-    assert fit.misfit(mean, cov, rows, rows[:, VARIANCE].copy(), 0.0, x) == pytest.approx(
+    assert fit.map_cost(mean, cov, rows, rows[:, VARIANCE].copy(), 0.0, x) == pytest.approx(
         expected, rel=1e-9
     )
 
@@ -69,7 +69,7 @@ def test_surprise_is_what_scipy_makes_of_it() -> None:
     innovation, H = linearise(rows, mean, 0.0)
     bent = [curvature_variance(row, mean, cov, 0.0) for row in rows]
     S = H @ cov @ H.T + np.diag(rows[:, VARIANCE] + bent)
-    distance, size = fit.surprise(mean, cov, rows, 0.0, True)
+    distance, size = fit.neg2_log_likelihood(mean, cov, rows, 0.0, True)
     assert distance == pytest.approx(innovation @ np.linalg.solve(S, innovation), rel=1e-9)
     assert size == pytest.approx(np.linalg.slogdet(2.0 * np.pi * S)[1], rel=1e-9)
 
@@ -98,15 +98,17 @@ def test_a_bearing_does_not_bend_along_itself() -> None:
     _, gradient = linearise(row, mean, 0.0)
     S = gradient[0] @ cov @ gradient[0] + 1e-4 + 0.5 * np.trace(bent @ bent)
     innovation = -0.6 - azimuth(4.0, -3.0)
-    distance, size = fit.surprise(mean, cov, row, 0.0, False)
+    distance, size = fit.neg2_log_likelihood(mean, cov, row, 0.0, False)
     assert distance == pytest.approx(innovation**2 / S, rel=1e-5)
     assert size == pytest.approx(math.log(2.0 * math.pi * S), rel=1e-5)
-    assert size < fit.surprise(mean, cov, row, 0.0, True)[1]
+    assert size < fit.neg2_log_likelihood(mean, cov, row, 0.0, True)[1]
     row[0, AXES + 8] = 0.9
-    assert fit.surprise(mean, cov, row, 0.0, False) == fit.surprise(mean, cov, row, 0.0, True)
+    assert fit.neg2_log_likelihood(mean, cov, row, 0.0, False) == fit.neg2_log_likelihood(
+        mean, cov, row, 0.0, True
+    )
     mean, cov, rows = range_problem(3)
     ranges = rows[rows[:, KIND] == Kind.RANGE]
     assert len(ranges) > 0
-    assert fit.surprise(mean, cov, ranges, 0.0, False) == fit.surprise(
+    assert fit.neg2_log_likelihood(mean, cov, ranges, 0.0, False) == fit.neg2_log_likelihood(
         mean, cov, ranges, 0.0, True
     )

@@ -7,7 +7,7 @@ import math
 import filter_rows
 import numpy as np
 import pytest
-from netpos.filters.manoeuvre import add_manoeuvre, unnoticed_s
+from netpos.filters.manoeuvre import add_manoeuvre, detection_delay_s
 from netpos.filters.measurement import GATE_VARIANCE, Kind, curvature_variance, linearise
 from netpos.messages.values import Array
 
@@ -39,7 +39,7 @@ def test_a_step_is_noticed_where_it_reaches_the_gate(seed: int) -> None:
     """In the direction known least, by search over all; twice as long as in the mean over them,
     for as long as that the filter follows."""
     cov, rows = problem(seed)
-    typical_s, longest_s = unnoticed_s(MEAN, cov, rows, 1.0, GATE, SPEED, np.empty(6))
+    typical_s, longest_s = detection_delay_s(MEAN, cov, rows, 1.0, GATE, SPEED, np.empty(6))
     angles = np.linspace(0.0, math.pi, 20001)
     ways = np.array([np.cos(angles), np.sin(angles)])
     reached = np.einsum("in,ij,jn->n", ways, known(cov, rows), ways)  # of a step of one metre
@@ -51,10 +51,13 @@ def test_a_step_is_noticed_where_it_reaches_the_gate(seed: int) -> None:
 def test_what_no_row_tells_is_never_noticed() -> None:
     """One bearing leaves its own direction open, and no rows everything."""
     cov, rows = problem(1)
-    some_s, longest_s = unnoticed_s(MEAN, cov, rows[:1], 1.0, GATE, SPEED, np.empty(6))
+    some_s, longest_s = detection_delay_s(MEAN, cov, rows[:1], 1.0, GATE, SPEED, np.empty(6))
     assert math.isfinite(some_s)
     assert longest_s == math.inf
-    assert unnoticed_s(MEAN, cov, rows[:0], 1.0, GATE, SPEED, np.empty(6)) == (math.inf, math.inf)
+    assert detection_delay_s(MEAN, cov, rows[:0], 1.0, GATE, SPEED, np.empty(6)) == (
+        math.inf,
+        math.inf,
+    )
 
 
 def test_a_step_at_any_time_moves_the_place_by_half_of_it() -> None:

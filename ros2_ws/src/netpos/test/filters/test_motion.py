@@ -68,7 +68,7 @@ def process_noise(
     **values: float,
 ) -> np.ndarray:
     """Q of constant velocity; the parameters not given are absurd: they must not matter."""
-    own = {Parameter.MODEL, Parameter.NOISE, Parameter.EXTRAS, Parameter.JUMP_SPEED}
+    own = {Parameter.MODEL, Parameter.NOISE, Parameter.EXTRAS, Parameter.VELOCITY_STEP_SD}
     absurd = {p.name.lower(): 1e6 for p in Parameter if p not in own}
     parameters = motion_parameters(noise=kind, **absurd | values)
     Q = np.full((6 + sd.size, 6 + sd.size), np.nan)
@@ -198,17 +198,21 @@ def test_add_noise_adds_to_what_is_there(kind: ProcessNoise) -> None:
 
 
 @pytest.mark.parametrize("kind", list(ProcessNoise))
-@pytest.mark.parametrize("spread_m", [0.0, 0.4])
-def test_a_velocity_step_allowed_for(kind: ProcessNoise, spread_m: float) -> None:
+@pytest.mark.parametrize("position_sd", [0.0, 0.4])
+def test_a_velocity_step_allowed_for(kind: ProcessNoise, position_sd: float) -> None:
     """A step of velocity of 3 m/s sd, 0.2 s ago: 0.6 m of position go with it, and nothing of the
     clock or the biases."""
     plain = process_noise(kind, 0.4, BIAS_SD, BIAS_TAU, **ONES)
-    jump = {"jump_speed": 3.0, "jump_time": 0.2, "jump_spread": spread_m}
-    Q = process_noise(kind, 0.4, BIAS_SD, BIAS_TAU, **jump, **ONES)
+    step = {
+        "velocity_step_sd": 3.0,
+        "velocity_step_age": 0.2,
+        "velocity_step_position_sd": position_sd,
+    }
+    Q = process_noise(kind, 0.4, BIAS_SD, BIAS_TAU, **step, **ONES)
     G = np.zeros((8, 2))
     G[0, 0] = G[1, 1] = 0.6
     G[2, 0] = G[3, 1] = 3.0
-    expected = G @ G.T + spread_m**2 * np.diag([1.0, 1.0, 0, 0, 0, 0, 0, 0])
+    expected = G @ G.T + position_sd**2 * np.diag([1.0, 1.0, 0, 0, 0, 0, 0, 0])
     np.testing.assert_allclose(Q - plain, expected, rtol=1e-12, atol=1e-14)
 
 
@@ -239,8 +243,8 @@ NOISE = {
     "accel_bias": 0.3,
     "yaw_increment": 0.25,
     "speed_increment": 1.1,
-    "jump_speed": 0.6,
-    "jump_time": 0.2,
+    "velocity_step_sd": 0.6,
+    "velocity_step_age": 0.2,
 }
 BIASES = np.array([[2.0, 0.5], [1.5, 0.3]])
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from netpos.filters.conditioning import Robust, RobustOptions, condition
+from netpos.filters.conditioning import Robust, RobustOptions, reweight
 from netpos.filters.measurement import AXES, BLOCKED, GROUP, HEADING, KIND, ROW_WIDTH, VALUE, Kind
-from netpos.filters.space_conditioning import condition_in_space
+from netpos.filters.space_conditioning import reweight_3d
 from netpos.filters.state import ERR_BIASES, Err, Nav, X
 from netpos.inertial.strapdown import NAV
 from netpos.messages.values import Array
@@ -48,8 +48,8 @@ def test_in_the_plane_it_is_the_planar_one(weights: Robust, late: tuple[float, f
     )
     planar, spatial = rows.copy(), rows.copy()
     options = RobustOptions(int(weights), 2.0, *late)
-    condition(mean, cov, planar, 0.0, options, np.empty(6))
-    condition_in_space(nav, wide, spatial, options)
+    reweight(mean, cov, planar, 0.0, options, np.empty(6))
+    reweight_3d(nav, wide, spatial, options)
     np.testing.assert_allclose(spatial, planar, rtol=1e-9)
     changed = not np.array_equal(planar, rows)
     assert changed is (weights is not Robust.NONE or late == LATE)

@@ -62,7 +62,7 @@ class Stream:
 
 
 def isolated(health: RsuHealth, t: float, names: Iterable[str] = "abcdef") -> set[str]:
-    return {name for name in names if health.isolated(name, ns(t))}
+    return {name for name in names if health.excluded(name, ns(t))}
 
 
 def first_isolated(stream: Stream, rsus: Mapping[str, Behaviour], stop: float, **kw: Any) -> float:

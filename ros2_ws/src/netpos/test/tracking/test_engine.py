@@ -102,7 +102,7 @@ def plain_step(
     if rejected >= options.inflate_after:
         P = opened(P, options.initial_speed_sd, unheard_s)
     rows, work = rows.copy(), ekf.workspace(len(mean), len(rows))
-    conditioning.condition(prior, P, rows, 0.0, options.robust, work[0])
+    conditioning.reweight(prior, P, rows, 0.0, options.robust, work[0])
     best = look(prior, P, rows, options)
     sd = options.manoeuvre_speed_sd
     if sd > 0.0 and not best[4].all():
@@ -127,7 +127,7 @@ def compiled_step(
     motion: Array,
     options: FilterOptions,
 ) -> tuple[Array, Array, float, int, Array]:
-    x, S = mean.copy(), engine.to_spread(cov, options)
+    x, S = mean.copy(), engine.to_cov_or_sqrt(cov, options)
     scratch, epoch = engine.scratch(6, len(rows)), EpochInput(dt, unheard_s, rejected, rows)
     result = engine.step(x, S, epoch, motion, NO_BIAS, options, scratch)
     accepted = scratch.accepted[0, :3]
@@ -166,7 +166,7 @@ def test_step_follows_the_rules(filter_name: str, name: str) -> None:
     rows = rows_of(truth, np.random.default_rng(3), wrong)
     kept = rows.copy()
     own = motion.copy()  # the step notes there which velocity step it allowed for
-    own[Parameter.JUMP_SPEED] = 7.0  # in the epoch before
+    own[Parameter.VELOCITY_STEP_SD] = 7.0  # in the epoch before
     got = compiled_step(mean, cov, 0.1, 1.3, rejected, rows, own, options)
     allowed, noted, without = np.zeros((3, 6, 6))
     want = plain_step(mean, cov, 0.1, 1.3, rejected, kept, motion, options, allowed)

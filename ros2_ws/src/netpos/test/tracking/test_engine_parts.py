@@ -44,8 +44,8 @@ def test_a_manoeuvre_at_any_time(within_s: float) -> None:
     steps = [opened(cov, 3.0, within_s * (x + 1.0) / 2.0) for x in nodes]
     expected = sum(w / 2.0 * step for w, step in zip(weights, steps, strict=True))
     L, P = srukf.factor(cov), cov.copy()
-    engine.allow_manoeuvre(P, within_s, plain)
-    engine.allow_manoeuvre(L, within_s, root)
+    engine.inflate_for_manoeuvre(P, within_s, plain)
+    engine.inflate_for_manoeuvre(L, within_s, root)
     np.testing.assert_allclose(P, expected, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(L @ L.T, expected, rtol=1e-12, atol=1e-13)
 
@@ -56,12 +56,12 @@ def test_a_smoother_is_told_of_both_steps(opened_sd: float, turn: float) -> None
     motion = motions_of(TrackerConfig())[0]
     without, noted = np.zeros((6, 6)), np.zeros((6, 6))
     noise(np.zeros(6), 0.1, motion, NO_BIAS, without)
-    engine.note_jump(motion, opened_sd, 1.3, turn, 0.7)
+    engine.set_velocity_step_noise(motion, opened_sd, 1.3, turn, 0.7)
     noise(np.zeros(6), 0.1, motion, NO_BIAS, noted)
     expected = opened(without, opened_sd, 1.3)
     if turn > 0.0:
         options = options_of(TrackerConfig(manoeuvre_speed_sd_mps=turn))
-        engine.allow_manoeuvre(expected, 0.7, options)
+        engine.inflate_for_manoeuvre(expected, 0.7, options)
     np.testing.assert_allclose(noted, expected, rtol=1e-12, atol=1e-14)
 
 
@@ -105,10 +105,10 @@ def test_what_can_be_a_device(change: dict[str, Any], sound: bool) -> None:
 def test_what_is_carried_and_the_covariance() -> None:
     _, cov = start()
     root, plain = options_of(TrackerConfig(filter="srukf")), options_of(TrackerConfig())
-    L = engine.to_spread(cov, root)
+    L = engine.to_cov_or_sqrt(cov, root)
     np.testing.assert_allclose(L, np.linalg.cholesky(cov), rtol=1e-12)
     np.testing.assert_allclose(engine.to_cov(L, root), cov, rtol=1e-12)
-    copied = engine.to_spread(cov, plain)
+    copied = engine.to_cov_or_sqrt(cov, plain)
     assert copied is not cov
     np.testing.assert_array_equal(copied, cov)
 
@@ -118,11 +118,11 @@ def test_predict_does_nothing_for_no_time(name: str) -> None:
     config = TrackerConfig(filter=name)
     options, motion = options_of(config), motions_of(config)[0]
     mean, cov = start()
-    x, S = mean.copy(), engine.to_spread(cov, options)
+    x, S = mean.copy(), engine.to_cov_or_sqrt(cov, options)
     for dt in (0.0, -1.0):
         engine.predict(x, S, dt, motion, NO_BIAS, options)
         np.testing.assert_array_equal(x, mean)
-        np.testing.assert_array_equal(S, engine.to_spread(cov, options))
+        np.testing.assert_array_equal(S, engine.to_cov_or_sqrt(cov, options))
     engine.predict(x, S, 0.5, motion, NO_BIAS, options)
     ekf.predict(mean, cov, 0.5, motion, NO_BIAS)  # linear: all the same
     np.testing.assert_allclose(x, mean, rtol=1e-9, atol=1e-12)
@@ -135,7 +135,7 @@ def test_every_filter_applies_what_is_linear_alike(name: str) -> None:
     options, (prior, cov) = options_of(TrackerConfig(filter=name)), start()
     R, fix = np.diag([0.25, 0.16]), prior[POSITION] + np.array([0.8, -0.5])
     rows = np.vstack([linear_rows(fix, R, H, 0), linear_rows(fix + 100.0, R, H, 1)])
-    x, S, accepted = prior.copy(), engine.to_spread(cov, options), np.full(2, 9.0)
+    x, S, accepted = prior.copy(), engine.to_cov_or_sqrt(cov, options), np.full(2, 9.0)
     nis, used = engine.update(x, S, rows, options, accepted, ekf.workspace(6, 4))
     assert accepted.tolist() == [1.0, 0.0]
     residual, information = fix - prior[POSITION], np.linalg.inv(cov)
@@ -168,7 +168,7 @@ def test_a_manoeuvre_is_more_than_the_velocity_allows_for(
     change = {"manoeuvre_speed_sd_mps": 3.0, "gate_probability": 0.999}
     options = options_of(TrackerConfig(filter=name, **change))
     cov = np.diag([2.0, 2.0, 12.0 * share, 6.0 * share, 1.0, 1.0])
-    S, rows = engine.to_spread(cov, options), linear_rows(np.zeros(2), 3.0 * np.eye(2), H, 0)
+    S, rows = engine.to_cov_or_sqrt(cov, options), linear_rows(np.zeros(2), 3.0 * np.eye(2), H, 0)
     shows_s = math.sqrt(chi2.ppf(0.999, 2) * 5.0) / 3.0
     for unheard_s in (0.1, 2.01 * shows_s):
         within_s = engine.manoeuvre_s(np.zeros(6), S, rows, unheard_s, options)
@@ -183,8 +183,8 @@ def test_rows_are_weighed_by_what_is_carried(name: str) -> None:
     options = options_of(TrackerConfig(filter=name, robust="huber", robust_parameter=1.5))
     (mean, cov), R, off = start(), np.diag([0.25, 0.16]), np.array([9.0, -7.0])
     rows = linear_rows(mean[POSITION] + off, R, H, 0)
-    S, work = engine.to_spread(cov, options), ekf.workspace(6, 2)
-    engine.condition(mean, S, rows, options, work)
+    S, work = engine.to_cov_or_sqrt(cov, options), ekf.workspace(6, 2)
+    engine.reweight(mean, S, rows, options, work)
     factor = math.sqrt(off @ np.linalg.solve(cov[POSITION, POSITION] + R, off) / 2.0) / 1.5
     assert factor > 2.0
     np.testing.assert_allclose(rows[:, [VARIANCE, GATE_VARIANCE]], factor, rtol=1e-9)

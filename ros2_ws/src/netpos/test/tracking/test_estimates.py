@@ -169,10 +169,10 @@ def test_a_copy_is_independent(name: str) -> None:
 
     def onward(e: estimates.Estimate) -> tuple[Array, Array]:
         if name == "inertial":
-            e.drive(0.3, 1.0, 0.01)
+            e.set_imu_increment(0.3, 1.0, 0.01)
         e.step(T0 + 3 * 10**8, 0.2, 0, fix(2.0, 3.0), NO_BIAS)
         e.predict(T0 + 4 * 10**8, NO_BIAS)
-        e.grow(np.append(np.zeros(e.mean.size - 6), 0.7))
+        e.augment(np.append(np.zeros(e.mean.size - 6), 0.7))
         return e.mean.copy(), e.cov.copy()
 
     moved = onward(twin)
@@ -189,7 +189,7 @@ def test_bias_states_grow_and_stay_stationary(name: str) -> None:
     extras = estimate.mean.size - 6
     before = estimate.cov.copy()
     for sd in ([0.5], [0.5, 2.0], [0.5, 2.0]):
-        estimate.grow(np.append(np.zeros(extras), sd))
+        estimate.augment(np.append(np.zeros(extras), sd))
     n = 6 + extras
     assert estimate.mean.size == n + 2
     np.testing.assert_allclose(np.diag(estimate.cov)[n:], [0.25, 4.0], rtol=1e-12)
@@ -275,5 +275,5 @@ def test_options_an_estimate_cannot_do_are_refused(values: dict[str, Any]) -> No
 
 def test_interacting_models_take_no_imu() -> None:
     with pytest.raises(NotImplementedError):
-        started("interacting").drive(0.0, 0.0, 0.0)
+        started("interacting").set_imu_increment(0.0, 0.0, 0.0)
     assert len(motions_of(TrackerConfig(motion_model="interacting"))) == 3

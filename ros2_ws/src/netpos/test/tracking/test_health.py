@@ -45,7 +45,7 @@ def test_an_rsu_never_heard() -> None:
     report = RsuHealth().report("x", 0)
     assert (report.state, report.text) == (RsuState.OK, "not heard yet")
     assert (report.age_s, report.accept_ratio) == (-1.0, -1.0)
-    assert not RsuHealth().isolated("x", 1)
+    assert not RsuHealth().excluded("x", 1)
 
 
 # liars
@@ -66,7 +66,7 @@ def test_a_steady_liar_is_found_named_and_isolated(kind: str, error: float, text
     stream.run(when, 40, rsus)
     assert isolated(stream.health, 40) == {"b"}
     report = stream.health.report("b", ns(40))
-    assert report.state is RsuState.ISOLATED
+    assert report.state is RsuState.EXCLUDED
     assert report.mean_innovation[kind] == pytest.approx(error, abs=0.4 * SD[kind])
     assert report.text.startswith(text)
     for other in "ac":
@@ -78,10 +78,10 @@ def test_the_verdict_holds_from_its_time_on() -> None:
     stream = Stream()
     rsus = {"a": honest, "b": liar(10.0, toa=30.0), "c": honest}
     when = first_isolated(stream, rsus, 30)
-    assert not stream.health.isolated("b", ns(when) - 1)
-    assert stream.health.isolated("b", ns(when))
+    assert not stream.health.excluded("b", ns(when) - 1)
+    assert stream.health.excluded("b", ns(when))
     stream.run(when, when + 1, rsus)
-    assert not stream.health.isolated("b", ns(when) - 1)
+    assert not stream.health.excluded("b", ns(when) - 1)
 
 
 def test_a_bias_that_passes_the_gate_is_suspect() -> None:

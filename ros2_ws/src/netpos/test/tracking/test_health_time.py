@@ -73,8 +73,8 @@ def test_order_of_arrival_does_not_matter() -> None:
                 health.observe(name, "v", ns(t), not accepted, {"range": (99.0, 1.0)})
                 health.rewind("w", 0)
             health.observe(name, "v", ns(t), accepted, values)
-            seen.add((t, health.isolated("b", ns(t))))
-        health.isolated("a", ns(60))
+            seen.add((t, health.excluded("b", ns(t))))
+        health.excluded("a", ns(60))
         return [sorted(seen), *health.reports(ns(45))]
 
     straight = answers(range(len(records)), False)
@@ -91,7 +91,7 @@ def test_rewind_drops_one_device_from_a_stamp_on() -> None:
         for k in range(20):
             health.observe("a", vue, ns(k / 10), True, {})
     health.rewind("v", ns(0.75))
-    health.isolated("a", ns(10))
+    health.excluded("a", ns(10))
     assert health.report("a", ns(10)).measurements == 8 + 20
 
 
@@ -100,7 +100,7 @@ def test_too_late_is_counted() -> None:
     health.observe("a", "v", ns(10.0), True, {})
     health.observe("a", "v", ns(7.999), False, {})
     health.observe("a", "v", ns(8.0), False, {})
-    health.isolated("a", ns(20))
+    health.excluded("a", ns(20))
     report = health.report("a", ns(20))
     assert (report.late, report.measurements, report.accept_ratio) == (1, 2, 0.5)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from netpos.filters.measurement import Kind
 from netpos.tracking.health import HealthConfig, RsuHealth
-from netpos.tracking.health_words import medians, misfit, off, rate_hz, words
+from netpos.tracking.health_words import mean_nis, medians, off, rate_hz, words
 from netpos.tracking.observations import Observation
 
 
@@ -85,8 +85,8 @@ def test_figures() -> None:
     entries = observed("range", [1.0, -2.0, 6.0], 2.0)
     assert medians(entries) == {"range": 1.0}
     assert medians(entries, normalised=True) == {"range": 0.5}
-    assert misfit(entries) == pytest.approx((1 + 4 + 36) / 4 / 3)
-    assert misfit([]) == 0.0
+    assert mean_nis(entries) == pytest.approx((1 + 4 + 36) / 4 / 3)
+    assert mean_nis([]) == 0.0
     assert rate_hz(entries) == pytest.approx(10.0)
     assert rate_hz(entries[:1]) == rate_hz([]) == 0.0
 

@@ -13,8 +13,8 @@ from netpos.tracking.config import FILTERS, ROBUST, TrackerConfig
 from netpos.tracking.engine import GATE_SIZE, Filter, FilterOptions
 from netpos.tracking.models import (
     FILTER_ITERATIONS,
+    augmented,
     gate_thresholds,
-    grown,
     initial_extra_sd,
     motions_of,
     options_of,
@@ -186,9 +186,9 @@ def test_pose_state_is_that_of_the_paper() -> None:
 def test_growing_appends_independent_states() -> None:
     A = np.random.default_rng(0).normal(size=(7, 7))
     mean, cov = np.arange(7.0), A @ A.T
-    same = grown(mean, cov, np.array([0.5]))
+    same = augmented(mean, cov, np.array([0.5]))
     assert same[0] is mean
-    x, P = grown(mean, cov, np.array([0.5, 2.0, 3.0]))
+    x, P = augmented(mean, cov, np.array([0.5, 2.0, 3.0]))
     np.testing.assert_array_equal(x, [*range(7), 0.0, 0.0])
     np.testing.assert_array_equal(P[:7, :7], cov)
     np.testing.assert_array_equal(P[7:, 7:], np.diag([4.0, 9.0]))

@@ -31,9 +31,9 @@ def test_rows_find_their_measurement() -> None:
     epoch = epoch_of(7 * S, np.random.default_rng(1))
     (a, first), (b, second) = epoch.observations()
     assert (a, b) == ("a", "b")
-    assert first == (7 * S, "v", True, ("AZIMUTH", "TOA"), tuple(epoch.fits[:2].ravel()))
+    assert first == (7 * S, "v", True, ("AZIMUTH", "TOA"), tuple(epoch.innovations[:2].ravel()))
     taken = bool(epoch.accepted[2])
-    assert second == (7 * S, "v", taken, ("RANGE",), tuple(epoch.fits[5]))
+    assert second == (7 * S, "v", taken, ("RANGE",), tuple(epoch.innovations[5]))
 
 
 @pytest.mark.parametrize("asked_every", [1, 7, 1000])
@@ -65,9 +65,9 @@ def test_all_are_trusted_until_one_is_isolated() -> None:
     health = RsuHealth()
     for k in range(80):
         stamp_ns = S + k * S // 10
-        assert health.trusts_all(stamp_ns) is not health.isolated("b", stamp_ns)
+        assert health.trusts_all(stamp_ns) is not health.excluded("b", stamp_ns)
         for rsu_id in "abc":
             error = 30.0 if rsu_id == "b" else 0.5
             health.observe(rsu_id, "v", stamp_ns, rsu_id != "b", {"range": (error, 1.0)})
-    assert health.isolated("b", 10 * S)
+    assert health.excluded("b", 10 * S)
     assert not health.trusts_all(10 * S)

@@ -23,10 +23,10 @@ from netpos.filters.state import POSITION, VELOCITY
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.phase_fix import (
     admissible,
+    init_hypothesis,
     nearest_turns,
     phase_scale,
     place,
-    spawn,
     to_fix,
 )
 from scipy.spatial.transform import Rotation
@@ -197,14 +197,14 @@ def test_spawn_opens_the_velocity_and_keeps_the_rest() -> None:
     A = rng.normal(size=(8, 8))
     cov = A @ A.T
     rest = cov[4:, 4:].copy()
-    area = spawn(mean, cov, rows[0], rows[1], turns, 1.5, HEIGHT)
+    area = init_hypothesis(mean, cov, rows[0], rows[1], turns, 1.5, HEIGHT)
     np.testing.assert_allclose(mean, [*xy, 0.0, 0.0, 4.0, 5.0, 6.0, 7.0], atol=1e-9)
     np.testing.assert_array_equal(cov[4:, 4:], rest)
     np.testing.assert_array_equal(cov[:4, 4:], 0.0)
     np.testing.assert_array_equal(cov[VELOCITY, VELOCITY], 2.25 * np.eye(2))
     assert area == pytest.approx(0.5 * math.log(np.linalg.det(cov[POSITION, POSITION])))
     before = mean.copy()
-    assert spawn(mean, cov, rows[0], rows[1], 9, 1.5, HEIGHT) == -math.inf
+    assert init_hypothesis(mean, cov, rows[0], rows[1], 9, 1.5, HEIGHT) == -math.inf
     np.testing.assert_array_equal(mean, before)
 
 

@@ -11,7 +11,7 @@ import pytest
 from engine_cases import opened
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from netpos.filters.manoeuvre import unnoticed_s
+from netpos.filters.manoeuvre import detection_delay_s
 from netpos.filters.measurement import (
     GROUP,
     VALUE,
@@ -25,7 +25,7 @@ from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking import TrackerConfig
 from netpos.tracking.engine import FilterOptions
-from netpos.tracking.fit import fits_and_level, row_fits
+from netpos.tracking.fit import innovations_and_level, innovations_with_sd
 from netpos.tracking.models import options_of
 from netpos.tracking.protection import (
     RISK_MIN,
@@ -240,7 +240,7 @@ def test_a_manoeuvre_is_noticed_where_the_gate_begins_to_refuse() -> None:
     mean, cov, sd, gate = np.array([100.0, 0, 0, 0, 0, 0]), np.zeros((6, 6)), math.radians(1), 9.0
     rows = np.vstack([azimuth_row(0.0, 0.0, sd, mean), azimuth_row(100.0, 40.0, sd, mean)])
     h, speed = np.empty(6), 2.5
-    typical, longest = unnoticed_s(mean, cov, rows, 0.0, gate, speed, h)
+    typical, longest = detection_delay_s(mean, cov, rows, 0.0, gate, speed, h)
     assert longest == pytest.approx(3.0 * sd * 100.0 / speed, rel=1e-9)
     moved = mean.copy()
     moved[1] += longest * speed
@@ -249,7 +249,7 @@ def test_a_manoeuvre_is_noticed_where_the_gate_begins_to_refuse() -> None:
     a, b = 100.0 * sd, 40.0 * sd
     expected = 2.0 * math.sqrt(gate / ((1 / a**2 + 1 / b**2) / 2)) / speed
     assert typical == pytest.approx(expected, rel=1e-9)
-    wider = unnoticed_s(mean, np.eye(6), rows, 0.0, gate, speed, h)
+    wider = detection_delay_s(mean, np.eye(6), rows, 0.0, gate, speed, h)
     assert wider[0] > typical
     assert wider[1] > longest
 
@@ -326,7 +326,9 @@ def test_level_of_a_manoeuvre_is_linearised_at_its_own_answer() -> None:
         ]
     )
     accepted, mean, height_m = np.array([1.0, 1.0, 0.0]), prior + 0.4, said.height_m
-    _, longest_s = unnoticed_s(prior, cov, rows, height_m, said.gate_nis[2], 4.0, np.empty(6))
+    _, longest_s = detection_delay_s(
+        prior, cov, rows, height_m, said.gate_nis[2], 4.0, np.empty(6)
+    )
     nodes, weights = np.polynomial.legendre.leggauss(3)
     times_s = longest_s * (nodes + 1.0) / 2.0
     wide = sum(w / 2.0 * opened(cov, 4.0, s) for s, w in zip(times_s, weights, strict=True))
@@ -359,17 +361,16 @@ def test_a_manoeuvre_nobody_could_notice() -> None:
 
 
 @pytest.mark.parametrize("speed", [0.0, 4.0])
-def test_fits_and_level_in_one_go(speed: float) -> None:
+def test_innovations_and_level_in_one_go(speed: float) -> None:
     prior, cov = np.array([10.0, 20.0, 3.0, -1.0, 0.0, 0.0]), np.diag([4.0, 9.0, 0.2, 0.3, 1, 1])
     rows = np.vstack([azimuth_row(-50.0, 0.0, 0.05, prior), azimuth_row(9.0, -80.0, 0.02, prior)])
     rows[:, GROUP] = 0, 1
     mean, taken, fits = prior + 0.2, np.array([1.0, 0.0]), np.full((2, 2), np.nan)
     said = options(speed=speed)
     epoch = fused(prior, cov, rows, taken, 0.3, mean)
-    level = fits_and_level(epoch, cov, said, fits)
-    assert np.array_equal(fits, row_fits(prior, cov, rows, said.height_m))
-    alone = manoeuvre_level(epoch, said)
-    assert level == (alone if speed else 0.0)
+    level = innovations_and_level(epoch, cov, said, fits)
+    assert np.array_equal(fits, innovations_with_sd(prior, cov, rows, said.height_m))
+    assert level == (manoeuvre_level(epoch, said) if speed else 0.0)
 
 
 @pytest.mark.parametrize("where", ["mean", "cov"])
@@ -381,7 +382,7 @@ def test_nothing_is_told_of_what_is_not_sound(where: str) -> None:
         cov[X.PY, X.PY] = -1.0
     row = azimuth_row(-50.0, 0.0, 0.05, np.zeros(6))
     epoch = fused(np.zeros(6), np.eye(6), row, np.ones(1), 0.1, mean)
-    assert math.isnan(fits_and_level(epoch, cov, options(), fits))
+    assert math.isnan(innovations_and_level(epoch, cov, options(), fits))
     assert np.array_equal(fits, [[7.0, 7.0]])
 
 

@@ -98,7 +98,7 @@ def test_a_lie_is_found_named_isolated_and_forgiven(world: Any, name: str, seed:
     assert all(r.state is RsuState.OK for t, r in reports.items() if t <= START_S)
     assert reports[START_S + 5.0].state is not RsuState.OK  # suspected within five seconds
     at_last = reports[HONEST_S]
-    assert at_last.state is RsuState.ISOLATED
+    assert at_last.state is RsuState.EXCLUDED
     assert at_last.text.startswith("isolated: ")
     assert re.search(words, at_last.text), at_last.text
     assert reports[END_S].state is RsuState.OK, reports[END_S].text
@@ -120,7 +120,7 @@ def test_every_filter_leaves_a_liar_out(world: Any, name: str, filter_name: str)
     assert max(settled) < 1.0
     assert found[-1][1].status.rejected["gate"] > 0
     assert "track_lost" not in found[-1][1].status.rejected
-    assert reports[12.0].state is RsuState.ISOLATED
+    assert reports[12.0].state is RsuState.EXCLUDED
     assert re.search(words, reports[12.0].text), reports[12.0].text
 
 
@@ -134,7 +134,7 @@ def test_a_network_whose_fixes_are_off(world: Any, filter_name: str) -> None:
     drift = Field.POSITION
     _, found, reports = drive(world, moved, drift, START_S, 99.0, 1, 16.0, **config)
     assert max(error for error, o in found if o.status.stamp_ns > T0 + 2 * 10**9) < 1.5
-    assert reports[16.0].state is RsuState.ISOLATED
+    assert reports[16.0].state is RsuState.EXCLUDED
 
 
 @pytest.mark.parametrize("name", ["range", "azimuth", "clock"])
@@ -147,6 +147,6 @@ def test_a_lie_from_the_start(world: Any, name: str, seed: int) -> None:
     assert first_s < 3.5
     settled = [error for error, o in found if o.status.stamp_ns > T0 + 6 * 10**9]
     assert max(settled) < 1.0
-    assert reports[16.0].state is RsuState.ISOLATED
+    assert reports[16.0].state is RsuState.EXCLUDED
     assert re.search(words, reports[16.0].text), reports[16.0].text
     assert "track_lost" not in found[-1][1].status.rejected

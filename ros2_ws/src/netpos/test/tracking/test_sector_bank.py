@@ -24,7 +24,7 @@ from netpos.filters.sigma import innovation_cov, regress
 from netpos.messages.values import Array
 from netpos.tracking import TrackerConfig, sector_bank
 from netpos.tracking.models import options_of, pose_state
-from netpos.tracking.sectors import Sectors, phase_place, sectors_of
+from netpos.tracking.sectors import PhaseAmbiguityBank, phase_place, sectors_of
 from scipy.special import logsumexp
 
 
@@ -57,7 +57,7 @@ def test_probabilities_are_those_of_the_posterior(seed: int, heading: float) -> 
     for name in ("srukf", "ukf", "iekf"):
         config = TrackerConfig(filter=name, accel_density_mps2_sqrthz=1e-4)
         start = pose_state(config, np.zeros(2), np.eye(2))
-        bank = Sectors.begin(config, T0, rows_at(walk, 0, 1e-3), 1, start)
+        bank = PhaseAmbiguityBank.begin(config, T0, rows_at(walk, 0, 1e-3), 1, start)
         assert bank is not None
         middle = len(bank.probabilities) // 2
         for k in range(1, 6):
@@ -74,7 +74,7 @@ def test_a_copy_goes_its_own_way() -> None:
     walk = Walk(np.array([0.8, 4.5]), 0.3, 0.6, 1)
     config = TrackerConfig(**CONFIG)
     start = pose_state(config, np.zeros(2), np.eye(2))
-    bank = Sectors.begin(config, T0, rows_at(walk, 0, 0.05), 1, start)
+    bank = PhaseAmbiguityBank.begin(config, T0, rows_at(walk, 0, 0.05), 1, start)
     assert bank is not None
     twin = bank.copy()
     mean, weights = bank.mean.copy(), bank.probabilities.copy()

@@ -17,7 +17,7 @@ from netpos.messages.values import Array
 from netpos.tracking import TrackerConfig, engine, sector_bank
 from netpos.tracking.engine import GATE_SIZE
 from netpos.tracking.models import motions_of, options_of
-from netpos.tracking.phase_fix import place, spawn
+from netpos.tracking.phase_fix import init_hypothesis, place
 from netpos.tracking.sector_bank import Bank, BankResult
 from scipy.special import logsumexp
 
@@ -65,7 +65,7 @@ def test_weights_follow_the_likelihood_and_outliers_decide_nothing() -> None:
         expected[s] = informed(x, P, z[0], H[0])
     accepted, nis, used = np.full((3, 3), 9.0), np.full(3, 9.0), np.full(3, 9.0)
     bank, result = Bank(means, covs, weights), BankResult(accepted, nis, used)
-    sector_bank.weigh(bank, rows, options, result, ekf.workspace(6, len(rows)))
+    sector_bank.update(bank, rows, options, result, ekf.workspace(6, len(rows)))
     np.testing.assert_allclose(weights[1:], (logs - logsumexp(logs))[1:], rtol=1e-7, atol=1e-9)
     assert weights[0] == -math.inf
     assert accepted.tolist() == [[9.0] * 3, [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
@@ -76,8 +76,8 @@ def test_weights_follow_the_likelihood_and_outliers_decide_nothing() -> None:
         np.testing.assert_allclose(covs[s], expected[s][1], rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("jump_sd", [0.0, 3.0])
-def test_all_filters_that_are_there_move(jump_sd: float) -> None:
+@pytest.mark.parametrize("velocity_step_sd", [0.0, 3.0])
+def test_all_filters_that_are_there_move(velocity_step_sd: float) -> None:
     config, rng = TrackerConfig(**FIXED), np.random.default_rng(1)
     motion, options = motions_of(config)[0], options_of(config)
     means, covs = rng.normal(size=(3, 6)), np.array([np.eye(6) * k for k in (1.0, 2.0, 3.0)])
@@ -85,9 +85,9 @@ def test_all_filters_that_are_there_move(jump_sd: float) -> None:
     expected, spread = means.copy(), covs.copy()
     for s in (0, 2):
         ekf.predict(expected[s], spread[s], 0.2, motion, NO_BIAS)
-        spread[s] = opened(spread[s], jump_sd, 1.7)
+        spread[s] = opened(spread[s], velocity_step_sd, 1.7)
     bank = Bank(means, covs, weights)
-    sector_bank.advance(bank, 0.2, jump_sd, 1.7, motion, NO_BIAS, options)
+    sector_bank.advance(bank, 0.2, velocity_step_sd, 1.7, motion, NO_BIAS, options)
     np.testing.assert_allclose(means, expected, rtol=1e-12)
     np.testing.assert_allclose(covs, spread, rtol=1e-12, atol=1e-14)
 
@@ -127,7 +127,7 @@ class Epoch:
         self.cov = np.diag([sd, sd, 0.1, 0.1, 1.0, 1.0]) ** 2
         self.means, self.covs = np.full((SLOTS, 6), np.nan), np.full((SLOTS, 6, 6), np.nan)
         self.means[self.home] = self.prior
-        self.covs[self.home] = engine.to_spread(self.cov, self.options)
+        self.covs[self.home] = engine.to_cov_or_sqrt(self.cov, self.options)
         self.weights = np.full(SLOTS, -math.inf)
         self.weights[self.home] = 0.0
         self.heirs = np.full(SLOTS, 9, dtype=np.int64)
@@ -149,7 +149,7 @@ class Epoch:
     def placed(self, slot: int) -> tuple[Array, Array] | None:
         """A filter put where range and phase say, then told the velocity."""
         mean, cov, rows = self.prior.copy(), self.cov.copy(), self.turned(slot)
-        if spawn(mean, cov, rows[0], rows[1], 0, 1.5, self.height_m) == -math.inf:
+        if init_hypothesis(mean, cov, rows[0], rows[1], 0, 1.5, self.height_m) == -math.inf:
             return None
         H = np.eye(2, 6, k=2) / 0.05
         return informed(mean, cov, self.walk.velocity / 0.05, H)
@@ -258,7 +258,7 @@ def test_who_is_placed_anew_may_refuse_the_rest(alone: bool) -> None:
     epoch.resolve()
     slot, rows = epoch.leader - 1, epoch.turned(epoch.leader - 1)
     mean, cov = epoch.prior.copy(), epoch.cov.copy()
-    assert math.isfinite(spawn(mean, cov, rows[0], rows[1], 0, 1.5, 0.0))
+    assert math.isfinite(init_hypothesis(mean, cov, rows[0], rows[1], 0, 1.5, 0.0))
     np.testing.assert_array_equal(epoch.means[slot], mean)
     np.testing.assert_array_equal(epoch.covs[slot], cov)
     for s in (slot, epoch.leader):
@@ -272,7 +272,7 @@ def test_the_whole_bank_has_the_moments_of_its_filters(name: str) -> None:
     away, A = rng.integers(-9, 10, size=(3, 6)) / 8.0, rng.normal(size=(3, 6, 6))
     means = away + np.array([500_000.0, 6_600_000.0, 0.0, 0.0, 0.0, 0.0])
     covs, share = A @ A.transpose(0, 2, 1) + np.eye(6), np.array([0.3, 0.0, 0.7])
-    spreads = np.array([engine.to_spread(P, options) for P in covs])
+    spreads = np.array([engine.to_cov_or_sqrt(P, options) for P in covs])
     means[1], spreads[1] = np.nan, np.nan
     weights = np.array([math.log(0.3), -math.inf, math.log(0.7)])
     mean, cov = sector_bank.combine(Bank(means, spreads, weights), options)

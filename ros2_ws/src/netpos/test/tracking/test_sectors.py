@@ -35,7 +35,7 @@ from netpos.messages.values import (
 )
 from netpos.tracking import Tracker, TrackerConfig, TrackOutput
 from netpos.tracking.models import pose_state
-from netpos.tracking.sectors import Sectors
+from netpos.tracking.sectors import PhaseAmbiguityBank
 
 
 def test_ambiguous_until_the_evidence_decides() -> None:
@@ -146,7 +146,9 @@ def test_half_a_wavelength_needs_no_decision() -> None:
     measured = walk.measured(0)
     measured.phase_difference_rad = math.pi * sine
     rows = rsu_rows(measured, info, rsu_axes(info), 0)
-    bank = Sectors.begin(config, T0, rows, 1, pose_state(config, np.zeros(2), np.eye(2)))
+    bank = PhaseAmbiguityBank.begin(
+        config, T0, rows, 1, pose_state(config, np.zeros(2), np.eye(2))
+    )
     assert bank is not None
     assert bank.decided
     assert np.hypot(*(bank.mean[POSITION] - xy[0])) < 0.1

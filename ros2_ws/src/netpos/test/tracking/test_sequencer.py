@@ -340,7 +340,7 @@ def test_an_initial_pose_that_is_needed_is_waited_for(pose_first: bool) -> None:
     second = 1_000_000_000
     measured = RsuMeasurement(stamp_ns=second, rsu_id="a", vue_id="v", expected=1)
     pose = InitialPose(stamp_ns=second, vue_id="v", position=np.zeros(3), cov=np.eye(3))
-    sequencer = Sequencer(hold_ns=second // 4, needs_pose=True)
+    sequencer = Sequencer(max_delay_ns=second // 4, needs_pose=True)
     epochs = []
     for item in (pose, measured) if pose_first else (measured, pose):
         assert sequencer.add(item) is None
@@ -350,7 +350,7 @@ def test_an_initial_pose_that_is_needed_is_waited_for(pose_first: bool) -> None:
 
 
 def test_an_initial_pose_is_not_waited_for_longer_than_hold() -> None:
-    sequencer = Sequencer(hold_ns=100, needs_pose=True)
+    sequencer = Sequencer(max_delay_ns=100, needs_pose=True)
     for stamp_ns in (1000, 1099):
         item = RsuMeasurement(stamp_ns=stamp_ns, rsu_id="a", vue_id="v", expected=1)
         assert sequencer.add(item) is None
@@ -374,7 +374,7 @@ def test_applied_epochs_are_forgotten_after_the_history() -> None:
 
 def test_ticks_are_epochs_once_an_rsu_was_heard_and_wait_for_it() -> None:
     """Every 20 ms of IMU, held for an RSU that measures once a second, 0.1 s late."""
-    sequencer = Sequencer(hold_ns=500_000_000, history_ns=0, tick_ns=20_000_000)
+    sequencer = Sequencer(max_delay_ns=500_000_000, history_ns=0, tick_ns=20_000_000)
     second, released = 1_000_000_000, []
     for k in range(100, 310):
         stamp = k * 10_000_000

@@ -124,8 +124,8 @@ def test_a_gap_inflates_the_covariance_and_no_more(world: Any, name: str) -> Non
         assert np.isfinite(ahead.mean).all()
         assert ahead.cov[X.PX, X.PX] > before[0, 0]
         # white acceleration, a lost velocity, no more than a turning, braking car could do
-        grown = math.sqrt(ahead.cov[X.PX, X.PX])
-        assert 0.1 < grown < 40.0 * gap_s**1.5 + 1.0
+        augmented = math.sqrt(ahead.cov[X.PX, X.PX])
+        assert 0.1 < augmented < 40.0 * gap_s**1.5 + 1.0
         (output,) = [
             *fed(tracker, world.measure(1.9 + gap_s, truth(1.9))),
             *tracker.flush(),

@@ -16,7 +16,7 @@ from netpos.scenario import Simulation, load_scenario
 from netpos.tracking import Tracker, TrackerConfig, TrackOutput
 from netpos.tracking.health import RsuState
 from netpos.tracking.rsus import Rsu
-from netpos.tracking.strapdown_rows import batch_in_space
+from netpos.tracking.strapdown_rows import epoch_rows_3d
 from netpos.tracking.strapdown_start import sound_fix
 
 NS = 1_000_000_000
@@ -182,10 +182,10 @@ def test_a_lying_rsu_is_named_isolated_and_trusted_again() -> None:
     half = [bent(i) for i in items if i.stamp_ns < start + 45 * NS]
     outputs, tracker = run(simulation, half)
     report = {r.rsu_id: r for r in tracker.rsu_reports()}[liar]
-    assert report.state is RsuState.ISOLATED
+    assert report.state is RsuState.EXCLUDED
     assert re.search(r"range late by (29|30|31)\.\d m", report.text)
     assert outputs[-1].status.rejected["isolated_rsu"] > 20
-    assert all(r.state is not RsuState.ISOLATED or r.rsu_id == liar for r in tracker.rsu_reports())
+    assert all(r.state is not RsuState.EXCLUDED or r.rsu_id == liar for r in tracker.rsu_reports())
     assert np.abs(errors(simulation, outputs)[-30:]).max() < 1.5
     whole, tracker = run(simulation, map(bent, items))
     assert {r.rsu_id: r for r in tracker.rsu_reports()}[liar].state is RsuState.OK
@@ -249,7 +249,7 @@ def test_without_a_single_culprit_the_fix_says_less() -> None:
 
     def fix(lies: dict[int, float]) -> tuple[Array, Array]:
         bent = [replace(m, range_m=m.range_m + lies.get(i, 0.0)) for i, m in enumerate(measured)]
-        found = sound_fix(batch_in_space(bent, known, None).rows, 1.5)
+        found = sound_fix(epoch_rows_3d(bent, known, None).rows, 1.5)
         assert found is not None
         return found
 

@@ -102,7 +102,7 @@ class Setup:
         simulation = self.simulation.with_seed(seed)
         mean, cov = self._start(simulation)
         heard, epochs = self._epochs(simulation)
-        prior = self._follower.grown(mean, cov, epochs.bias)[1]
+        prior = self._follower.augmented(mean, cov, epochs.bias)[1]
         truth = _truth(simulation.beacons(VUE), heard, len(prior))
         if self._experiment.start_drawn:
             mean = np.random.default_rng([seed, 1]).multivariate_normal(truth[0, :N_CORE], cov)

@@ -1,4 +1,4 @@
-"""What ``tracking.track`` reports of a whole run, at once: estimates or their rivals, and
+"""What ``tracking.track`` reports of a whole run, at once: estimates or their hypotheses, and
 protection levels."""
 
 from __future__ import annotations
@@ -15,6 +15,12 @@ from netpos.filters.motion import Parameter
 from netpos.filters.state import X
 from netpos.messages.values import Array
 from netpos.tracking.engine import GATE_SIZE, Epochs, FilterOptions, Run
+from netpos.tracking.manoeuvre_hypotheses import (
+    SELECTED,
+    hypothesis_level,
+    is_needed,
+    no_hypotheses,
+)
 from netpos.tracking.protection import (
     FusedEpoch,
     gaussian_radius,
@@ -22,7 +28,6 @@ from netpos.tracking.protection import (
     level_scratch,
     radius_limit,
 )
-from netpos.tracking.rivals import LEADER, matter, no_rivals, rival_level
 
 _WINDOW, _TAIL = 50, 1e-3  # of ``NisWindow``
 _BOUND = np.append(0.0, chdtri(np.arange(1.0, 64.0 * _WINDOW), _TAIL))
@@ -59,34 +64,36 @@ def _allow_for_manoeuvres(
     options: FilterOptions,
     level: Array,
 ) -> tuple[Array, Array]:
-    """Fill ``level`` (N,) with those of a manoeuvre nobody has noticed, rivals of the estimate
+    """Fill ``level`` (N,) with those of a manoeuvre nobody has noticed, hypotheses of the estimate
     included; means and covariances reported."""
     stamps_ns, row_start, rows = epochs
     means, covs, nis, dof, groups = run
     told_means, told_covs, led = means, covs, False
     x, P, motion = means[0].copy(), covs[0].copy(), motions[0].copy()
     scratch = level_scratch(x.size, np.diff(row_start).max())
-    heard_ns, accepted, rivals = stamps_ns[0], np.ones(GATE_SIZE), no_rivals(x.size, stamps_ns[0])
+    heard_ns, accepted = stamps_ns[0], np.ones(GATE_SIZE)
+    hypotheses = no_hypotheses(x.size, stamps_ns[0])
     for k in range(level.size):
         if k > 0:
             dt = (stamps_ns[k] - stamps_ns[k - 1]) * 1e-9
             unheard_s = (stamps_ns[k] - heard_ns) * 1e-9
             x[:], P[:], motion[:] = means[k - 1], covs[k - 1], motions[min(k, len(motions) - 1)]
-            motion[Parameter.JUMP_SPEED] = 0.0
+            motion[Parameter.VELOCITY_STEP_SD] = 0.0
             ekf.predict(x, P, dt, motion, bias)
             accepted[:] = 1.0 if groups[k] > 0 else 0.0
             own = rows[row_start[k] : row_start[k + 1]]
             epoch = FusedEpoch(x, P, own, accepted, unheard_s, means[k], nis[k], int(dof[k]))
             level[k] = level_in(epoch, options, scratch)
-            if matter(stamps_ns[k], epoch, rivals):
-                level[k] = rival_level(
-                    level[k], stamps_ns[k], dt, epoch, motion, bias, options, rivals
+            if is_needed(stamps_ns[k], epoch, hypotheses):
+                level[k] = hypothesis_level(
+                    level[k], stamps_ns[k], dt, epoch, motion, bias, options, hypotheses
                 )
-                leader = rivals.marks[LEADER]
-                if leader >= 0:
+                selected = hypotheses.marks[SELECTED]
+                if selected >= 0:
                     if not led:
                         told_means, told_covs, led = means.copy(), covs.copy(), True
-                    told_means[k], told_covs[k] = rivals.means[leader], rivals.covs[leader]
+                    told_means[k] = hypotheses.means[selected]
+                    told_covs[k] = hypotheses.covs[selected]
             if groups[k] == 0:
                 level[k] += options.manoeuvre_speed_sd * unheard_s
         if groups[k] > 0:

@@ -24,9 +24,9 @@ from netpos.radio.noise import generator
 from netpos.scenario.networks import fix_errors
 from netpos.scenario.schema import NS
 from netpos.tracking import estimates
-from netpos.tracking.batch import batch_of
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.engine import Epochs, Run, run_epochs
+from netpos.tracking.epoch_rows import epoch_rows_of
 from netpos.tracking.models import motions_of, options_of
 from netpos.tracking.networks.common_instant import TRACK_STATES, at_common_instant, step_matrices
 from netpos.tracking.networks.secondary import OwnNoise, Secondary
@@ -87,7 +87,7 @@ def position_rows(fixes: Array, sd_m: Array) -> Array:
         position=np.ones(3),
         position_cov=np.eye(3),
     )
-    template = batch_of([probe], {"fix": info}, None, -1).rows
+    template = epoch_rows_of([probe], {"fix": info}, None, -1).rows
     rows = np.tile(template, (len(fixes), 1)).reshape(len(fixes), 2, ROW_WIDTH)
     rows[:, :, VALUE] *= fixes
     for column in (VARIANCE, GATE_VARIANCE):

@@ -31,12 +31,12 @@ from netpos.messages.values import Array
 from netpos.radio.noise import generator
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.schema import RectangleRoute
+from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimates import Estimate
-from netpos.tracking.phase_fix import TWO_PI, spawn
+from netpos.tracking.phase_fix import TWO_PI, init_hypothesis
 from netpos.tracking.phase_start import PhaseStart
-from netpos.tracking.sectors import Sectors
-from netpos.tracking.steadiness import Steadiness
+from netpos.tracking.sectors import PhaseAmbiguityBank
 
 Ints = npt.NDArray[np.int64]
 
@@ -134,19 +134,19 @@ class Setup:
         mean, cov = np.full((n, 6), np.nan), np.full((n, 6, 6), np.nan)
         decided, nis, dof = np.zeros(n, dtype=bool), np.zeros(n), np.zeros(n)
         start, estimate, rejected, last_ns = PhaseStart(self.config), None, 0, 0
-        steadiness = Steadiness(self.config)
+        process_noise = AdaptiveProcessNoise(self.config)
         wrong_s = self._case.trouble.wrong_s
         wrong_at = -1 if wrong_s is None else int(np.searchsorted(self.times_s, wrong_s))
         for k, stamp in enumerate(self.stamps_ns.tolist()):
             own = rows[k] if self.heard[k] else _alone(rows[k, 2:])
             velocity = reported(stamp, own[-2:])
-            density = steadiness.density(stamp, [velocity])
+            density = process_noise.density(stamp, [velocity])
             if estimate is None:
                 start.hear(velocity)
                 estimate = start.add(stamp, own, np.zeros(len(own)))
             else:
                 if density is not None:
-                    estimate.shake(density)
+                    estimate.set_process_noise(density)
                 if k == wrong_at:
                     estimate = _moved(self.config, estimate, own)
                 unheard_s = (stamp - last_ns) / NS
@@ -168,9 +168,9 @@ def _moved(config: TrackerConfig, estimate: Estimate, rows: Array) -> Estimate:
     turns = round(excess / TWO_PI)
     moving = slice(2, 4)
     velocity, velocity_cov = mean[moving].copy(), cov[moving, moving].copy()
-    spawn(mean, cov, rows[0], phase, turns + (1 if turns <= 0 else -1), speed, height_m)
+    init_hypothesis(mean, cov, rows[0], phase, turns + (1 if turns <= 0 else -1), speed, height_m)
     mean[moving], cov[moving, moving] = velocity, velocity_cov
-    return Sectors.promote(config, estimate.stamp_ns, mean, cov, rows, 1)
+    return PhaseAmbiguityBank.promote(config, estimate.stamp_ns, mean, cov, rows, 1)
 
 
 def _alone(rows: Array) -> Array:

@@ -26,9 +26,9 @@ from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.radio.anchor import uwb_wavelength_m
 from netpos.radio.noise import generator
 from netpos.scenario import load_scenario
+from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
 from netpos.tracking.models import pose_state
-from netpos.tracking.sectors import Sectors
-from netpos.tracking.steadiness import Steadiness
+from netpos.tracking.sectors import PhaseAmbiguityBank
 from netpos.tracking.step_heading import choose_sector
 from netpos.world.frames import quaternion_from_yaw
 
@@ -147,14 +147,14 @@ class Setup:
         right, decided = np.zeros(STEPS, dtype=bool), np.zeros(STEPS, dtype=bool)
         claimed = np.zeros(STEPS)
         first = pose_state(self.config, np.zeros(2), np.eye(2))
-        bank = Sectors.begin(self.config, NS, rows[0], 1, first)
+        bank = PhaseAmbiguityBank.begin(self.config, NS, rows[0], 1, first)
         assert bank is not None
-        steadiness = Steadiness(self.config)
+        process_noise = AdaptiveProcessNoise(self.config)
         for k in range(1, len(rows)):
             stamp_ns = NS + round(self.times_s[k] * NS)
-            density = steadiness.density(stamp_ns, [reported(stamp_ns, rows[k, 2:])])
+            density = process_noise.density(stamp_ns, [reported(stamp_ns, rows[k, 2:])])
             if density is not None:
-                bank.shake(density)
+                bank.set_process_noise(density)
             bank.step(stamp_ns, INTERVAL_S, 0, rows[k], NO_BIAS)
             s = int(step[k])  # the last epoch of the step stays
             right[s], decided[s] = bank.sector == turns[k], bank.decided

@@ -17,7 +17,7 @@ from netpos.tracking.config import TrackerConfig
 from netpos.tracking.engine import Run, run_epochs
 from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser
-from netpos.tracking.models import grown, initial_extra_sd, motions_of, options_of
+from netpos.tracking.models import augmented, initial_extra_sd, motions_of, options_of
 from netpos.tracking.rsus import Rsu
 
 Ints = npt.NDArray[np.int64]
@@ -92,9 +92,9 @@ class Follower:
         """Index of the first state of an RSU's slow error."""
         return N_CORE + self._extra_sd.size
 
-    def grown(self, mean: Array, cov: Array, bias: Array) -> tuple[Array, Array]:
+    def augmented(self, mean: Array, cov: Array, bias: Array) -> tuple[Array, Array]:
         """A start (6,), (6, 6) with the motion model's own states and the biases (2, k)."""
-        return grown(mean, cov, np.append(self._extra_sd, bias[0]))
+        return augmented(mean, cov, np.append(self._extra_sd, bias[0]))
 
     def follow(
         self, epochs: Epochs, mean: Array, cov: Array, samples: list[ImuSample] | None
@@ -136,7 +136,7 @@ class Follower:
 
     def _compiled(self, epochs: Epochs, mean: Array, cov: Array, run: Run) -> int:
         """Epochs done: all in one kernel."""
-        mean, cov = self.grown(mean, cov, epochs.bias)
+        mean, cov = self.augmented(mean, cov, epochs.bias)
         done: int = run_epochs(
             epochs.measured, mean, cov, self._motions[0], epochs.bias, self._options, run
         )
@@ -157,22 +157,22 @@ class Follower:
         config, first = self._config, self.first_bias
         sd = np.append(self._extra_sd, epochs.bias[0])
         heard_ns, rejected, known = int(epochs.stamps_ns[0]), 0, first
-        estimate = estimates.start(config, heard_ns, *grown(mean, cov, self._extra_sd))
+        estimate = estimates.start(config, heard_ns, *augmented(mean, cov, self._extra_sd))
         for k, stamp in enumerate(epochs.stamps_ns.tolist()):
             rows = epochs.rows[epochs.row_start[k] : epochs.row_start[k + 1]].copy()
             if rows.size:
                 known = max(known, int(rows[:, BIAS].max()) + 1)
-                estimate.grow(sd[: known - N_CORE])
+                estimate.augment(sd[: known - N_CORE])
                 if imu is not None:
                     yaw, speed, _ = imu.increments(estimate.stamp_ns, stamp)
-                    estimate.drive(yaw, speed, config.gyro_noise_density)
+                    estimate.set_imu_increment(yaw, speed, config.gyro_noise_density)
                 unheard_s, bias = (stamp - heard_ns) / NS, epochs.bias[:, : known - first].copy()
                 step = estimate.step(stamp, unheard_s, rejected, rows, bias)
                 run.nis[k], run.dof[k], taken = step
                 run.groups[k] = taken.sum()
                 rejected = 0 if 2 * taken.sum() >= taken.size else rejected + 1
                 heard_ns = stamp if run.dof[k] else heard_ns
-            run.means[k], run.covs[k] = grown(estimate.mean, estimate.cov, sd)
+            run.means[k], run.covs[k] = augmented(estimate.mean, estimate.cov, sd)
             if imu is not None:
                 motions[k] = estimate.motion
             if rejected >= config.max_rejected_epochs:

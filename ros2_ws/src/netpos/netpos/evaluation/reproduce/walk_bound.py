@@ -38,7 +38,7 @@ def known_instants_rmse_m(setup: Setup, from_s: float, every_step: bool = False)
             blocks.append(own)
             starts[place + 1] = len(own)
         else:
-            motions[place, Parameter.JUMP_SPEED] = _FREE_MPS
+            motions[place, Parameter.VELOCITY_STEP_SD] = _FREE_MPS
     for axis in range(2):
         truth[:, axis] = np.interp(times[order], setup.times_s, setup.truth[:, axis])
     config = setup.config

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from netpos.filters import kf
-from netpos.filters.motion import Parameter, add_jump, transition
+from netpos.filters.motion import Parameter, add_velocity_step, transition
 from netpos.messages.values import Array, NetworkTrack
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimates import Estimate
@@ -70,8 +70,12 @@ class Secondary:
         mean, cov = estimate.prior[0].copy(), estimate.prior[1].copy()
         share = np.zeros_like(cov) if own is None else own.at(estimate, bias)
         motion = estimate.motion
-        jump = Parameter.JUMP_SPEED, Parameter.JUMP_TIME, Parameter.JUMP_SPREAD
-        add_jump(*(motion[part] for part in jump), cov)
+        add_velocity_step(
+            motion[Parameter.VELOCITY_STEP_SD],
+            motion[Parameter.VELOCITY_STEP_AGE],
+            motion[Parameter.VELOCITY_STEP_POSITION_SD],
+            cov,
+        )
         options, accepted = self._options, np.zeros(len(rows))
         floor, gate, height_m = options.gain_floor, options.gate_nis, options.height_m
         kf.update_shared(mean, cov, rows, height_m, gate, accepted, floor, share)

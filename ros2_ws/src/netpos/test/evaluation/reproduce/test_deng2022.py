@@ -76,7 +76,7 @@ def test_attitude_errors_are_small_rotations(blocked: Run) -> None:
 
 
 def test_couplings_stand_in_their_order(tally: dict[str, Tally]) -> None:
-    """Single epochs, then the filter, then what vehicles do not do."""
+    """KalmanEstimate epochs, then the filter, then what vehicles do not do."""
     plane = {name: np.hypot(*t.rms_m[:2]) for name, t in tally.items()}
     loose, tight = {LOOSE, LOOSE_DIAGONAL, LOOSE_FIXED}, {TIGHT, VEHICLE, DEFAULT, DEFAULT_VEHICLE}
     assert set(tally) == {FIX, FIX_HEIGHT} | loose | tight

@@ -7,15 +7,15 @@ from dataclasses import dataclass, field
 from netpos.filters.measurement import BLOCKED, GROUP, KIND, Kind
 from netpos.filters.robust import update_prior
 from netpos.messages.values import RsuMeasurement
-from netpos.tracking.batch import Batch
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.epoch_rows import EpochRows
 
 _LATE = (Kind.TOA, Kind.RANGE)
 _STRENGTH = 10.0  # measurements the configured share counts for
 
 
 @dataclass(slots=True)
-class Blockage:
+class NlosRate:
     """Beta distribution (alpha, beta) of the share of blocked paths per RSU, that of the
     configuration where nothing was heard yet."""
 
@@ -24,30 +24,30 @@ class Blockage:
     _shares: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, config: TrackerConfig) -> Blockage:
+    def of(cls, config: TrackerConfig) -> NlosRate:
         """With nothing learned."""
         return cls(config.nlos_probability, config.nlos_memory)
 
-    def copy(self) -> Blockage:
+    def copy(self) -> NlosRate:
         """An independent copy."""
-        return Blockage(self.probability, self.memory, self._shares.copy())
+        return NlosRate(self.probability, self.memory, self._shares.copy())
 
     def share(self, rsu_id: str) -> float:
         """Mean share of blocked paths."""
         alpha, beta = self._share(rsu_id)
         return alpha / (alpha + beta)
 
-    def expect(self, batch: Batch) -> None:
+    def expect(self, epoch_rows: EpochRows) -> None:
         """Write each RSU's share into its rows, for the filter to start from."""
-        for row, rsu_id in self._late(batch):
-            batch.rows[row, BLOCKED] = self.share(rsu_id)
+        for row, rsu_id in self._late(epoch_rows):
+            epoch_rows.rows[row, BLOCKED] = self.share(rsu_id)
 
-    def learn(self, batch: Batch) -> None:
+    def learn(self, epoch_rows: EpochRows) -> None:
         """Take over what the filter made of the rows."""
-        for row, rsu_id in self._late(batch):
+        for row, rsu_id in self._late(epoch_rows):
             self._shares[rsu_id] = update_prior(
                 *self._share(rsu_id),
-                batch.rows[row, BLOCKED],
+                epoch_rows.rows[row, BLOCKED],
                 1.0 - 1.0 / self.memory,
                 *self._prior,
             )
@@ -59,13 +59,13 @@ class Blockage:
     def _share(self, rsu_id: str) -> tuple[float, float]:
         return self._shares.get(rsu_id, self._prior)
 
-    def _late(self, batch: Batch) -> list[tuple[int, str]]:
+    def _late(self, epoch_rows: EpochRows) -> list[tuple[int, str]]:
         """Rows that a blocked path makes late, and their RSUs; none where the option is off."""
         if self.probability == 0.0:
             return []
-        sources = [batch.items[int(group)] for group in batch.rows[:, GROUP]]
+        sources = [epoch_rows.items[int(group)] for group in epoch_rows.rows[:, GROUP]]
         return [
             (i, source.rsu_id)
             for i, source in enumerate(sources)
-            if isinstance(source, RsuMeasurement) and int(batch.rows[i, KIND]) in _LATE
+            if isinstance(source, RsuMeasurement) and int(epoch_rows.rows[i, KIND]) in _LATE
         ]

@@ -8,20 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 from netpos.messages.values import Velocity
+from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.steadiness import Steadiness
 
 NS = 1_000_000_000
 FREE, STEADY = 1.0, 0.1
 
 
-def steadiness(**settings: Any) -> Steadiness:
+def process_noise(**settings: Any) -> AdaptiveProcessNoise:
     given = {
         "accel_density_mps2_sqrthz": FREE,
         "steady_accel_density_mps2_sqrthz": STEADY,
         "gate_probability": 0.9999,
     }
-    return Steadiness(TrackerConfig(**{**given, **settings}))
+    return AdaptiveProcessNoise(TrackerConfig(**{**given, **settings}))
 
 
 def report(time_s: float, vx: float, sd: float = 0.05, source: str = "step_velocity") -> Velocity:
@@ -34,7 +34,7 @@ def report(time_s: float, vx: float, sd: float = 0.05, source: str = "step_veloc
     )
 
 
-def after(walk: Steadiness, *reports: Velocity) -> float:
+def after(walk: AdaptiveProcessNoise, *reports: Velocity) -> float:
     found = 0.0
     for item in reports:
         density = walk.density(item.stamp_ns, [item])
@@ -44,27 +44,27 @@ def after(walk: Steadiness, *reports: Velocity) -> float:
 
 
 def test_equal_steps_are_as_steady_as_they_are_known() -> None:
-    found = after(steadiness(), report(1.0, 1.0), report(1.1, 1.0), report(1.2, 1.05))
+    found = after(process_noise(), report(1.0, 1.0), report(1.1, 1.0), report(1.2, 1.05))
     assert found == pytest.approx(math.hypot(STEADY, 0.05))
-    found = after(steadiness(), report(1.0, 1.0, 0.4), report(1.1, 1.0, 0.3))
+    found = after(process_noise(), report(1.0, 1.0, 0.4), report(1.1, 1.0, 0.3))
     assert found == pytest.approx(math.hypot(STEADY, 0.3))
 
 
 def test_an_unknown_velocity_is_as_free_as_any() -> None:
-    assert after(steadiness(), report(1.0, 0.0, 2.0)) == FREE
+    assert after(process_noise(), report(1.0, 0.0, 2.0)) == FREE
 
 
 def test_what_was_said_lasts_a_second() -> None:
-    walk = steadiness()
+    walk = process_noise()
     after(walk, report(1.0, 1.0))
     assert walk.density(2 * NS) == pytest.approx(math.hypot(STEADY, 0.05))
     assert walk.density(2 * NS + 1) == FREE
-    assert steadiness().density(NS) == FREE
+    assert process_noise().density(NS) == FREE
 
 
 def test_a_change_beyond_the_errors_is_a_jump_at_some_time_since() -> None:
     """The variance of a velocity step of random sign and instant, over one interval."""
-    found = after(steadiness(), report(1.0, 0.0), report(1.2, 1.0))
+    found = after(process_noise(), report(1.0, 0.0), report(1.2, 1.0))
     assert found**2 * 0.2 == pytest.approx(1.0 / 2.0 + 0.2 * (STEADY**2 + 0.05**2))
 
 
@@ -72,21 +72,21 @@ def test_a_change_beyond_the_errors_is_a_jump_at_some_time_since() -> None:
 def test_errors_explain_what_the_gate_accepts(distance2: float, opens: bool) -> None:
     """chi2(0.9999, 2 dof) = 18.42; the sum of both covariances counts."""
     change = math.sqrt(distance2 * (0.05**2 + 0.12**2))
-    found = after(steadiness(), report(1.0, 0.0, 0.12), report(1.1, change))
+    found = after(process_noise(), report(1.0, 0.0, 0.12), report(1.1, change))
     assert (found > 1.5 * math.hypot(STEADY, 0.05)) is opens
 
 
 def test_sources_are_compared_with_themselves() -> None:
-    walk = steadiness()
+    walk = process_noise()
     after(walk, report(1.0, 1.0), report(1.05, 0.0, source="other"), report(1.1, 1.0))
     assert walk.density(round(1.1 * NS)) == pytest.approx(math.hypot(STEADY, 0.05))
     assert after(walk, report(1.2, 1.0, source="other")) > 1.0
 
 
 def test_off_or_with_an_imu_the_motion_model_has_its_own() -> None:
-    off = steadiness(steady_accel_density_mps2_sqrthz=0.0)
+    off = process_noise(steady_accel_density_mps2_sqrthz=0.0)
     assert off.density(NS, [report(1.0, 1.0)]) is None
-    driven = steadiness(motion_model="inertial")
+    driven = process_noise(motion_model="inertial")
     assert driven.density(NS, [report(1.0, 1.0)]) is None
 
 
@@ -101,11 +101,11 @@ def test_off_or_with_an_imu_the_motion_model_has_its_own() -> None:
 )
 def test_models_without_one_white_acceleration_are_refused(settings: dict[str, str]) -> None:
     with pytest.raises(ValueError, match="steady_accel_density_mps2_sqrthz needs"):
-        steadiness(**settings)
+        process_noise(**settings)
 
 
 def test_a_copy_goes_its_own_way() -> None:
-    walk = steadiness()
+    walk = process_noise()
     after(walk, report(1.0, 0.0))
     twin = walk.copy()
     after(twin, report(1.1, 1.0))

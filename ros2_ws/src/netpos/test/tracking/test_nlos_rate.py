@@ -11,8 +11,8 @@ from netpos.filters.measurement import BLOCKED, KIND, Kind
 from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Field, RsuInfo, RsuMeasurement
 from netpos.tracking import TrackerConfig
-from netpos.tracking.batch import Batch
-from netpos.tracking.blockage import Blockage
+from netpos.tracking.epoch_rows import EpochRows
+from netpos.tracking.nlos_rate import NlosRate
 from scipy.constants import speed_of_light
 
 STANDING = np.array([40.0, 2.0, 0.0, 0.0, 0.0, 0.0])
@@ -25,7 +25,7 @@ NLOS = {
 }
 
 
-def _batch() -> Batch:
+def _epoch_rows() -> EpochRows:
     info = RsuInfo(rsu_id="a", position=np.zeros(3))
     m = RsuMeasurement(
         stamp_ns=1,
@@ -36,42 +36,42 @@ def _batch() -> Batch:
         range_m=5.0,
         range_var=0.01,
     )
-    return Batch(rsu_rows(m, info, rsu_axes(info), 0), (m,))
+    return EpochRows(rsu_rows(m, info, rsu_axes(info), 0), (m,))
 
 
 def test_share_is_the_mean_of_the_beta_distribution() -> None:
     """Three measurements written out: alpha' = f alpha + (1 - f) alpha0 + p, and the same of
     beta."""
-    blockage, batch = Blockage(0.2, 50.0), _batch()
+    nlos_rate, epoch_rows = NlosRate(0.2, 50.0), _epoch_rows()
     alpha, beta, f = 2.0, 8.0, 0.98
     for p in (0.9, 1.0, 0.1):
-        blockage.expect(batch)
-        late = batch.rows[:, KIND] == Kind.RANGE
-        assert batch.rows[late, BLOCKED] == pytest.approx(alpha / (alpha + beta))
-        assert batch.rows[~late, BLOCKED] == 0.0
-        batch.rows[late, BLOCKED] = p
-        blockage.learn(batch)
+        nlos_rate.expect(epoch_rows)
+        late = epoch_rows.rows[:, KIND] == Kind.RANGE
+        assert epoch_rows.rows[late, BLOCKED] == pytest.approx(alpha / (alpha + beta))
+        assert epoch_rows.rows[~late, BLOCKED] == 0.0
+        epoch_rows.rows[late, BLOCKED] = p
+        nlos_rate.learn(epoch_rows)
         alpha = f * alpha + (1 - f) * 2.0 + p
         beta = f * beta + (1 - f) * 8.0 + 1 - p
-        assert blockage.share("a") == pytest.approx(alpha / (alpha + beta))
-    assert blockage.share("b") == 0.2
+        assert nlos_rate.share("a") == pytest.approx(alpha / (alpha + beta))
+    assert nlos_rate.share("b") == 0.2
 
 
 def test_a_copy_learns_for_itself() -> None:
-    blockage, batch = Blockage(0.2, 50.0), _batch()
-    twin = blockage.copy()
-    batch.rows[:, BLOCKED] = 1.0
-    twin.learn(batch)
+    nlos_rate, epoch_rows = NlosRate(0.2, 50.0), _epoch_rows()
+    twin = nlos_rate.copy()
+    epoch_rows.rows[:, BLOCKED] = 1.0
+    twin.learn(epoch_rows)
     assert twin.share("a") > 0.2
-    assert blockage.share("a") == 0.2
+    assert nlos_rate.share("a") == 0.2
 
 
 def test_nothing_is_learned_where_the_option_is_off() -> None:
-    blockage, batch = Blockage.of(TrackerConfig()), _batch()
-    blockage.expect(batch)
-    assert (batch.rows[:, BLOCKED] == 0.0).all()
-    blockage.learn(batch)
-    assert blockage.share("a") == 0.0
+    nlos_rate, epoch_rows = NlosRate.of(TrackerConfig()), _epoch_rows()
+    nlos_rate.expect(epoch_rows)
+    assert (epoch_rows.rows[:, BLOCKED] == 0.0).all()
+    nlos_rate.learn(epoch_rows)
+    assert nlos_rate.share("a") == 0.0
 
 
 RSUS = {
@@ -103,7 +103,7 @@ def test_learning_beats_the_configured_share(world: Any, feed: Any) -> None:
             outputs = [o for items in epochs for o in feed(tracker, items)][50:]
             places = np.array([o.odometry.position[:2] for o in outputs])
             square[memory] += float(np.sum((places - STANDING[:2]) ** 2))
-        shares = {name: tracker._tracks["vue_1"]._state.blockage.share(name) for name in RSUS}
+        shares = {name: tracker._tracks["vue_1"]._state.nlos_rate.share(name) for name in RSUS}
         assert shares.pop("b") > 0.6
         assert max(shares.values()) < 0.1
     assert square[100.0] < 0.85 * square[1.0]
@@ -120,4 +120,4 @@ def test_late_measurements_end_in_the_same_estimate(world: Any, feed: Any) -> No
             feed(late, epochs[40][:1])
     first, second = (t._tracks["vue_1"]._state for t in (in_order, late))
     np.testing.assert_array_equal(first.estimate.mean, second.estimate.mean)
-    assert [first.blockage.share(n) for n in RSUS] == [second.blockage.share(n) for n in RSUS]
+    assert [first.nlos_rate.share(n) for n in RSUS] == [second.nlos_rate.share(n) for n in RSUS]

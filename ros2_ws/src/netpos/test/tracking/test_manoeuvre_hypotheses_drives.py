@@ -1,4 +1,4 @@
-"""Drives with turns that only rivals of the estimate tell of, and their kernels in a node."""
+"""Drives with turns that only hypotheses of the estimate tell of, and their kernels in a node."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from netpos.evaluation.reproduce import segments
 from netpos.evaluation.reproduce.experiment import Experiment, Setup
 from netpos.evaluation.reproduce.integrity import reported
 from netpos.messages.values import Array
-from netpos.tracking import rivals as rivals_module
+from netpos.tracking import manoeuvre_hypotheses as module
 from netpos.tracking import warm_up
 
 
@@ -18,7 +18,7 @@ from netpos.tracking import warm_up
 def test_a_turn_along_the_bearing_is_held_and_ended(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without rivals 238 and 597 errors are above the level: the estimate drifts off by 23 m,
+    """Without hypotheses 238 and 597 errors are above the level: the estimate drifts off by 23 m,
     sure of it to less than one."""
     changes = (("devices.0.beacon_interval_s", 100 * 167.3e-6), ("measurement.nearest", 1))
     alone: list[Array] = []
@@ -40,9 +40,9 @@ def test_a_turn_along_the_bearing_is_held_and_ended(
     assert np.nanmedian(level) < 5.0
 
 
-def test_the_warm_up_looks_for_rivals(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_warm_up_looks_for_hypotheses(monkeypatch: pytest.MonkeyPatch) -> None:
     """A kernel first needed afterwards would bring the compiler back."""
     asked = []
-    monkeypatch.setattr(rivals_module, "rival_level", lambda *args: asked.append(args) or 1.0)
-    warm_up._rivals()
+    monkeypatch.setattr(module, "hypothesis_level", lambda *args: asked.append(args) or 1.0)
+    warm_up._hypotheses()
     assert len(asked) == 1

@@ -22,7 +22,7 @@ _LASTS_S = 1.0  # a report holds for so long, and its error may build up within 
 
 
 @dataclass(slots=True)
-class Steadiness:
+class AdaptiveProcessNoise:
     """Turns reported velocities into the density of the white acceleration up to their stamp."""
 
     config: TrackerConfig
@@ -32,9 +32,9 @@ class Steadiness:
     def __post_init__(self) -> None:
         self._explained = float(gate_thresholds(self.config.gate_probability)[2])
 
-    def copy(self) -> Steadiness:
+    def copy(self) -> AdaptiveProcessNoise:
         """An independent copy."""
-        twin = Steadiness.__new__(Steadiness)
+        twin = AdaptiveProcessNoise.__new__(AdaptiveProcessNoise)
         twin.config, twin._explained, twin._last = self.config, self._explained, self._last.copy()
         return twin
 

@@ -19,7 +19,7 @@ _VELOCITY_H = np.eye(2, N_CORE, k=X.VX)
 
 
 @dataclass(slots=True)
-class Batch:
+class EpochRows:
     """Rows (m, ROW_WIDTH) of one epoch and, per group, the item they come from."""
 
     rows: Array
@@ -41,13 +41,13 @@ class Batch:
         return variance
 
 
-def batch_of(
+def epoch_rows_of(
     items: Sequence[Source],
     rsus: Mapping[str, Rsu],
     biases: BiasStates | None,
     heading: int,
     inflation: Mapping[str, float] | None = None,
-) -> Batch:
+) -> EpochRows:
     """Rows of the items, one group each; biases heard for the first time are added to ``biases``
     (None: rows without).
 
@@ -73,7 +73,7 @@ def batch_of(
             block = speed_row(item.speed_mps, item.speed_var, group)
         end += len(block)
         rows[first:end] = block
-    return Batch(rows[:end], tuple(items))
+    return EpochRows(rows[:end], tuple(items))
 
 
 def velocity_inflation(
@@ -92,11 +92,11 @@ def velocity_inflation(
     return factors
 
 
-def mostly_accepted(batch: Batch, accepted: Sequence[float]) -> bool:
+def mostly_accepted(epoch_rows: EpochRows, accepted: Sequence[float]) -> bool:
     """Whether at least half of the RSUs, or of all where there is none, were accepted."""
     votes = [
         bool(taken)
-        for item, taken in zip(batch.items, accepted, strict=True)
+        for item, taken in zip(epoch_rows.items, accepted, strict=True)
         if isinstance(item, RsuMeasurement)
     ] or [bool(taken) for taken in accepted]
     return 2 * sum(votes) >= len(votes)

@@ -9,27 +9,27 @@ from operator import attrgetter
 import numpy as np
 
 from netpos.messages.values import Array
-from netpos.tracking.blockage import Blockage
+from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
 from netpos.tracking.estimates import Estimate
 from netpos.tracking.initialise import Initialiser
+from netpos.tracking.manoeuvre_hypotheses import ManoeuvreHypotheses
 from netpos.tracking.networks.secondary import OwnNoise
+from netpos.tracking.nlos_rate import NlosRate
 from netpos.tracking.phase_start import PhaseStart
 from netpos.tracking.protection import NisWindow
-from netpos.tracking.rivals import Rivals
 from netpos.tracking.rsus import BiasStates
-from netpos.tracking.steadiness import Steadiness
 
 
 @dataclass(slots=True)
-class TrackMemory:
+class TrackSnapshot:
     """All of a track that changes with an epoch; unheard of until its first measurement."""
 
     biases: BiasStates
     initialiser: Initialiser
-    blockage: Blockage
+    nlos_rate: NlosRate
     phase_start: PhaseStart
-    steadiness: Steadiness
-    rivals: Rivals
+    process_noise: AdaptiveProcessNoise
+    hypotheses: ManoeuvreHypotheses
     segment: int = 0
     estimate: Estimate | None = None
     own: OwnNoise | None = None
@@ -39,28 +39,28 @@ class TrackMemory:
     yaw: float = 0.0
     has_clock: bool = False
     rejected_in_row: int = 0
-    unnoticed_m: float = 0.0
+    undetected_m: float = 0.0
     last_accepted_ns: int = 0
     velocity_ns: dict[str, int] = field(default_factory=dict)
     accepted: int = 0
     rejected: defaultdict[str, int] = field(default_factory=lambda: defaultdict(int))
 
-    def copy(self) -> TrackMemory:
+    def copy(self) -> TrackSnapshot:
         """An independent copy, for a track to go back to."""
-        twin = TrackMemory(*_values(self))
+        twin = TrackSnapshot(*_values(self))
         twin.biases = self.biases.copy()
-        twin.blockage = self.blockage.copy()
+        twin.nlos_rate = self.nlos_rate.copy()
         if self.estimate is None:
             twin.initialiser = self.initialiser.copy()
             twin.phase_start = self.phase_start.copy()
         else:
             twin.estimate = self.estimate.copy()
         twin.nis_window = self.nis_window.copy()
-        twin.rivals = self.rivals.copy()
+        twin.hypotheses = self.hypotheses.copy()
         twin.rejected = self.rejected.copy()
         twin.velocity_ns = self.velocity_ns.copy()
-        twin.steadiness = self.steadiness.copy()
+        twin.process_noise = self.process_noise.copy()
         return twin
 
 
-_values = attrgetter(*(entry.name for entry in fields(TrackMemory)))
+_values = attrgetter(*(entry.name for entry in fields(TrackSnapshot)))
