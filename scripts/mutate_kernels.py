@@ -60,7 +60,7 @@ TESTS_OF = {
     "tracking/output": "test_output.py",
     "tracking/phase_fix": "test_phase_fix.py",
     "tracking/protection": "test_protection.py",
-    "tracking/manoeuvre_hypotheses": "test_manoeuvre_hypotheses.py",
+    "tracking/components": "test_components.py",
     "tracking/sectors": "test_sector_bank.py -kwhere_a_phase",
     "tracking/sector_bank": "test_sector_bank_rules.py test_sector_bank.py",
     "ukf": "test_ukf.py test_gate.py",

@@ -1,24 +1,22 @@
 """A Gaussian mixture over one state, for a posterior that is not one Gaussian.
 
-A mixture is (means (K, n), covs (K, n, n), log_weights (K,)); the weights sum to one. An epoch
-updates each component as an extended Kalman filter does. A component that is too wide for the
-tangent of a range is split first: the likelihood of a range is a ring, and the ring is a sum of
-Gaussians along it, each short enough for the tangent to hold (Alspach and Sorenson 1972; along the
-direction of greatest curvature, Tuggle and Zanetti 2018). Components without weight are dropped;
-components that are alike become one by the bound of Runnalls 2007.
+A component that is too wide for the tangent of a range is split: the likelihood of a range is a
+ring, and the ring is a sum of Gaussians along it, each short enough for the tangent to hold
+(Alspach and Sorenson 1972; along the direction of greatest curvature, Tuggle and Zanetti 2018).
+Components without weight are dropped; components that are alike become one by the bound of
+Runnalls 2007.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from netpos.filters import ekf
 from netpos.filters.compile import kernel
 from netpos.filters.measurement import (
-    GROUP,
     KIND,
     LEVER,
     ORIGIN,
@@ -26,12 +24,9 @@ from netpos.filters.measurement import (
     Kind,
     curvature_variance,
     innovation_row,
-    innovation_variance,
 )
-from netpos.filters.motion import Parameter
 from netpos.messages.values import Array
 
-Mixture = tuple[Array, Array, Array]
 Ints = npt.NDArray[np.int64]
 
 _VELOCITY_END = 4  # position and velocity come first
@@ -40,13 +35,22 @@ _WIDE = 0.25
 # or where it reaches the RSU within so many sd; narrower components (m) never are.
 _REACH_SD, _NARROW_M = 3.0, 1.0
 _SPACING_SD = 1.2  # of Gaussians along a ring: their sum is flat to 1e-3 there
-_RING_MIN, _RING_MAX = 12, 128
+_RING_MIN, RING_MAX = 12, 128
 _OUTLIERS = 1e-2  # of all values; those of a range lie anywhere within
 _OUTLIER_RANGE_M = 100.0
 _LEAST_WEIGHT = 1e-8
 _COMPONENTS_MAX = 64
-_ALIKE = 2e-4  # divergence (Runnalls' bound) below which two components become one
+RING_MERGE_COST = 2e-4  # divergence (Runnalls' bound) that merging parts of a ring may cost
 _APART2 = 9.0  # squared Mahalanobis distance of means from which components are two modes
+
+
+class Mixture(NamedTuple):
+    """Components: means (K, n), covs (K, n, n), log_weights (K,), the weights of which sum to
+    one."""
+
+    means: Array
+    covs: Array
+    log_weights: Array
 
 
 @kernel
@@ -72,7 +76,7 @@ def _is_ranged(row: Array) -> bool:
 
 
 @kernel
-def _outlier_log(rows: Array) -> float:
+def outlier_log(rows: Array) -> float:
     """Log density of the values of one measurement that has nothing to do with the device."""
     total = math.log(_OUTLIERS)
     for i in range(rows.shape[0]):
@@ -116,50 +120,6 @@ def splits(rows: Array, mean: Array, cov: Array, height_m: float) -> bool:
 
 
 @kernel
-def will_split(
-    mean: Array, cov: Array, dt: float, motion: Array, bias: Array, rows: Array, height_m: float
-) -> bool:
-    """Whether one of ``rows`` finds the Gaussian too wide once it is moved by ``dt`` seconds;
-    arguments as for ``ekf.predict``, nothing is changed."""
-    moved, P, straight = mean.copy(), cov.copy(), motion.copy()
-    straight[Parameter.VELOCITY_STEP_SD] = 0.0
-    ekf.predict(moved, P, dt, straight, bias)
-    start = 0
-    while start < rows.shape[0]:
-        stop = start + 1
-        while stop < rows.shape[0] and rows[stop, GROUP] == rows[start, GROUP]:
-            stop += 1
-        if splits(rows[start:stop], moved, P, height_m):
-            return True
-        start = stop
-    return False
-
-
-@kernel
-def _update_component(
-    mean: Array, cov: Array, rows: Array, height_m: float, gate_nis: Array
-) -> tuple[float, float, bool]:
-    """Fuse one measurement's rows in place if the gate takes them: log likelihood (that of an
-    outlier if it does not), NIS, whether it was taken."""
-    n, m = mean.size, rows.shape[0]
-    H, innovation, variance = np.empty((m, n)), np.empty(m), np.empty(m)
-    for i in range(m):
-        innovation[i] = innovation_row(rows[i], mean, height_m, H[i])
-        variance[i] = rows[i, VARIANCE] + curvature_variance(rows[i], mean, cov, height_m)
-    S = H @ cov @ H.T
-    for i in range(m):
-        S[i, i] += variance[i]
-    nis = float(innovation @ np.linalg.solve(S, innovation))
-    if nis > gate_nis[min(m, gate_nis.size - 1)]:
-        return _outlier_log(rows), nis, False
-    start, log_likelihood = mean.copy(), 0.0
-    for i in range(m):
-        residual = innovation[i] - float(H[i] @ (mean - start))
-        log_likelihood += _fuse(mean, cov, H[i], residual, variance[i])
-    return log_likelihood, nis, True
-
-
-@kernel
 def split_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Mixture:
     """The product of the Gaussian ``mean`` (n,), ``cov`` (n, n) and the likelihood of a range or
     time of arrival: components along the ring, their log weights not normalised."""
@@ -173,7 +133,7 @@ def split_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Mi
     radius = math.sqrt(max(slant * slant - dz * dz, 0.25 * own, 1e-4))
     sd = math.sqrt(radius * math.sqrt(2.0 * _WIDE * own))  # whose second-order variance is own
     wanted = math.ceil(2.0 * math.pi * radius / (_SPACING_SD * sd))
-    count = int(min(max(wanted, _RING_MIN), _RING_MAX))
+    count = int(min(max(wanted, _RING_MIN), RING_MAX))
     arc = 2.0 * math.pi * radius / count
     sd = arc / _SPACING_SD
     means, covs, logs = np.empty((count, n)), np.empty((count, n, n)), np.empty(count)
@@ -188,14 +148,14 @@ def split_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Mi
         along[0], along[1] = -s, c
         residual = c * (at[1] - means[k, 1]) - s * (at[0] - means[k, 0])
         logs[k] += _fuse(means[k], covs[k], along, residual, sd * sd)
-    return means, covs, logs
+    return Mixture(means, covs, logs)
 
 
 @kernel
 def _log_det(cov: Array) -> float:
     """Log determinant of the covariance of position and velocity."""
     end = _VELOCITY_END
-    return float(2.0 * np.log(np.diag(np.linalg.cholesky(cov[:end, :end].copy()))).sum())
+    return float(np.linalg.slogdet(cov[:end, :end].copy())[1])
 
 
 @kernel
@@ -223,8 +183,10 @@ def _merge_cost(
 
 
 @kernel
-def reduced(means: Array, covs: Array, log_weights: Array) -> Mixture:
-    """The mixture normalised, without components of no weight, and with merged what is alike."""
+def reduced(components: Mixture, merge_cost: float) -> Mixture:
+    """The mixture normalised, without components of no weight; components are merged while that
+    costs at most ``merge_cost`` (Runnalls' bound of the divergence)."""
+    means, covs, log_weights = components
     top = log_weights.max()
     logs = log_weights - (top + math.log(np.exp(log_weights - top).sum()))
     kept = np.flatnonzero(logs > math.log(_LEAST_WEIGHT))
@@ -238,7 +200,7 @@ def reduced(means: Array, covs: Array, log_weights: Array) -> Mixture:
             costs[i, j] = _merge_cost(i, j, means, covs, weights, log_dets)
     while left > 1:
         i, j = divmod(int(np.argmin(costs)), count)
-        if costs[i, j] > _ALIKE and left <= _COMPONENTS_MAX:
+        if costs[i, j] > merge_cost and left <= _COMPONENTS_MAX:
             break
         weights[i], means[i], covs[i] = _merged(i, j, means, covs, weights)
         weights[j], log_dets[i], left = 0.0, _log_det(covs[i]), left - 1
@@ -249,110 +211,17 @@ def reduced(means: Array, covs: Array, log_weights: Array) -> Mixture:
                 costs[low, high] = _merge_cost(low, high, means, covs, weights, log_dets)
     alive = np.flatnonzero(weights > 0.0)
     weights = weights[alive] / weights[alive].sum()
-    return means[alive], covs[alive], np.log(weights)
+    return Mixture(means[alive], covs[alive], np.log(weights))
 
 
 @kernel
-def _update_group(
-    means: Array, covs: Array, log_weights: Array, rows: Array, height_m: float, gate_nis: Array
-) -> tuple[Array, Array, Array, float, bool]:
-    """The mixture after one measurement, the NIS of its most probable component, and whether the
-    measurement was taken by most of the mixture."""
-    count, n = means.shape
-    size = 0
-    split = np.empty(count, dtype=np.bool_)
-    for k in range(count):
-        split[k] = splits(rows, means[k], covs[k], height_m)
-        size += _RING_MAX + 1 if split[k] else 1
-    new_means, new_covs, new_logs = np.empty((size, n)), np.empty((size, n, n)), np.empty(size)
-    h = np.empty(n)
-    end, taken_weight, refused_weight, nis, best = 0, 0.0, 0.0, 0.0, -math.inf
-    top = log_weights.max()
-    for k in range(count):
-        first = end
-        if split[k]:
-            row = rows[0]
-            value = innovation_row(row, means[k], height_m, h)
-            one = (
-                value
-                * value
-                / innovation_variance(row, means[k], covs[k], height_m, row[VARIANCE], h)
-            )
-            ring = split_along_ring(means[k], covs[k], row, height_m)
-            end += ring[2].size
-            new_means[first:end], new_covs[first:end], new_logs[first:end] = ring
-            taken = True
-        else:
-            new_means[end], new_covs[end] = means[k], covs[k]
-            new_logs[end], one, taken = _update_component(
-                new_means[end], new_covs[end], rows, height_m, gate_nis
-            )
-            end += 1
-        for c in range(first, end):
-            new_logs[c] += log_weights[k]
-            if not taken:
-                refused_weight += math.exp(new_logs[c] - top)
-                continue
-            taken_weight += math.exp(new_logs[c] - top)
-            if new_logs[c] > best:
-                best, nis = new_logs[c], one
-        if split[k]:  # the component itself, to which the measurement is an outlier
-            new_means[end], new_covs[end] = means[k], covs[k]
-            new_logs[end] = log_weights[k] + _outlier_log(rows)
-            refused_weight += math.exp(new_logs[end] - top)
-            end += 1
-    means, covs, logs = reduced(new_means[:end], new_covs[:end], new_logs[:end])
-    return means, covs, logs, nis, bool(taken_weight > refused_weight)
-
-
-@kernel
-def update(
-    means: Array,
-    covs: Array,
-    log_weights: Array,
-    rows: Array,
-    height_m: float,
-    gate_nis: Array,
-    accepted: Array,
-) -> tuple[Array, Array, Array, float, int]:
-    """One epoch, measurement by measurement: the mixture after it, the NIS of what was accepted
-    and its degrees of freedom.
-
-    rows : (m, ROW_WIDTH), groups numbered 0, 1, ...
-    gate_nis : as for ``ekf.update``, for each component alone
-    accepted : (groups,), filled with 1 where most of the mixture takes the group, else 0
-    """
-    nis, dof, start = 0.0, 0, 0
-    logs = log_weights
-    while start < rows.shape[0]:
-        group = int(rows[start, GROUP])
-        stop = start + 1
-        while stop < rows.shape[0] and int(rows[stop, GROUP]) == group:
-            stop += 1
-        means, covs, logs, one, taken = _update_group(
-            means, covs, logs, rows[start:stop], height_m, gate_nis
-        )
-        accepted[group] = 1.0 if taken else 0.0
-        if taken:
-            nis, dof = nis + one, dof + stop - start
-        start = stop
-    return means, covs, logs, nis, dof
-
-
-@kernel
-def predict(means: Array, covs: Array, dt: float, motion: Array, bias: Array) -> None:
-    """Move every component by ``dt`` seconds in place; arguments as for ``ekf.predict``."""
-    for k in range(means.shape[0]):
-        ekf.predict(means[k], covs[k], dt, motion, bias)
-
-
-@kernel
-def mode_of(means: Array, covs: Array, log_weights: Array) -> Ints:
+def mode_of(components: Mixture) -> Ints:
     """Number of the mode (K,) each component belongs to, 0 the mode of the most probable one.
 
     Components belong to one mode where a chain of them leads from one to the other, each within
     3 sd (of both together) of the next.
     """
+    means, covs, log_weights = components
     count = log_weights.size
     order = np.argsort(-log_weights)
     modes, found = np.full(count, -1), 0

@@ -1,7 +1,5 @@
-"""One epoch of one track, compiled: predict, gate, update, re-update, recover.
-
-The same kernel serves the live track, the replay and Monte Carlo runs of thousands of routes.
-"""
+"""One epoch of one component, compiled: predict, gate, update, recover. The same kernel serves the
+live track, the replay and Monte Carlo runs of thousands of routes."""
 
 from __future__ import annotations
 
@@ -47,7 +45,8 @@ class FilterOptions(NamedTuple):
     inflate_after: int  # epochs rejected in a row
     lost_after: int  # epochs rejected in a row
     initial_speed_sd: float  # [m/s] to which the velocity opens then
-    manoeuvre_speed_sd: float  # [m/s] of a manoeuvre in a re-update; 0: none
+    manoeuvre_speed_sd: float  # [m/s] of a manoeuvre; 0: none
+    coast_after_s: float  # a longer silence may leave the device anywhere
     integrity_risk: float  # share of errors that may exceed the protection level
     robust: RobustOptions
     gain_floor: Array  # (3,) as for ``kf.update``
@@ -73,15 +72,13 @@ class StepResult(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of ``step``: of ``ekf.workspace``, groups accepted by update and re-update
-    (2, groups), the prediction (n,), (n, n) and the state of the re-update."""
+    """Memory of ``step``: of ``ekf.workspace``, groups accepted (groups,) and the prediction (n,),
+    (n, n)."""
 
     work: Array
     accepted: Array
     prior_mean: Array
     prior_cov_or_sqrt: Array
-    reupdate_mean: Array
-    reupdate_cov_or_sqrt: Array
 
 
 class Epochs(NamedTuple):
@@ -94,24 +91,22 @@ class Epochs(NamedTuple):
 
 
 class Run(NamedTuple):
-    """What a filter made of N epochs: means (N, n), covs (N, n, n); of the accepted rows nis (N,),
-    dof (N,) their number and groups (N,) that of their groups."""
+    """What a filter made of N epochs: means (N, n), covs (N, n, n) of the mixture; of the accepted
+    rows nis (N,), dof (N,) their number and groups (N,) that of their groups; radius (N,) [m] that
+    a mixture leaves with the integrity risk, 0 where there is one component."""
 
     means: Array
     covs: Array
     nis: Array
     dof: Array
     groups: Array
+    radius: Array
 
 
 @kernel
 def scratch(n: int, m: int) -> Scratch:
     """Memory for ``step`` with ``n`` states and up to ``m`` rows."""
-    means, covs_or_sqrts = np.zeros((2, n)), np.zeros((2, n, n))
-    accepted = np.zeros((2, m))
-    return Scratch(
-        ekf.workspace(n, m), accepted, means[0], covs_or_sqrts[0], means[1], covs_or_sqrts[1]
-    )
+    return Scratch(ekf.workspace(n, m), np.zeros(m), np.zeros(n), np.zeros((n, n)))
 
 
 def to_cov_or_sqrt(cov: Array, options: FilterOptions) -> Array:
@@ -193,14 +188,11 @@ def _open_factor(cov_or_sqrt: Array, sd: float, unheard_s: float) -> None:
 
 @kernel
 def manoeuvre_s(
-    mean: Array, cov_or_sqrt: Array, rows: Array, unheard_s: float, options: FilterOptions
+    mean: Array, cov: Array, rows: Array, unheard_s: float, options: FilterOptions
 ) -> float:
-    """Time [s] in which a manoeuvre may have begun, seen from the prediction: since the last
-    accepted measurement, or for as long as it goes unnoticed. A step of the velocity that its own
-    sd allows for is followed, and no manoeuvre."""
-    cov = cov_or_sqrt
-    if options.filter == Filter.SRUKF:
-        cov = srukf.covariance(cov_or_sqrt)
+    """Time [s] in which a manoeuvre may have begun, seen from the prediction mean (n,), cov (n,
+    n): since the last accepted measurement, or for as long as it goes unnoticed. A step of the
+    velocity that its own sd allows for is followed, and no manoeuvre."""
     h, height_m = np.empty(mean.size), options.height_m
     speed, gate = options.manoeuvre_speed_sd, options.gate_nis[2]
     if 2.0 * speed * speed <= cov[X.VX, X.VX] + cov[X.VY, X.VY]:
@@ -284,68 +276,30 @@ def step(
     options: FilterOptions,
     scratch: Scratch,
 ) -> StepResult:
-    """Predict and apply one epoch, in place.
+    """Predict and apply one epoch to one component, in place.
 
-    The update gates with the prediction. Where it rejects something, a re-update that allows for a
-    manoeuvre in the time it may have gone unnoticed is taken if it accepts more. After
-    ``inflate_after`` epochs rejected in a row the velocity opens to its initial sd. Nothing
-    accepted leaves the prediction.
-
-    ``scratch`` keeps the prediction, and in the first row of ``accepted`` 0 or 1 of each group.
-    The robust options re-weight the rows in place. The velocity step allowed for is left in
-    ``motion`` (``set_velocity_step_noise``), for a smoother to know.
+    After ``inflate_after`` epochs rejected in a row the velocity opens to its initial sd. Nothing
+    accepted leaves the prediction. ``scratch`` keeps the prediction, and 0 or 1 of each group in
+    ``accepted``. The robust options re-weight the rows in place. The velocity step allowed for is
+    left in ``motion`` (``set_velocity_step_noise``), for a smoother to know.
     """
-    rows, unheard_s, accepted = epoch.rows, epoch.unheard_s, scratch.accepted[0]
+    rows, unheard_s = epoch.rows, epoch.unheard_s
     groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
     predict(mean, cov_or_sqrt, epoch.dt_s, motion, bias, options)
     _copy(mean, cov_or_sqrt, scratch.prior_mean, scratch.prior_cov_or_sqrt)
     opened = epoch.rejected_in_row >= options.inflate_after
     opened_sd = options.initial_speed_sd if opened else 0.0
-    manoeuvre_sd, within_s = 0.0, 0.0
     if opened:
         open_velocity(cov_or_sqrt, opened_sd, unheard_s, options)
     if options.robust.kind != Robust.NONE or options.robust.nlos_probability > 0.0:
         reweight(mean, cov_or_sqrt, rows, options, scratch.work)
-    nis, used = update(mean, cov_or_sqrt, rows, options, accepted, scratch.work)
-    taken = _count(accepted, groups)
-    manoeuvre = options.manoeuvre_speed_sd
-    if taken < groups and manoeuvre > 0.0:
-        within_s = manoeuvre_s(
-            scratch.prior_mean, scratch.prior_cov_or_sqrt, rows, unheard_s, options
-        )
-        second = _reupdate(rows, opened_sd, unheard_s, within_s, options, scratch)
-        if second.groups > taken:
-            nis, used, taken = second
-            _copy(scratch.reupdate_mean, scratch.reupdate_cov_or_sqrt, mean, cov_or_sqrt)
-            for g in range(groups):
-                accepted[g] = scratch.accepted[1, g]
-            manoeuvre_sd = manoeuvre
+    nis, used = update(mean, cov_or_sqrt, rows, options, scratch.accepted, scratch.work)
+    taken = _count(scratch.accepted, groups)
     if taken == 0:
         _copy(scratch.prior_mean, scratch.prior_cov_or_sqrt, mean, cov_or_sqrt)
     else:
-        set_velocity_step_noise(motion, opened_sd, unheard_s, manoeuvre_sd, within_s)
+        set_velocity_step_noise(motion, opened_sd, unheard_s, 0.0, 0.0)
     return StepResult(nis, used, taken)
-
-
-@leaf
-def _reupdate(
-    rows: Array,
-    opened_sd: float,
-    unheard_s: float,
-    within_s: float,
-    options: FilterOptions,
-    scratch: Scratch,
-) -> StepResult:
-    """Update once more from the prediction, with a manoeuvre in the last ``within_s`` seconds."""
-    mean, cov_or_sqrt = scratch.reupdate_mean, scratch.reupdate_cov_or_sqrt
-    accepted = scratch.accepted[1]
-    _copy(scratch.prior_mean, scratch.prior_cov_or_sqrt, mean, cov_or_sqrt)
-    if opened_sd > 0.0:
-        open_velocity(cov_or_sqrt, opened_sd, unheard_s, options)
-    inflate_for_manoeuvre(cov_or_sqrt, within_s, options)
-    nis, used = update(mean, cov_or_sqrt, rows, options, accepted, scratch.work)
-    groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
-    return StepResult(nis, used, _count(accepted, groups))
 
 
 @kernel
@@ -357,53 +311,3 @@ def reweight(
     if options.filter == Filter.SRUKF:
         cov = srukf.covariance(cov_or_sqrt)
     conditioning.reweight(mean, cov, rows, options.height_m, options.robust, work[0])
-
-
-@kernel
-def run_epochs(
-    epochs: Epochs,
-    mean: Array,
-    cov: Array,
-    motion: Array,
-    bias: Array,
-    options: FilterOptions,
-    run: Run,
-) -> int:
-    """A whole run: ``step`` for every epoch, from ``mean`` (n,), ``cov`` (n, n) valid at the
-    first stamp (a square-root filter takes and gives covariances, too); ``run`` is filled.
-
-    Returns the number of epochs done: less than N where the track was lost, that is after
-    ``lost_after`` epochs rejected in a row.
-    """
-    stamps_ns, row_start = epochs.stamps_ns, epochs.row_start
-    most = 1
-    for k in range(stamps_ns.size):
-        most = max(most, row_start[k + 1] - row_start[k])
-    memory, own = scratch(mean.size, most), np.empty((most, epochs.rows.shape[1]))
-    square_root = options.filter == Filter.SRUKF
-    x = mean.copy()
-    S = srukf.factor(cov) if square_root else cov.copy()
-    rejected_in_row = 0
-    last_ns = heard_ns = stamps_ns[0]
-    for k in range(stamps_ns.size):
-        dt = (stamps_ns[k] - last_ns) * 1e-9
-        last_ns = stamps_ns[k]
-        m = row_start[k + 1] - row_start[k]
-        if m == 0:
-            predict(x, S, dt, motion, bias, options)
-            run.nis[k], run.dof[k], run.groups[k] = 0.0, 0, 0
-        else:
-            own[:m] = epochs.rows[row_start[k] : row_start[k + 1]]
-            unheard_s = (last_ns - heard_ns) * 1e-9
-            epoch = EpochInput(dt, unheard_s, rejected_in_row, own[:m])
-            result = step(x, S, epoch, motion, bias, options, memory)
-            run.nis[k], run.dof[k], run.groups[k] = result
-            groups = int(own[m - 1, GROUP]) + 1
-            rejected_in_row = 0 if 2 * result.groups >= groups else rejected_in_row + 1
-            if result.groups > 0:
-                heard_ns = last_ns
-        run.means[k] = x
-        run.covs[k] = srukf.covariance(S) if square_root else S
-        if rejected_in_row >= options.lost_after:
-            return k + 1
-    return int(stamps_ns.size)

@@ -13,13 +13,16 @@ import numpy as np
 
 from netpos.filters import ekf, filterpy_backend, imm
 from netpos.filters.measurement import GROUP
+from netpos.filters.mixture import Mixture, mode_of
 from netpos.filters.motion import Parameter
-from netpos.filters.state import N_CORE
+from netpos.filters.state import N_CORE, X
 from netpos.messages.values import Array, TrackMode
-from netpos.tracking import engine
+from netpos.tracking import components, engine
+from netpos.tracking.components import moments
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.engine import EpochInput, FilterOptions
 from netpos.tracking.models import augmented, initial_extra_sd, motions_of, options_of
+from netpos.tracking.protection import mixture_radius
 
 
 class Estimate(Protocol):
@@ -102,19 +105,19 @@ class OneModel:
     def set_process_noise(self, accel_density: float) -> None:
         self._motion[Parameter.ACCEL] = accel_density
 
-    def set_motion(self, motion: Array) -> None:
-        """Go on with the parameters (Parameter,) of another estimate."""
-        self._motion = motion.copy()
 
-
-class KalmanEstimate(UnimodalEstimate, OneModel):
-    """One motion model in the compiled engine."""
+class KalmanEstimate(OneModel):
+    """One motion model in the compiled engine: one component, or a mixture of them while one does
+    not explain the measurements (``tracking.components``)."""
 
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
-        self.stamp_ns = stamp_ns
+        self.stamp_ns = self._turn_ns = stamp_ns
         self._options = options_of(config)
         self._factored = config.filter == "srukf"
         self._motion: Array = motions_of(config)[0].copy()
+        self._components: Mixture | None = None  # replaced, never changed; None: one component
+        self._prior: tuple[Array, Array] | None = None  # of a mixture
+        self._modes: tuple[TrackMode, ...] | None = ()  # None: not yet asked for
         mean, cov = augmented(mean, cov, initial_extra_sd(config))
         self.mean, self._cov_or_sqrt = mean.copy(), engine.to_cov_or_sqrt(cov, self._options)
         self._rows = 0
@@ -135,20 +138,56 @@ class KalmanEstimate(UnimodalEstimate, OneModel):
 
     @property
     def prior(self) -> tuple[Array, Array]:
+        return self._prior or self._prior_of_one()
+
+    def _prior_of_one(self) -> tuple[Array, Array]:
         cov_or_sqrt = self._scratch.prior_cov_or_sqrt
         cov = engine.to_cov(cov_or_sqrt, self._options) if self._factored else cov_or_sqrt
         return self._scratch.prior_mean, cov
 
+    def _set(self, mixture: Mixture) -> None:
+        """Go on with ``mixture``; mean and covariance are those of all of them together."""
+        self._components = mixture if mixture.log_weights.size > 1 else None
+        self.mean, cov = moments(mixture)
+        self._cov_or_sqrt = engine.to_cov_or_sqrt(cov, self._options)
+        self._modes = () if self._components is None else None
+
+    @property
+    def modes(self) -> tuple[TrackMode, ...]:
+        """Modes that carry more than the integrity risk, the most probable first; none where it is
+        only one."""
+        if self._modes is None:
+            assert self._components is not None
+            self._modes = modes_of(self._components, self._options.integrity_risk)
+        return self._modes
+
+    def radius(self, level_m: float) -> float:
+        if self._components is None:
+            return level_m
+        risk = self._options.integrity_risk
+        held: float = mixture_radius(self._components, self.mean, risk)
+        return max(level_m, held)
+
     def augment(self, sd: Array) -> None:
-        if self.mean.size < N_CORE + sd.size:
+        if self.mean.size >= N_CORE + sd.size:
+            return
+        if self._components is not None:
+            means, covs, log_weights = self._components
+            pairs = [augmented(mean, cov, sd) for mean, cov in zip(means, covs, strict=True)]
+            larger = np.array([mean for mean, _ in pairs]), np.array([cov for _, cov in pairs])
+            self._set(Mixture(*larger, log_weights))
+        else:
             mean, cov = augmented(self.mean, self.cov, sd)
             self.mean, self._cov_or_sqrt = mean, engine.to_cov_or_sqrt(cov, self._options)
-            self._make_room(self._rows)
+        self._make_room(self._rows)
 
     def predict(self, stamp_ns: int, bias: Array) -> None:
         dt = (stamp_ns - self.stamp_ns) * 1e-9
-        engine.predict(self.mean, self._cov_or_sqrt, dt, self._motion, bias, self._options)
         self.stamp_ns = stamp_ns
+        if self._components is None:
+            engine.predict(self.mean, self._cov_or_sqrt, dt, self._motion, bias, self._options)
+        elif dt > 0.0:
+            self._set(components.move(self._components, dt, self._motion, bias, self._options))
 
     def step(
         self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
@@ -156,18 +195,36 @@ class KalmanEstimate(UnimodalEstimate, OneModel):
         if len(rows) > self._rows:
             self._make_room(len(rows))
         dt_s = (stamp_ns - self.stamp_ns) * 1e-9
-        epoch = EpochInput(dt_s, unheard_s, rejected_in_row, rows)
-        nis, dof, _ = engine.step(
-            self.mean,
-            self._cov_or_sqrt,
-            epoch,
-            self._motion,
-            bias,
-            self._options,
-            self._scratch,
+        epoch, accepted = (
+            EpochInput(dt_s, unheard_s, rejected_in_row, rows),
+            self._scratch.accepted,
         )
-        self.stamp_ns = stamp_ns
-        return nis, dof, self._scratch.accepted[0, : int(rows.item(-1, GROUP)) + 1]
+        motion, options, groups = self._motion, self._options, int(rows.item(-1, GROUP)) + 1
+        since_turn_s = (stamp_ns - self._turn_ns) * 1e-9
+        coasted = self._components is None and dt_s > options.coast_after_s
+        if coasted and components.is_too_wide(self.mean, self.cov, epoch, motion, bias, options):
+            self._components = components.one_component(self.mean, self.cov)
+        if self._components is None:
+            result = engine.step(
+                self.mean, self._cov_or_sqrt, epoch, motion, bias, options, self._scratch
+            )
+            self.stamp_ns, self._prior = stamp_ns, None
+            refused = result.groups < groups
+            if not (refused or groups == 1) or not components.is_not_enough(
+                result, epoch, since_turn_s, options
+            ):
+                return result.nis, result.used, accepted[:groups]
+            prior = components.one_component(*self._prior_of_one())
+        else:
+            prior = components.move(self._components, dt_s, motion, bias, options)
+            self.stamp_ns = stamp_ns
+        found = components.apply_epoch(prior, epoch, options, since_turn_s, accepted)
+        components.note_turn(found, motion, options)
+        self._prior = moments(prior)
+        self._set(found.components)
+        if found.begun:
+            self._turn_ns = stamp_ns
+        return found.nis, found.used, accepted[:groups]
 
     def copy(self) -> KalmanEstimate:
         twin = KalmanEstimate.__new__(KalmanEstimate)
@@ -175,6 +232,20 @@ class KalmanEstimate(UnimodalEstimate, OneModel):
         twin.mean, twin._cov_or_sqrt = self.mean.copy(), self._cov_or_sqrt.copy()
         twin._motion = self._motion.copy()
         return twin
+
+
+def modes_of(mixture: Mixture, risk: float) -> tuple[TrackMode, ...]:
+    """Modes of a mixture that carry more than ``risk``, the most probable first; none where it is
+    only one."""
+    weights, mode = np.exp(mixture.log_weights), mode_of(mixture)
+    sums = np.bincount(mode, weights)
+    x, y = (np.bincount(mode, weights * mixture.means[:, a]) / sums for a in (X.PX, X.PY))
+    modes = tuple(
+        TrackMode(weight=float(sums[m]), x_m=float(x[m]), y_m=float(y[m]))
+        for m in np.argsort(-sums, kind="stable").tolist()
+        if sums[m] > risk
+    )
+    return modes if len(modes) > 1 else ()
 
 
 class GatedEstimate(UnimodalEstimate):

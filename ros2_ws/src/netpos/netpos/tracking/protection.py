@@ -19,6 +19,7 @@ from netpos.filters.factor import eigenvalues
 from netpos.filters.fusion import W_GAIN, fuse
 from netpos.filters.manoeuvre import add_manoeuvre, detection_delay_s
 from netpos.filters.measurement import GROUP, VARIANCE, curvature_variance, innovation_row
+from netpos.filters.mixture import Mixture
 from netpos.filters.state import X
 from netpos.messages.values import Array
 from netpos.tracking.engine import FilterOptions
@@ -112,12 +113,13 @@ def gaussian_tail(xx: float, xy: float, yy: float, radius: float) -> float:
 
 
 @kernel
-def mixture_radius(means: Array, covs: Array, weights: Array, centre: Array, risk: float) -> float:
-    """Radius round ``centre`` (2,) that a position with the mixture of means (K, n), covs (K, n,
-    n), weights (K,) leaves with at most the probability ``risk``.
+def mixture_radius(components: Mixture, centre: Array, risk: float) -> float:
+    """Radius round the position of ``centre`` (n,) that a device with the mixture ``components``
+    leaves with at most the probability ``risk``.
 
     Of a component at distance d at most the tail of its own error beyond radius - d lies outside.
     """
+    means, covs, weights = components.means, components.covs, np.exp(components.log_weights)
     low, high = 0.0, 0.0
     away = np.hypot(means[:, X.PX] - centre[0], means[:, X.PY] - centre[1])
     for k in range(weights.size):
@@ -197,8 +199,7 @@ Scratch = tuple[Array, Array, Array, Array]
 
 class FusedEpoch(NamedTuple):
     """An epoch that a filter has applied: prediction (n,), (n, n), rows (m, ROW_WIDTH), which
-    groups it accepted, seconds since an accepted measurement before, posterior mean (n,), NIS of
-    the accepted rows and their number."""
+    groups it accepted, seconds since an accepted measurement before, posterior mean (n,)."""
 
     prior_mean: Array
     prior_cov: Array
@@ -206,8 +207,6 @@ class FusedEpoch(NamedTuple):
     accepted: Array
     unheard_s: float
     mean: Array
-    nis: float
-    dof: int
 
 
 @kernel

@@ -241,7 +241,8 @@ class PhaseAmbiguityBank(OneModel):
             first, first_parent_index = self._bank, self._parent_index
             self._bank, self._parent_index = _copy_of(before), self._parent_index.copy()
             mean, cov_or_sqrt = self._bank.means[self._best], self._bank.covs_or_sqrts[self._best]
-            within_s = engine.manoeuvre_s(mean, cov_or_sqrt, rows, unheard_s, self._options)
+            cov = engine.to_cov(cov_or_sqrt, self._options)
+            within_s = engine.manoeuvre_s(mean, cov, rows, unheard_s, self._options)
             for s in np.flatnonzero(self._bank.weights > -math.inf).tolist():
                 engine.inflate_for_manoeuvre(self._bank.covs_or_sqrts[s], within_s, self._options)
             second = self._apply(rows, at)

@@ -12,7 +12,6 @@ from netpos.messages.values import Array
 from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
 from netpos.tracking.estimates import Estimate
 from netpos.tracking.initialise import Initialiser
-from netpos.tracking.manoeuvre_hypotheses import ManoeuvreHypotheses
 from netpos.tracking.networks.secondary import OwnNoise
 from netpos.tracking.nlos_rate import NlosRate
 from netpos.tracking.phase_start import PhaseStart
@@ -29,7 +28,6 @@ class TrackSnapshot:
     nlos_rate: NlosRate
     phase_start: PhaseStart
     process_noise: AdaptiveProcessNoise
-    hypotheses: ManoeuvreHypotheses
     segment: int = 0
     estimate: Estimate | None = None
     own: OwnNoise | None = None
@@ -56,7 +54,6 @@ class TrackSnapshot:
         else:
             twin.estimate = self.estimate.copy()
         twin.nis_window = self.nis_window.copy()
-        twin.hypotheses = self.hypotheses.copy()
         twin.rejected = self.rejected.copy()
         twin.velocity_ns = self.velocity_ns.copy()
         twin.process_noise = self.process_noise.copy()

@@ -34,8 +34,6 @@ from netpos.tracking.health import RsuHealth
 from netpos.tracking.history import History, merge
 from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser, with_heading
-from netpos.tracking.manoeuvre_hypotheses import ManoeuvreHypotheses
-from netpos.tracking.mixture import MixtureEstimate, with_components
 from netpos.tracking.models import heading_index, initial_extra_sd, options_of, pose_state
 from netpos.tracking.networks.secondary import Secondary
 from netpos.tracking.nlos_rate import NlosRate
@@ -89,7 +87,6 @@ class Track:
             NlosRate.of(self._config),
             PhaseStart(self._config),
             AdaptiveProcessNoise(self._config),
-            ManoeuvreHypotheses(self._config),
         )
 
     @property
@@ -235,9 +232,8 @@ class Track:
     def _update(self, stamp_ns: int, epoch_rows: EpochRows) -> EpochResult:
         state = self._state
         state.estimate = with_sectors(self._config, state.estimate, epoch_rows.rows)
-        estimate = self._split(
-            stamp_ns, self._prepare(stamp_ns, epoch_rows.items), epoch_rows.rows
-        )
+        estimate = self._prepare(stamp_ns, epoch_rows.items)
+        was_ambiguous = bool(estimate.modes)
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
         blocked = self._config.nlos_probability > 0.0
         if blocked:
@@ -253,6 +249,8 @@ class Track:
                 state.own, stamp_ns, estimate, epoch_rows.rows, state.bias
             )
         state.segment += corrections(estimate, state.rejected)
+        # a smoother does not reach across: what it keeps is one Gaussian
+        state.segment += bool(estimate.modes) != was_ambiguous
         state.has_clock = state.has_clock or (dof > 0 and epoch_rows.has_time)
         if not self._note_fit(stamp_ns, epoch_rows, flags, accepted, nis, dof):
             state.rejected["diverged"] += 1
@@ -264,16 +262,6 @@ class Track:
         sources = self._note_accepted(stamp_ns, epoch_rows, accepted) if dof > 0 else ()
         self._count_rejected(not refused or mostly_accepted(epoch_rows, accepted))
         return EpochResult(stamp_ns, nis, dof, sources)
-
-    def _split(self, stamp_ns: int, estimate: Estimate, rows: Array) -> Estimate:
-        """The estimate as a mixture where it is too wide for ``rows``; a smoother does not reach
-        from the one to the other."""
-        state = self._state
-        state.estimate = with_components(self._config, estimate, stamp_ns, rows, state.bias)
-        if state.estimate is not estimate:
-            state.segment += 1
-            state.hypotheses = ManoeuvreHypotheses(self._config)
-        return state.estimate
 
     def _count_rejected(self, accepted: bool) -> None:
         """Count the epochs in a row that did not fit; too many, and the track is lost."""
@@ -318,20 +306,13 @@ class Track:
         assert state.estimate is not None
         estimate, (prior_mean, prior_cov) = state.estimate, state.estimate.prior
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
-        fused = FusedEpoch(
-            prior_mean, prior_cov, epoch_rows.rows, flags, unheard_s, estimate.mean, nis, dof
-        )
+        fused = FusedEpoch(prior_mean, prior_cov, epoch_rows.rows, flags, unheard_s, estimate.mean)
         undetected_m: float = innovations_and_level(
             fused, estimate.cov, self._options, innovations
         )
         if math.isnan(undetected_m):
             return False
         state.undetected_m = undetected_m
-        alone = len(accepted) == 1 and not isinstance(estimate, MixtureEstimate)
-        if state.hypotheses.present or alone:
-            state.undetected_m = state.hypotheses.level(
-                undetected_m, stamp_ns, estimate, fused, state.bias
-            )
         nis, dof = with_refused(epoch_rows, accepted, self._gate, nis, dof)
         if math.isfinite(nis):
             state.nis_window.add(nis, dof)
@@ -389,7 +370,7 @@ class Track:
         if estimate is None:
             status = track_status(config, self._vue_id, epoch, state.accepted, rejected)
             return TrackOutput(None, None, status, network=config.network)
-        mean, cov = state.hypotheses.reported(epoch.stamp_ns, estimate, state.bias)
+        mean, cov = estimate.mean, estimate.cov
         odometry, clock, state.yaw, sd_m, radius_m = output.describe(
             epoch.stamp_ns,
             self._vue_id,

@@ -6,13 +6,8 @@ from functools import cache
 
 import numpy as np
 
-from netpos.filters.motion import NO_BIAS
-from netpos.filters.rows import linear_rows
 from netpos.messages.values import Field, GroundSpeed, InitialPose, RsuInfo, RsuMeasurement
-from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.manoeuvre_hypotheses import ManoeuvreHypotheses
-from netpos.tracking.protection import FusedEpoch
 from netpos.tracking.tracker import Tracker
 
 
@@ -27,7 +22,6 @@ def warm_up(network: str | None = None) -> None:
     _angles_and_ranges()
     if network is None:
         warm_up_anchors()
-        _hypotheses()
         Tracker(TrackerConfig(motion_model="strapdown", robust="huber"))
     if network != "":
         _fixes_of_a_network()
@@ -98,14 +92,3 @@ def _angles_and_ranges() -> None:
     for item in (speed, pose):
         tracker.add(item)
         tracker.process()
-
-
-def _hypotheses() -> None:
-    """An epoch that fits so badly that manoeuvre hypotheses begin."""
-    config, stamp_ns, interval_s = TrackerConfig(manoeuvre_speed_sd_mps=1.0), 100_000_000, 0.1
-    estimate = estimates.start(config, 0, np.zeros(6), np.eye(6))
-    rows = linear_rows(np.full(2, 4.0), np.eye(2), np.eye(6)[:2], 0)
-    _, dof, accepted = estimate.step(stamp_ns, interval_s, 0, rows, NO_BIAS)
-    mean, cov = estimate.prior
-    epoch = FusedEpoch(mean, cov, rows, accepted, interval_s, estimate.mean, 99.0, dof)
-    ManoeuvreHypotheses(config).level(1.0, stamp_ns, estimate, epoch, NO_BIAS)

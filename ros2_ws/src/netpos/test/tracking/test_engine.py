@@ -10,19 +10,17 @@ import pytest
 from engine_cases import opened, start
 from netpos.filters import conditioning, ekf
 from netpos.filters.measurement import (
-    GATE_VARIANCE,
     GROUP,
     ROW_WIDTH,
     Kind,
-    curvature_variance,
-    linearise,
 )
 from netpos.filters.motion import NO_BIAS, SPEED_OF_LIGHT_MPS, Parameter, noise
 from netpos.filters.rows import rsu_axes, rsu_rows
-from netpos.filters.state import POSITION, VELOCITY, X
+from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array, Field, InitialPose, RsuInfo, RsuMeasurement
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking import Tracker, TrackerConfig, engine
+from netpos.tracking.components import Model, run_epochs
 from netpos.tracking.engine import EpochInput, Epochs, FilterOptions, Run
 from netpos.tracking.models import motions_of, options_of, pose_state
 
@@ -52,26 +50,7 @@ def rows_of(state: Array, rng: np.random.Generator, wrong: tuple[int, ...] = ())
     return np.vstack(blocks)
 
 
-def turned(
-    mean: Array, cov: Array, rows: Array, unheard_s: float, options: FilterOptions
-) -> Array:
-    """The mean over all times at which a manoeuvre may have begun: since the last accepted
-    measurement, or twice as long as one goes unnoticed on average over its directions."""
-    _, H = linearise(rows, mean, 0.0)
-    S = np.einsum("ia,ab,ib->i", H, cov, H) + rows[:, GATE_VARIANCE]
-    S += [curvature_variance(row, mean, cov, 0.0) for row in rows]
-    information = (H[:, :2].T / S) @ H[:, :2]
-    sd = options.manoeuvre_speed_sd
-    noticed_s = math.sqrt(options.gate_nis[2] / (np.trace(information) / 2.0)) / sd
-    within_s = max(unheard_s, 2.0 * noticed_s)
-    if sd**2 <= np.trace(cov[VELOCITY, VELOCITY]) / 2.0:  # no manoeuvre
-        within_s = unheard_s
-    nodes, weights = np.polynomial.legendre.leggauss(3)
-    times = within_s * (nodes + 1.0) / 2.0
-    return sum(w / 2.0 * opened(cov, sd, s) for s, w in zip(times, weights, strict=True))
-
-
-def look(
+def gated(
     mean: Array, cov: Array, rows: Array, options: FilterOptions
 ) -> tuple[Array, Array, float, int, Array]:
     x, P, accepted = mean.copy(), cov.copy(), np.zeros(int(rows[-1, GROUP]) + 1)
@@ -92,10 +71,9 @@ def plain_step(
     options: FilterOptions,
     allowed: Array | None = None,
 ) -> tuple[Array, Array, float, int, Array]:
-    """The rules: predict; open after too many rejected epochs; re-weight what is to be; a second
-    look where something is refused, taken if it accepts more; nothing accepted leaves the
-    prediction. What was added to the prediction, if anything was accepted, is added to
-    ``allowed``."""
+    """The rules: predict; open after too many rejected epochs; re-weight what is to be; nothing
+    accepted leaves the prediction. What was added to the prediction, if anything was accepted, is
+    added to ``allowed``."""
     prior, prior_cov = mean.copy(), cov.copy()
     ekf.predict(prior, prior_cov, dt, motion, NO_BIAS)
     P = prior_cov
@@ -103,13 +81,7 @@ def plain_step(
         P = opened(P, options.initial_speed_sd, unheard_s)
     rows, work = rows.copy(), ekf.workspace(len(mean), len(rows))
     conditioning.reweight(prior, P, rows, 0.0, options.robust, work[0])
-    best = look(prior, P, rows, options)
-    sd = options.manoeuvre_speed_sd
-    if sd > 0.0 and not best[4].all():
-        wide = P + turned(prior, prior_cov, rows, unheard_s, options) - prior_cov
-        second = look(prior, wide, rows, options)
-        if second[4].sum() > best[4].sum():
-            best, P = second, wide
+    best = gated(prior, P, rows, options)
     if not best[4].any():
         return prior, prior_cov, best[2], best[3], best[4]
     if allowed is not None:
@@ -130,7 +102,7 @@ def compiled_step(
     x, S = mean.copy(), engine.to_cov_or_sqrt(cov, options)
     scratch, epoch = engine.scratch(6, len(rows)), EpochInput(dt, unheard_s, rejected, rows)
     result = engine.step(x, S, epoch, motion, NO_BIAS, options, scratch)
-    accepted = scratch.accepted[0, :3]
+    accepted = scratch.accepted[:3]
     assert result.groups == accepted.sum()
     return x, engine.to_cov(S, options), result.nis, result.used, accepted
 
@@ -142,11 +114,6 @@ CASES = {
     "nothing fits even opened": ({}, 2, (0, 1, 2), 900.0, 0),
     "moved, not yet opened": ({}, 1, (), 6.0, 0),
     "moved, opened": ({}, 2, (), 6.0, 3),
-    "moved, second look": ({"manoeuvre_speed_sd_mps": 10.0}, 0, (), 6.0, 3),
-    "moved, a second look too narrow": ({"manoeuvre_speed_sd_mps": 0.01}, 0, (), 6.0, 0),
-    "second look no better": ({"manoeuvre_speed_sd_mps": 0.5}, 0, (1,), 0.0, 2),
-    "opened and second look": ({"manoeuvre_speed_sd_mps": 20.0}, 2, (), 14.0, 3),
-    "opened, moved too far for one look": ({"manoeuvre_speed_sd_mps": 20.0}, 2, (), 40.0, 3),
     "weighed": ({"robust": "huber", "robust_parameter": 1.3}, 0, (), 1.5, 2),
     "late": ({"nlos_probability": 0.3}, 0, (), 2.0, 2),
     "no gate": ({"gate_probability": 1.0}, 0, (0, 1), 6.0, 3),
@@ -206,21 +173,21 @@ def drive(epochs: int = 60) -> tuple[Array, Array, Array]:
 def run(config: TrackerConfig, mean: Array, cov: Array, inputs: Any) -> tuple[int, Run]:
     stamps, starts, rows = inputs
     N, n = len(stamps), len(mean)
-    out = Run(*(np.full(shape, np.nan) for shape in ((N, n), (N, n, n), N, N, N)))
-    before, motion = rows.copy(), motions_of(config)[0]
+    out = Run(*(np.full(shape, np.nan) for shape in ((N, n), (N, n, n), N, N, N, N)))
+    before, model = rows.copy(), Model(motions_of(config)[0], NO_BIAS)
     epochs = Epochs(stamps, starts, rows)
-    done = engine.run_epochs(epochs, mean, cov, motion, NO_BIAS, options_of(config), out)
+    done = run_epochs(epochs, mean, cov, model, options_of(config), out)
     np.testing.assert_array_equal(rows, before)
     return done, out
 
 
-@pytest.mark.parametrize("change", [{}, {"manoeuvre_speed_sd_mps": 40.0}, {"filter": "ekf"}])
+@pytest.mark.parametrize("change", [{}, {"filter": "ekf"}])
 def test_a_run_is_its_steps(change: dict[str, Any]) -> None:
     config = TrackerConfig(**change)
     motion, options = motions_of(config)[0], options_of(config)
     mean, cov = start()
     stamps, starts, rows = drive()
-    done, (means, covs, nis, dof, taken) = run(config, mean, cov, (stamps, starts, rows))
+    done, (means, covs, nis, dof, taken, _) = run(config, mean, cov, (stamps, starts, rows))
     assert done == len(stamps)
     rejected, heard = 0, stamps[0]
     rejected_most = 0
@@ -242,14 +209,14 @@ def test_a_run_is_its_steps(change: dict[str, Any]) -> None:
         rejected_most = max(rejected, rejected_most)
         np.testing.assert_allclose(means[k], mean, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(covs[k], cov, rtol=1e-8, atol=1e-11)
-    assert rejected_most == (3 if "manoeuvre_speed_sd_mps" not in change else 0)
+    assert rejected_most == 3
 
 
 def test_a_run_ends_where_the_track_is_lost() -> None:
     config = TrackerConfig(max_rejected_epochs=3, inflate_after_epochs=100, filter="ekf")
     mean, cov = start()
     stamps, starts, rows = drive(60)
-    done, (means, _, _, _, taken) = run(config, mean, 1e-4 * cov, (stamps, starts, rows))
+    done, (means, _, _, _, taken, _) = run(config, mean, 1e-4 * cov, (stamps, starts, rows))
     lost = 33  # the epochs 30, 31, 32 are rejected; 33 has no rows
     assert done == lost
     assert taken[29] > 0
@@ -315,7 +282,7 @@ def test_a_run_equals_the_tracker(metis: Any, name: str, rtol: float) -> None:
     stamps, starts, rows = as_rows(rsus, items)
     assert pose.stamp_ns <= stamps[0]
     mean, cov = pose_state(config, pose.position[:2], pose.cov[:2, :2])
-    done, (means, covs, nis, dof, taken) = run(config, mean, cov, (stamps, starts, rows))
+    done, (means, covs, nis, dof, taken, _) = run(config, mean, cov, (stamps, starts, rows))
     outputs = [o for o in outputs if o.status.stamp_ns >= stamps[0]]
     assert done == len(stamps) == len(outputs) > 600
     assert pose.stamp_ns == stamps[0]

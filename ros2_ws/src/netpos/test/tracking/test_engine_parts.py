@@ -168,13 +168,13 @@ def test_a_manoeuvre_is_more_than_the_velocity_allows_for(
     change = {"manoeuvre_speed_sd_mps": 3.0, "gate_probability": 0.999}
     options = options_of(TrackerConfig(filter=name, **change))
     cov = np.diag([2.0, 2.0, 12.0 * share, 6.0 * share, 1.0, 1.0])
-    S, rows = engine.to_cov_or_sqrt(cov, options), linear_rows(np.zeros(2), 3.0 * np.eye(2), H, 0)
+    rows = linear_rows(np.zeros(2), 3.0 * np.eye(2), H, 0)
     shows_s = math.sqrt(chi2.ppf(0.999, 2) * 5.0) / 3.0
     for unheard_s in (0.1, 2.01 * shows_s):
-        within_s = engine.manoeuvre_s(np.zeros(6), S, rows, unheard_s, options)
+        within_s = engine.manoeuvre_s(np.zeros(6), cov, rows, unheard_s, options)
         expected = max(unheard_s, 2.0 * shows_s) if is_one else unheard_s
         assert within_s == pytest.approx(expected, rel=1e-9)
-        assert engine.manoeuvre_s(np.zeros(6), S, rows[:0], unheard_s, options) == unheard_s
+        assert engine.manoeuvre_s(np.zeros(6), cov, rows[:0], unheard_s, options) == unheard_s
 
 
 @pytest.mark.parametrize("name", ["iekf", "srukf"])

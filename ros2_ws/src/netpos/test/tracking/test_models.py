@@ -49,6 +49,7 @@ def test_options_hold_what_the_parameters_say() -> None:
         accel_gain_min=0.4,
         gate_probability=0.99,
         integrity_risk=1e-5,
+        coast_after_s=0.7,
     )
     options = options_of(config)
     expected = FilterOptions(
@@ -60,6 +61,7 @@ def test_options_hold_what_the_parameters_say() -> None:
         initial_speed_sd=6.5,
         manoeuvre_speed_sd=7.5,
         integrity_risk=1e-5,
+        coast_after_s=0.7,
         robust=RobustOptions(ROBUST.index("student_t"), 5.5, 0.1, 33.0),
         gain_floor=options.gain_floor,
         gate_nis=options.gate_nis,

@@ -20,6 +20,7 @@ from netpos.filters.measurement import (
     curvature_variance,
     linearise,
 )
+from netpos.filters.mixture import Mixture
 from netpos.filters.rows import linear_rows, rsu_axes, rsu_rows
 from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
@@ -265,7 +266,7 @@ def options(gate_probability: float = 0.9999, speed: float = 4.0) -> FilterOptio
 def fused(
     prior: Array, cov: Array, rows: Array, accepted: Array, unheard_s: float, mean: Array
 ) -> FusedEpoch:
-    return FusedEpoch(prior, cov, rows, accepted, unheard_s, mean, 0.0, 0)
+    return FusedEpoch(prior, cov, rows, accepted, unheard_s, mean)
 
 
 @pytest.mark.parametrize("unheard_s", [0.1, 5.0])
@@ -398,7 +399,7 @@ def test_the_tail_beyond_a_radius_is_its_risk(
 
 def test_the_radius_of_one_component_is_that_of_its_gaussian() -> None:
     cov = np.array([[4.0, 1.5], [1.5, 1.0]])
-    found = mixture_radius(np.zeros((1, 2)), cov[None], np.ones(1), np.zeros(2), 1e-3)
+    found = mixture_radius(Mixture(np.zeros((1, 2)), cov[None], np.zeros(1)), np.zeros(2), 1e-3)
     assert found == pytest.approx(protection_level(cov, 1e-3), rel=1e-3)
 
 
@@ -414,6 +415,6 @@ def test_the_radius_of_a_mixture_holds_its_samples(weights: tuple[float, float])
     )
     drawn = np.where(chosen[:, None], second, first)
     centre = np.average(means, axis=0, weights=weights)
-    radius = mixture_radius(means, covs, np.array(weights), centre, risk)
+    radius = mixture_radius(Mixture(means, covs, np.log(weights)), centre, risk)
     reached = np.quantile(np.linalg.norm(drawn - centre, axis=1), 1.0 - risk)
     assert reached * 0.99 <= radius <= 1.2 * reached

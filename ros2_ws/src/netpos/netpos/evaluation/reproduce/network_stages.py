@@ -24,8 +24,9 @@ from netpos.radio.noise import generator
 from netpos.scenario.networks import fix_errors
 from netpos.scenario.schema import NS
 from netpos.tracking import estimates
+from netpos.tracking.components import Model, run_epochs
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.engine import Epochs, Run, run_epochs
+from netpos.tracking.engine import Epochs, Run
 from netpos.tracking.epoch_rows import epoch_rows_of
 from netpos.tracking.models import motions_of, options_of
 from netpos.tracking.networks.common_instant import TRACK_STATES, at_common_instant, step_matrices
@@ -132,9 +133,10 @@ class Pass:
         n = self._epochs.size
         mean = np.zeros(8)
         mean[TRACK_STATES] = start
-        run = Run(np.empty((n, 8)), np.empty((n, 8, 8)), *np.empty((3, n)))
+        run = Run(np.empty((n, 8)), np.empty((n, 8, 8)), *np.empty((4, n)))
         epochs = Epochs(self._epochs, self._row_start, position_rows(fixes, self._sd))
-        run_epochs(epochs, mean, self._start_cov, self._motion, NO_BIAS, self._options, run)
+        model = Model(self._motion, NO_BIAS)
+        run_epochs(epochs, mean, self._start_cov, model, self._options, run)
         kept = np.ix_(np.arange(1, n), TRACK_STATES, TRACK_STATES)
         return run.means[1:, TRACK_STATES], run.covs[kept]
 

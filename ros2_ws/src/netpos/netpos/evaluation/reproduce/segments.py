@@ -8,13 +8,14 @@ import numpy as np
 import numpy.typing as npt
 
 from netpos.evaluation.metrics import NS
-from netpos.evaluation.reproduce.integrity import reported
+from netpos.evaluation.reproduce.integrity import levels
 from netpos.filters.measurement import BIAS
 from netpos.filters.state import N_CORE
 from netpos.messages.values import Array, ImuSample
 from netpos.tracking import engine, estimates
+from netpos.tracking.components import Model, run_epochs
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.engine import Run, run_epochs
+from netpos.tracking.engine import Run
 from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser
 from netpos.tracking.models import augmented, initial_extra_sd, motions_of, options_of
@@ -68,7 +69,7 @@ class Followed(NamedTuple):
 
 
 def _empty_run(epochs: int, n: int) -> Run:
-    figures = np.zeros((3, epochs))
+    figures = np.zeros((4, epochs))
     return Run(np.full((epochs, n), np.nan), np.full((epochs, n, n), np.nan), *figures)
 
 
@@ -118,14 +119,18 @@ class Follower:
             else:
                 done = self._stepped(part, mean, cov, own, imu, own_motions)
             end = first + done
-            self._report(part, _part(own, 0, done), own_motions, level[first:end])
+            level[first:end] = levels(
+                part.measured, _part(own, 0, done), own_motions, part.bias, self._options
+            )
             lost = end < count
             tracked[first : end - lost] = True  # nothing is published of the epoch of the loss
             losses += lost
             start = self._first_fix(epochs, end) if lost else None
         for array in (run.means, run.covs, level):
             array[~tracked] = np.nan
-        return Followed(run.means, run.covs, level, *run[2:], motions, tracked, losses)
+        return Followed(
+            run.means, run.covs, level, run.nis, run.dof, run.groups, motions, tracked, losses
+        )
 
     def _run_motions(self, count: int, driven: bool) -> Array:
         """(1 or N, Parameter): the N of a run that the IMU drives are filled on the way. Of models
@@ -138,7 +143,7 @@ class Follower:
         """Epochs done: all in one kernel."""
         mean, cov = self.augmented(mean, cov, epochs.bias)
         done: int = run_epochs(
-            epochs.measured, mean, cov, self._motions[0], epochs.bias, self._options, run
+            epochs.measured, mean, cov, Model(self._motions[0], epochs.bias), self._options, run
         )
         return done
 
@@ -173,17 +178,12 @@ class Follower:
                 rejected = 0 if 2 * taken.sum() >= taken.size else rejected + 1
                 heard_ns = stamp if run.dof[k] else heard_ns
             run.means[k], run.covs[k] = augmented(estimate.mean, estimate.cov, sd)
+            run.radius[k] = estimate.radius(0.0)
             if imu is not None:
                 motions[k] = estimate.motion
             if rejected >= config.max_rejected_epochs:
                 return k + 1
         return epochs.stamps_ns.size
-
-    def _report(self, epochs: Epochs, run: Run, motions: Array, level: Array) -> None:
-        """Put what a tracker publishes of a segment in its place, and fill ``level``."""
-        run.means[:], run.covs[:], level[:] = reported(
-            epochs.measured, run, motions, epochs.bias, self._options
-        )
 
     def _first_fix(self, epochs: Epochs, first: int) -> tuple[int, Array, Array] | None:
         """Epoch, mean (6,) and covariance (6, 6) of a first fix by the rows from ``first`` on;
