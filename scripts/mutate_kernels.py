@@ -43,17 +43,24 @@ TESTS_OF = {
     "kf": "test_kf.py test_gate.py",
     "manoeuvre": "test_manoeuvre.py",
     "measurement": "test_measurement.py test_measurement_curvature.py test_measurement_phase.py "
-    "test_measurement_rows.py test_step_velocity.py",
+    "test_measurement_rows.py test_step_velocity.py sensors/test_models.py",
     "motion": "test_motion.py test_motion_models.py",
     "position_fix": "test_position_fix.py",
     "robust": "test_robust.py",
     "rows": "test_measurement_rows.py test_measurement_phase.py",
     "sigma": "test_ukf.py",
     "smooth": "test_smooth.py",
-    "space": "test_space.py",
+    "space": "test_space.py sensors/test_models.py",
     "space_conditioning": "test_space_conditioning.py",
     "srukf": "test_srukf.py -knot+ten_thousand",
-    "step_velocity": "test_step_velocity.py test_measurement.py",
+    **{
+        f"filters/sensors/{name}": "test_models.py ../test_measurement.py ../test_space.py "
+        "../test_measurement_curvature.py ../test_measurement_phase.py ../test_step_velocity.py"
+        for name in (
+            *("azimuth", "elevation", "cone_angle", "range", "phase", "position"),
+            *("ground_speed", "step_velocity", "body_motion", "geometry"),
+        )
+    },
     "tracking/engine": "test_engine_parts.py test_engine.py -knot+equals_the_tracker",
     "tracking/fit": "test_protection.py -kinnovations_and_level+or+is_not_sound",
     "tracking/initialise": "test_initialise.py test_initialise_fit.py",
@@ -80,6 +87,10 @@ EQUIVALENT = {
     ("bearing", "fuse_bearing", "operator swapped: high - low"),  # nearer still than it has to be
     ("bearing", "fuse_bearing", "operator swapped: reach - 0.5 * a[0]"),  # ends beyond all weight
     ("measurement", "wrap", "operator swapped: angle + math.pi"),  # a whole turn away
+    *(  # both are squared
+        ("filters/sensors/range", "exact", f"operator swapped: {sum_}")
+        for sum_ in ("Pd += cov[i, j] * d[j]", "along += d[i] * Pd")
+    ),
     ("srukf", "_eliminate", "left out: continue"),
     ("sigma", "_regress", "left out: E[i, n] *= _SHIFT_WEIGHT"),  # is 1
     ("sigma", "_regress", "operator swapped: E[i, n] *= _SHIFT_WEIGHT"),
@@ -191,7 +202,7 @@ def folder_and_module(room: str) -> tuple[str, ModuleType]:
     """Where a room is."""
     folder, _, name = room.rpartition("/")
     folder = folder or "filters"
-    return folder, import_module(f"netpos.{folder}.{name}")
+    return folder, import_module(f"netpos.{folder.replace('/', '.')}.{name}")
 
 
 def kernels(module: ModuleType) -> Iterator[ast.FunctionDef]:

@@ -9,6 +9,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStam
 from netpos.messages import topics
 from netpos.messages.values import RsuMeasurement as Measurement
 from netpos.tracking import Tracker, TrackOutput
+from netpos.tracking.validation import explanation
 from netpos.tracking.warm_up import warm_up, warm_up_anchors
 from netpos_msgs.msg import NetworkTrack, RsuInfo, RsuMeasurement
 from netpos_node import CDR, CODEC, LATCHED, STREAM, patience, run, take_waiting
@@ -74,7 +75,10 @@ class EkfTrackerNode(EstimatingNode):
     def _add(self, item: Any) -> None:
         reason = self._tracker.add(item)
         if reason is not None:
-            source = f", from {item.rsu_id}" if isinstance(item, Measurement) else ""
+            source = ""
+            if isinstance(item, Measurement):
+                why = explanation(item, reason)
+                source = f", from {item.rsu_id}" + (f": {why}" if why else "")
             self.get_logger().warning(
                 f"{item.vue_id}: refused a {type(item).__name__}: {reason}{source}",
                 throttle_duration_sec=2.0,

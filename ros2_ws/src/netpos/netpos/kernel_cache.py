@@ -13,6 +13,10 @@ from pathlib import Path
 
 _VARIABLE = "NUMBA_CACHE_DIR"
 _KEPT = 4
+_MARKS = (b"@kernel", b"@leaf", b"@inlined", b"@link", b"njit")
+# The table of the sensors and the indices of states are compiled into kernels, too.
+_SENSORS = "sensors"
+_INDICES = ("state.py", "navigation_state.py")
 
 
 def cache_folder(root: Path) -> Path:
@@ -20,7 +24,8 @@ def cache_folder(root: Path) -> Path:
     digest = hashlib.blake2b(digest_size=8)
     for path in sorted(root.rglob("*.py")):
         text = path.read_bytes()
-        if b"@kernel" in text or b"@leaf" in text or b"njit" in text:
+        is_compiled = path.parent.name == _SENSORS or path.name in _INDICES
+        if is_compiled or any(mark in text for mark in _MARKS):
             digest.update(str(path.relative_to(root)).encode() + b"\0" + text)
     return root / "__pycache__" / f"kernels-{digest.hexdigest()}"
 

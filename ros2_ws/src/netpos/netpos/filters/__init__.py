@@ -2,7 +2,9 @@
 
 ``state``        which entry of a state is what
 ``motion``       f, F and Q of the process models
-``measurement``  one scalar row per measured quantity: h, H and which components are angles
+``sensors``      one module per sensor and the table of all: h, H, second-order term, refusals
+``measurement``  rows of measurements in a planar filter, ``space`` in a spatial one; ``rows``
+                 makes them of messages
 ``ekf``          extended and iterated extended Kalman filter: predict, gate, update
 ``fusion``, ``iteration``  rows into the estimate; again where the model bends (``fit``)
 ``ukf``, ``srukf``  unscented filters on ``sigma`` points, the second on the square root of P

@@ -24,6 +24,12 @@ inlined: Callable[..., Any] = njit(
     cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True
 )
 
+# An inlined closure made at import. Numba cannot find one in its cache again, and it need not: it
+# is part of the callers that are cached.
+link: Callable[..., Any] = njit(
+    error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True
+)
+
 
 def _local_array(_context: Any, *shape: Any) -> Any:
     """Array of a shape known at compile time on the stack of the kernel that calls it, its entries

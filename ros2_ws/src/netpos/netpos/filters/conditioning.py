@@ -15,13 +15,12 @@ from netpos.filters.measurement import (
     BLOCKED,
     GATE_VARIANCE,
     GROUP,
-    KIND,
     VALUE,
     VARIANCE,
-    Kind,
     curvature_variance,
     innovation_row,
     innovation_variance,
+    is_range,
     linearise,
 )
 from netpos.filters.robust import huber_factor, nlos_mixture_exponential, student_t_factor
@@ -71,7 +70,7 @@ def nlos_correct(
 @leaf
 def may_be_late(row: Array) -> bool:
     """Whether a blocked path makes the row late."""
-    return int(row[KIND]) == Kind.TOA or int(row[KIND]) == Kind.RANGE
+    return bool(is_range(row))
 
 
 @kernel

@@ -29,9 +29,10 @@ from netpos.filters.measurement import (
     ROW_WIDTH,
     VALUE,
     VARIANCE,
+    Kind,
 )
 from netpos.filters.motion import add_walk
-from netpos.filters.space import SpaceKind, innovation_at, linearise_in_space
+from netpos.filters.space import innovation_at, linearise_in_space
 from netpos.filters.state import ERR_BIASES, Err, Nav
 from netpos.inertial.strapdown import (
     ACCEL_BIAS,
@@ -70,7 +71,7 @@ _CREEP_MPS = 1.0
 _DOUBT_CHUNKS = 100
 """What contradicts the state ends a standstill, and no other begins for so long."""
 _CONSTRAINT_GATE = np.array([0.0, 15.14])  # chi-square, 1 dof, 0.9999
-_BODY_VELOCITY, _BODY_RATE = int(SpaceKind.BODY_VELOCITY), int(SpaceKind.BODY_RATE)
+_BODY_VELOCITY, _BODY_RATE = int(Kind.BODY_VELOCITY), int(Kind.BODY_RATE)
 
 
 class Constraints(NamedTuple):

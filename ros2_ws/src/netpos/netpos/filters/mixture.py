@@ -17,13 +17,12 @@ import numpy.typing as npt
 
 from netpos.filters.compile import kernel
 from netpos.filters.measurement import (
-    KIND,
     LEVER,
     ORIGIN,
     VARIANCE,
-    Kind,
     curvature_variance,
     innovation_row,
+    is_range,
 )
 from netpos.messages.values import Array
 
@@ -71,16 +70,11 @@ def _fuse(mean: Array, cov: Array, h: Array, residual: float, variance: float) -
 
 
 @kernel
-def _is_ranged(row: Array) -> bool:
-    return bool(int(row[KIND]) == Kind.RANGE or int(row[KIND]) == Kind.TOA)
-
-
-@kernel
 def outlier_log(rows: Array) -> float:
     """Log density of the values of one measurement that has nothing to do with the device."""
     total = math.log(_OUTLIERS)
     for i in range(rows.shape[0]):
-        total -= math.log(_OUTLIER_RANGE_M if _is_ranged(rows[i]) else 2.0 * math.pi)
+        total -= math.log(_OUTLIER_RANGE_M if is_range(rows[i]) else 2.0 * math.pi)
     return total
 
 
@@ -99,7 +93,7 @@ def is_wide(row: Array, mean: Array, cov: Array, height_m: float) -> bool:
     """Whether a component is to be split for a row: a range or time of arrival that narrows the
     position, but whose tangent does not hold over the component's width."""
     width2 = cov[0, 0] + cov[1, 1]
-    if not _is_ranged(row) or width2 < _NARROW_M * _NARROW_M:
+    if not is_range(row) or width2 < _NARROW_M * _NARROW_M:
         return False
     h = np.empty(mean.size)
     innovation_row(row, mean, height_m, h)

@@ -25,7 +25,9 @@ from netpos.filters.measurement import (
     VALUE,
     VARIANCE,
     Kind,
+    has_clock,
     is_angle,
+    is_range,
     wrap,
 )
 from netpos.filters.space import value_at
@@ -95,7 +97,7 @@ def _normal_equations(rows: Array, at: Array, A: Array, b: Array) -> float:
         residual = rows[i, VALUE] - value
         if is_angle(rows[i]):
             residual = wrap(residual)
-        if int(rows[i, KIND]) == Kind.TOA:
+        if has_clock(rows[i]):
             reference = residual if clock == 0.0 else reference
             residual -= reference
         weight = 1.0 / rows[i, VARIANCE]
@@ -105,7 +107,7 @@ def _normal_equations(rows: Array, at: Array, A: Array, b: Array) -> float:
             b[r] += weight * residual * g[r]
             for c in range(3):
                 A[r, c] += weight * g[r] * g[c]
-        if int(rows[i, KIND]) == Kind.TOA:
+        if has_clock(rows[i]):
             clock += weight
             late += weight * residual
             c0, c1, c2 = c0 + weight * g0, c1 + weight * g1, c2 + weight * g2
@@ -127,7 +129,7 @@ def fix_position(rows: Array, start: Array) -> Fix:
     A, b, cov = np.empty((3, 3)), np.empty(3), np.zeros((3, 3))
     unknowns = 3
     for i in range(rows.shape[0]):
-        if int(rows[i, KIND]) == Kind.TOA:
+        if has_clock(rows[i]):
             unknowns = 4
     if rows.shape[0] < unknowns:
         return Fix(at, cov, _TOO_FEW, 0)
@@ -162,8 +164,7 @@ def start_of(rows: Array, height_m: float) -> Array:
     start = np.zeros(3)
     nearest, count = math.inf, 0
     for i in range(rows.shape[0]):
-        kind = int(rows[i, KIND])
-        if kind == Kind.RANGE or kind == Kind.TOA:
+        if is_range(rows[i]):
             start[:2] += rows[i, ORIGIN : ORIGIN + 2]
             count += 1
     start /= max(count, 1)
@@ -176,7 +177,7 @@ def start_of(rows: Array, height_m: float) -> Array:
             rows[i, ORIGIN] == rows[i - 2, ORIGIN]
             and rows[i, ORIGIN + 1] == rows[i - 2, ORIGIN + 1]
         )
-        ranged = int(rows[i, KIND]) == Kind.RANGE
+        ranged = is_range(rows[i]) and not has_clock(rows[i])
         if not (angles and same and ranged and rows[i, VALUE] < nearest):
             continue
         nearest = rows[i, VALUE]

@@ -6,10 +6,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from netpos.filters.compile import leaf
+from netpos.filters.compile import inlined, leaf, link
 from netpos.filters.measurement import (
     AXES,
     BIAS,
@@ -26,17 +29,17 @@ from netpos.filters.measurement import (
     VARIANCE,
     Kind,
 )
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.filters.sensors.dispatch import choose
+from netpos.filters.sensors.model import Kernel, Reading
+from netpos.filters.sensors.table import readings
 from netpos.filters.state import N_CORE
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 
-# Plain integers: arithmetic of flags costs ten times as much.
-_AZIMUTH, _ELEVATION, _TOA = int(Field.AZIMUTH), int(Field.ELEVATION), int(Field.TOA)
-_RANGE, _PHASE, _POSITION = int(Field.RANGE), int(Field.PHASE), int(Field.POSITION)
-_PLACE = HEADING - ORIGIN  # what of a row says where its RSU is
-_MASTER, _ALONG = 12, 15  # in ``rsu_place``, after ORIGIN and AXES
+_POSITION = int(Field.POSITION)  # a plain integer: arithmetic of flags costs ten times as much
+_MIDDLE, _POSE, _MASTER, _ALONG = 0, 3, 12, 15  # in ``rsu_place``
 _CONE = AngleConvention.CONE
-ROWS_MAX = 7  # of one measurement: five scalars and a position
+ROWS_MAX = len({reading.field for _, reading in readings()}) + 2
+"""Rows of one measurement at most: its scalars and a position."""
 
 
 def rsu_axes(info: RsuInfo) -> Array:
@@ -76,98 +79,98 @@ class Coupling:
 UNCOUPLED = Coupling({}, {}, {})
 
 
+class ScalarPlan(NamedTuple):
+    """What the scalar rows of a measurement are made of, k of them."""
+
+    kinds: tuple[Kind, ...]
+    read: attrgetter[tuple[float, ...]] | None
+    """Gives value and variance of each, one after the other; None: no rows."""
+    sources: npt.NDArray[np.int64]
+    """(k, 3): kind, and where in ``rsu_place`` its ORIGIN and the first of its AXES are."""
+
+
 @lru_cache(256)
-def scalar_kinds(fields: int, convention: AngleConvention) -> tuple[Kind, ...]:
-    """Kinds of the rows a measurement with these fields gives, in their order; those of a position
-    are left out."""
-    angles = (Kind.COSINE_Y, Kind.COSINE_Z) if convention is _CONE else (Kind(0), Kind(1))
-    kinds = ((_AZIMUTH, angles[0]), (_ELEVATION, angles[1]), (_TOA, Kind.TOA))
-    return tuple(
-        kind
-        for flag, kind in (*kinds, (_RANGE, Kind.RANGE), (_PHASE, Kind.PHASE))
-        if fields & flag
+def scalar_plan(fields: int, cone: bool) -> ScalarPlan:
+    """Plan of a measurement with these ``fields`` by an RSU whose angles are those of linear
+    arrays, or not."""
+    convention = _CONE if cone else AngleConvention.SPHERICAL
+    chosen = [
+        (sensor, reading)
+        for sensor, reading in readings()
+        if fields & reading.field and reading.convention in (None, convention)
+    ]
+    names = [name for _, r in chosen for name in (r.value, r.variance)]
+    sources = [
+        (s.kind, _MASTER if r.from_master else _MIDDLE, _ALONG if r.along_array else _POSE)
+        for s, r in chosen
+    ]
+    return ScalarPlan(
+        tuple(Kind(sensor.kind) for sensor, _ in chosen),
+        attrgetter(*names) if names else None,
+        np.array(sources, dtype=np.int64).reshape(-1, 3),
     )
 
 
-@leaf
-def _put(rows: Array, at: int, kind: Kind, value: float, variance: float, place: Array) -> int:
-    """Write a row; the index of the next one."""
-    row = rows[at]
-    row[KIND], row[VALUE] = kind.value, value
-    row[VARIANCE] = row[GATE_VARIANCE] = variance
-    row[BIAS] = row[COMMON] = -1.0
-    for i in range(_PLACE):
-        row[ORIGIN + i] = place[i]
-    if kind == Kind.TOA or kind == Kind.RANGE:
-        for i in range(3):
-            row[ORIGIN + i] = place[_MASTER + i]
-    elif kind == Kind.PHASE:
-        for i in range(3):
-            row[AXES + i] = place[_ALONG + i]
-    return at + 1
+def scalar_kinds(fields: int, convention: AngleConvention) -> tuple[Kind, ...]:
+    """Kinds of the rows a measurement with these fields gives, in their order; those of a position
+    are left out."""
+    return scalar_plan(fields, convention is _CONE).kinds
 
 
-@leaf
-def _put_angle(
-    rows: Array, at: int, kind: Kind, angle: float, variance: float, place: Array, cone: bool
-) -> int:
-    """``_put`` of an azimuth or elevation; of the sine, which is a direction cosine, where it is
-    that of a cone. Its variance is at end-fire no smaller than the second-order term."""
-    if not cone:
-        return int(_put(rows, at, kind, angle, variance, place))
-    cosine = Kind.COSINE_Y if kind == Kind.AZIMUTH else Kind.COSINE_Z
-    of_sine = max(math.cos(angle) ** 2 * variance, variance * variance / 2.0)
-    return int(_put(rows, at, cosine, math.sin(angle), of_sine, place))
+@inlined
+def _as_it_is(value: float, variance: float) -> tuple[float, float]:
+    return value, variance
+
+
+def _converted(reading: Reading) -> Kernel:
+    """Value and variance of the message to those of the row."""
+    scale, to_row = reading.scale, reading.to_row or _as_it_is
+
+    @link
+    def converted(value: float, variance: float) -> tuple[float, float]:
+        return to_row(scale * value, scale * scale * variance)  # type: ignore[no-any-return]
+
+    return converted  # type: ignore[no-any-return]
+
+
+_to_row = choose([(sensor.kind, _converted(reading)) for sensor, reading in readings()], _as_it_is)
 
 
 @leaf
 def put_scalars(
     rows: Array,
     at: int,
+    sources: npt.NDArray[np.int64],
+    values: Array,
+    place: Array,
+    lever_arm: tuple[float, float, float],
     group: int,
     heading: int,
-    fields: int,
-    cone: bool,
-    place: Array,
-    azimuth: float,
-    azimuth_var: float,
-    elevation: float,
-    elevation_var: float,
-    toa: float,
-    toa_var: float,
-    distance: float,
-    distance_var: float,
-    phase: float,
-    phase_var: float,
-    forward: float,
-    left: float,
-    up: float,
 ) -> int:
-    """Write the rows of the scalar quantities that ``fields`` names from ``rows[at]`` on; the
-    index after the last one.
+    """Write the rows of scalar quantities from ``rows[at]`` on; the index after the last one.
 
-    place : (18,) of ``rsu_place``; forward, left, up : lever arm [m]; the rest as measured
+    sources : (k, 3) of ``ScalarPlan``; values : (2 k,) as its ``read`` gives them
+    place : (18,) of ``rsu_place``
     """
-    first, c = at, SPEED_OF_LIGHT_MPS
-    if fields & _AZIMUTH:
-        at = _put_angle(rows, at, Kind.AZIMUTH, azimuth, azimuth_var, place, cone)
-    if fields & _ELEVATION:
-        at = _put_angle(rows, at, Kind.ELEVATION, elevation, elevation_var, place, cone)
-    if fields & _TOA:
-        at = _put(rows, at, Kind.TOA, c * toa, c * c * toa_var, place)
-    if fields & _RANGE:
-        at = _put(rows, at, Kind.RANGE, distance, distance_var, place)
-    if fields & _PHASE:
-        at = _put(rows, at, Kind.PHASE, phase, phase_var, place)
-    for i in range(first, at):
-        rows[i, GROUP], rows[i, HEADING], rows[i, BLOCKED] = group, heading, 0.0
-        rows[i, LEVER], rows[i, LEVER + 1], rows[i, LEVER + 2] = forward, left, up
-    return at
+    for k in range(sources.shape[0]):
+        row, kind = rows[at + k], sources[k, 0]
+        value, variance = _to_row(kind, values[2 * k], values[2 * k + 1])
+        row[KIND], row[VALUE] = kind, value
+        row[VARIANCE] = row[GATE_VARIANCE] = variance
+        row[BIAS] = row[COMMON] = -1.0
+        row[GROUP], row[HEADING], row[BLOCKED] = group, heading, 0.0
+        for i in range(HEADING - AXES):
+            row[AXES + i] = place[_POSE + i]
+        for i in range(3):
+            row[ORIGIN + i] = place[sources[k, 1] + i]
+            row[AXES + i] = place[sources[k, 2] + i]
+        row[LEVER], row[LEVER + 1], row[LEVER + 2] = lever_arm[0], lever_arm[1], lever_arm[2]
+    return int(at + sources.shape[0])
 
 
 def rsu_place(info: RsuInfo, axes: Array) -> Array:
-    """Where an RSU is, for ``put_scalars``: position, ``axes`` (9,) of ``rsu_axes``, where its
-    ranges and times count from, what its phases count along."""
+    """Where an RSU is (18,), for ``put_scalars``: position, ``axes`` (9,) of ``rsu_axes``, where
+    its ranges and times count from, what its phases count along."""
     along, master, turns = array_direction(axes), info.position, axes[:3]
     if info.baseline_m > 0.0:
         master = info.position + info.baseline_m / 2.0 * along
@@ -181,26 +184,10 @@ def put_measurement(
     """Write the rows of one RSU measurement, without biases, from ``rows[at]`` on; the index after
     the last one. A position fix of its antenna becomes two decorrelated LINEAR rows."""
     fields = int(m.fields)
-    at = put_scalars(
-        rows,
-        at,
-        group,
-        heading,
-        fields,
-        cone,
-        place,
-        m.azimuth_rad,
-        m.azimuth_var,
-        m.elevation_rad,
-        m.elevation_var,
-        m.toa_s,
-        m.toa_var,
-        m.range_m,
-        m.range_var,
-        m.phase_difference_rad,
-        m.phase_difference_var,
-        *m.lever_arm,
-    )
+    _, read, sources = scalar_plan(fields, cone)
+    if read is not None:
+        values = np.array(read(m), np.float64)
+        at = put_scalars(rows, at, sources, values, place, m.lever_arm, group, heading)
     if fields & _POSITION:
         fix = linear_rows(m.position[:2], m.position_cov[:2, :2], np.eye(2, N_CORE), group)
         fix[:, HEADING:BLOCKED] = heading, *m.lever_arm

@@ -1,14 +1,9 @@
-"""Measurement rows in space: any quantity of ``measurement``, seen from a navigation state.
+"""Rows of measurements in a spatial filter: any sensor, seen from a navigation state.
 
-Rows are those of ``measurement``; with C and p of the state, the antenna stands at
-a = p + C lever and d = a - origin. Rows of the kinds here hold a direction u in ORIGIN:
-
-    PLACE          u . a              a position, one axis at a time     (deng2022:eq.8)
-    BODY_VELOCITY  u . C' v           non-holonomic and zero-velocity constraints
-    BODY_RATE      u . gyro bias      a gyro at rest shows nothing else
-
-A TOA is a range plus the clock's offset where the state has one; the biases an RSU's rows name
-are added (``error_state`` tells the order of the states).
+With p, v and the attitude C of the state the antenna is at a = p + C lever, and d = a - RSU. A
+sensor of d is the same function as in a planar filter (``measurement.of_offset``); others are
+functions of a or of the whole state. A TOA is a range plus the clock's offset where the state has
+one; the biases an RSU's rows name are added (``error_state`` tells the order of the states).
 
 With the error state of ``inertial.strapdown`` and r = C lever the Jacobian of a function of a
 with gradient g is [g, 0, r x g, 0, 0].
@@ -17,11 +12,10 @@ with gradient g is [g, 0, r x g, 0, 0].
 from __future__ import annotations
 
 import math
-from enum import IntEnum
 
 import numpy as np
 
-from netpos.filters.compile import kernel, leaf
+from netpos.filters.compile import inlined, kernel, leaf
 from netpos.filters.measurement import (
     BIAS,
     COMMON,
@@ -35,45 +29,75 @@ from netpos.filters.measurement import (
     VALUE,
     VARIANCE,
     Kind,
-    direction,
-    is_angle,
-    range_second_order_variance,
+    has_clock,
+    is_cyclic,
+    of_offset,
+    second_order_of_offset,
     wrap,
 )
+from netpos.filters.sensors.dispatch import choose, is_one_of
+from netpos.filters.sensors.table import SENSORS
 from netpos.filters.state import Err, Nav
-from netpos.inertial.strapdown import (
-    ACCEL_BIAS,
-    ATTITUDE_ERR,
-    GYRO_BIAS,
-    GYRO_BIAS_ERR,
-    QUATERNION,
-    VELOCITY,
-    rotation_of,
-)
+from netpos.inertial.navigation_state import ACCEL_BIAS, QUATERNION
+from netpos.inertial.strapdown import rotation_of
 from netpos.messages.values import Array
 
 
-class SpaceKind(IntEnum):
-    """What a row measures that a planar filter does not take; numbered on from ``Kind``."""
+@inlined
+def _no_antenna_value(
+    _row: Array, _x: float, _y: float, _z: float
+) -> tuple[float, float, float, float]:
+    return math.nan, math.nan, math.nan, math.nan
 
-    PLACE = 11
-    BODY_VELOCITY = 12
-    BODY_RATE = 13
+
+@inlined
+def _no_navigation_value(_row: Array, _nav: Array, _C: Array, _h: Array) -> float:
+    return math.nan
+
+
+_of_antenna = choose([(s.kind, s.of_antenna) for s in SENSORS], _no_antenna_value)
+_of_navigation = choose([(s.kind, s.of_navigation) for s in SENSORS], _no_navigation_value)
+_has_antenna_model = is_one_of(s.kind for s in SENSORS if s.of_antenna)
+_has_navigation_model = is_one_of(s.kind for s in SENSORS if s.of_navigation)
+_has_offset_model = is_one_of(s.kind for s in SENSORS if s.of_offset)
+_adds_biases = is_one_of(s.kind for s in SENSORS if s.adds_biases)
 
 
 @leaf
 def value_at(row: Array, x: float, y: float, z: float) -> tuple[float, float, float, float]:
     """Predicted value of a row for an antenna at (x, y, z) in map, and its gradient there."""
-    o = ORIGIN
     kind = int(row[KIND])
-    if kind == SpaceKind.PLACE:
-        value = row[o] * x + row[o + 1] * y + row[o + 2] * z
-        return value, row[o], row[o + 1], row[o + 2]
-    dx, dy, dz = x - row[o], y - row[o + 1], z - row[o + 2]
-    if kind == Kind.RANGE or kind == Kind.TOA:
-        r = max(math.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
-        return r, dx / r, dy / r, dz / r
-    return direction(row, dx, dy, dz)  # type: ignore[no-any-return]
+    if _has_antenna_model(kind):
+        return _of_antenna(kind, row, x, y, z)  # type: ignore[no-any-return]
+    dx, dy, dz = x - row[ORIGIN], y - row[ORIGIN + 1], z - row[ORIGIN + 2]
+    return of_offset(kind, row, dx, dy, dz)  # type: ignore[no-any-return]
+
+
+@inlined
+def _lever(row: Array, C: Array) -> tuple[float, float, float]:
+    """Lever arm of the antenna, in map."""
+    a = LEVER
+    return (
+        C[0, 0] * row[a] + C[0, 1] * row[a + 1] + C[0, 2] * row[a + 2],
+        C[1, 0] * row[a] + C[1, 1] * row[a + 1] + C[1, 2] * row[a + 2],
+        C[2, 0] * row[a] + C[2, 1] * row[a + 1] + C[2, 2] * row[a + 2],
+    )
+
+
+@inlined
+def _of_position(row: Array, nav: Array, C: Array, h: Array) -> float:
+    """Value of a sensor of the antenna's position."""
+    rx, ry, rz = _lever(row, C)
+    x, y, z = nav[Nav.PX] + rx, nav[Nav.PY] + ry, nav[Nav.PZ] + rz
+    value, gx, gy, gz = value_at(row, x, y, z)
+    h[Err.PX], h[Err.PY], h[Err.PZ] = gx, gy, gz
+    h[Err.ROLL] = ry * gz - rz * gy
+    h[Err.PITCH] = rz * gx - rx * gz
+    h[Err.YAW] = rx * gy - ry * gx
+    if has_clock(row) and h.size > Err.CLOCK:
+        h[Err.CLOCK] = 1.0
+        value += nav[Nav.CLOCK]
+    return float(value)
 
 
 @leaf
@@ -84,44 +108,18 @@ def innovation_at(row: Array, nav: Array, C: Array, h: Array) -> float:
     """
     h[:] = 0.0
     kind = int(row[KIND])
-    u = ORIGIN
-    if kind == SpaceKind.BODY_RATE:
-        value = 0.0
-        for i in range(3):
-            h[GYRO_BIAS_ERR + i] = row[u + i]
-            value += row[u + i] * nav[GYRO_BIAS + i]
-        return float(row[VALUE] - value)
-    if kind == SpaceKind.BODY_VELOCITY:
-        value = 0.0
-        for i in range(3):
-            h[VELOCITY + i] = C[i, 0] * row[u] + C[i, 1] * row[u + 1] + C[i, 2] * row[u + 2]
-            value += h[VELOCITY + i] * nav[VELOCITY + i]
-        for i in range(3):  # (C u) x v
-            j, k = (i + 1) % 3, (i + 2) % 3
-            h[ATTITUDE_ERR + i] = (
-                h[VELOCITY + j] * nav[VELOCITY + k] - h[VELOCITY + k] * nav[VELOCITY + j]
-            )
-        return float(row[VALUE] - value)
-    a = LEVER
-    rx = C[0, 0] * row[a] + C[0, 1] * row[a + 1] + C[0, 2] * row[a + 2]
-    ry = C[1, 0] * row[a] + C[1, 1] * row[a + 1] + C[1, 2] * row[a + 2]
-    rz = C[2, 0] * row[a] + C[2, 1] * row[a + 1] + C[2, 2] * row[a + 2]
-    x, y, z = nav[Nav.PX] + rx, nav[Nav.PY] + ry, nav[Nav.PZ] + rz
-    value, gx, gy, gz = value_at(row, x, y, z)
-    h[Err.PX], h[Err.PY], h[Err.PZ] = gx, gy, gz
-    h[Err.ROLL] = ry * gz - rz * gy
-    h[Err.PITCH] = rz * gx - rx * gz
-    h[Err.YAW] = rx * gy - ry * gx
-    if kind == Kind.TOA and h.size > Err.CLOCK:
-        h[Err.CLOCK] = 1.0
-        value += nav[Nav.CLOCK]
-    for column in (BIAS, COMMON):
-        index = int(row[column])
-        if Err.CLOCK < index < h.size:  # a state without clock and biases takes none
-            h[index] = 1.0
-            value += nav[index + 1]
+    if _has_navigation_model(kind):
+        value = float(_of_navigation(kind, row, nav, C, h))
+    else:
+        value = _of_position(row, nav, C, h)
+    if _adds_biases(kind):
+        for column in (BIAS, COMMON):
+            index = int(row[column])
+            if Err.CLOCK < index < h.size:  # a state without clock and biases takes none
+                h[index] = 1.0
+                value += nav[index + 1]
     difference = row[VALUE] - value
-    return float(wrap(difference)) if is_angle(row) else float(difference)
+    return float(wrap(difference)) if is_cyclic(row) else float(difference)
 
 
 @leaf
@@ -129,25 +127,12 @@ def bend_variance(row: Array, nav: Array, cov: Array) -> float:
     """Variance of what linearising ``row`` leaves out, for the position covariance in ``cov``:
     ``measurement.curvature_variance`` in space (lever arm left out)."""
     kind = int(row[KIND])
-    if kind >= SpaceKind.PLACE:
+    if not _has_offset_model(kind):
         return 0.0
-    d0 = nav[Nav.PX] - row[ORIGIN]
-    d1 = nav[Nav.PY] - row[ORIGIN + 1]
-    d2 = nav[Nav.PZ] - row[ORIGIN + 2]
-    if kind == Kind.RANGE or kind == Kind.TOA:
-        return float(range_second_order_variance(d0, d1, d2, cov, 3))
-    rho2 = max(d0 * d0 + d1 * d1, 1e-6)
-    r2 = rho2 + d2 * d2
-    square = 0.0
-    for i in range(3):
-        for j in range(3):
-            square += cov[i, j] * cov[i, j]
-    if kind == Kind.AZIMUTH:
-        plane = (
-            cov[Err.PX, Err.PX] ** 2 + 2.0 * cov[Err.PX, Err.PY] ** 2 + cov[Err.PY, Err.PY] ** 2
-        )
-        return float(0.5 * plane / (rho2 * rho2))
-    return float(0.5 * square / (r2 * r2))
+    dx = nav[Nav.PX] - row[ORIGIN]
+    dy = nav[Nav.PY] - row[ORIGIN + 1]
+    dz = nav[Nav.PZ] - row[ORIGIN + 2]
+    return float(second_order_of_offset(kind, row, dx, dy, dz, cov, 3))
 
 
 @kernel
@@ -165,7 +150,7 @@ def linearise_in_space(rows: Array, nav: Array, cov: Array) -> tuple[Array, Arra
 
 
 def direction_rows(
-    kind: SpaceKind, directions: Array, values: Array, variances: Array, group: int
+    kind: Kind, directions: Array, values: Array, variances: Array, group: int
 ) -> Array:
     """Rows (..., ROW_WIDTH) of one group: components ``values`` (...) of a vector along
     ``directions`` (..., 3)."""
@@ -190,6 +175,6 @@ def place_rows(
     factor = np.linalg.cholesky((cov + np.swapaxes(cov, -1, -2)) / 2.0)
     directions = np.linalg.inv(factor)
     values = np.einsum("...ij,...j->...i", directions, position)
-    rows = direction_rows(SpaceKind.PLACE, directions, values, np.ones_like(values), group)
+    rows = direction_rows(Kind.PLACE, directions, values, np.ones_like(values), group)
     rows[..., LEVER : LEVER + 3] = lever
     return rows

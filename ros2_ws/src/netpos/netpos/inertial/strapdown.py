@@ -29,13 +29,47 @@ import numpy.typing as npt
 from numba import njit
 
 from netpos.inertial.attitude import GRAVITY_MPS2
+from netpos.inertial.navigation_state import (
+    ACCEL_BIAS,
+    ACCEL_BIAS_ERR,
+    ATTITUDE_ERR,
+    ERR,
+    GYRO_BIAS,
+    GYRO_BIAS_ERR,
+    NAV,
+    POSITION,
+    QUATERNION,
+    VELOCITY,
+)
+
+__all__ = [
+    "ACCEL_BIAS",
+    "ACCEL_BIAS_ERR",
+    "ATTITUDE_ERR",
+    "EARTH_RATE_RADPS",
+    "ERR",
+    "GYRO_BIAS",
+    "GYRO_BIAS_ERR",
+    "NAV",
+    "POSITION",
+    "QUATERNION",
+    "VELOCITY",
+    "Earth",
+    "InertialNoise",
+    "cross",
+    "decay_biases",
+    "earth_at",
+    "inject",
+    "mechanise",
+    "propagate",
+    "rotate",
+    "rotation_of",
+    "still_earth",
+    "transition",
+]
 
 Array = npt.NDArray[np.float64]
 
-POSITION, VELOCITY, QUATERNION, ACCEL_BIAS, GYRO_BIAS = 0, 3, 6, 10, 13  # in NAV
-NAV = 16
-ATTITUDE_ERR, ACCEL_BIAS_ERR, GYRO_BIAS_ERR = 6, 9, 12  # in ERR, whose begin is that of NAV
-ERR = 15
 EARTH_RATE_RADPS = 7.292115e-5
 _SMALL = 1e-8
 

@@ -39,8 +39,9 @@ Ints = npt.NDArray[np.int64]
 
 Direction = tuple[float, float, float]
 
-AZIMUTH, ELEVATION, TOA, RANGE, PHASE = range(5)  # columns of values and variances
-QUANTITIES = 5
+QUANTITIES = ("azimuth", "elevation", "toa", "range", "phase")
+"""What is simulated: names of the columns of values and variances."""
+AZIMUTH, ELEVATION, TOA, RANGE, PHASE = range(5)
 ALWAYS_VISIBLE = -1
 _ROUNDING = 1.0 + 1e-12  # squared distances may be compared within this factor only
 
@@ -288,8 +289,8 @@ def observe(
     n, nearest = stamps_ns.size, sight.nearest
     heard_by = np.zeros(n, dtype=np.int64)
     rsu = np.full((n, nearest), -1, dtype=np.int64)
-    values = np.zeros((n, nearest, QUANTITIES))
-    variances = np.zeros((n, nearest, QUANTITIES))
+    values = np.zeros((n, nearest, len(QUANTITIES)))
+    variances = np.zeros((n, nearest, len(QUANTITIES)))
     rssi = np.zeros((n, nearest))
     plane = np.empty(nearest)
     hint = np.full(nearest, -1, dtype=np.int64)

@@ -7,13 +7,23 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from netpos.filters.sensors.table import readings
 from netpos.radio.anchor import TwoWayRanging
 from netpos.radio.arrays import AntennaArray
 from netpos.radio.propagation import LosModel, PathLoss
 from netpos.radio.waveform import Waveform
 from netpos.scenario.section import Positive, Section
 
-Quantity = Literal["azimuth", "elevation", "toa", "range", "position", "phase"]
+_SIMULATED = {r.quantity: r.simulated for _, r in readings() if r.simulated is not None}
+_QUANTITIES = (*_SIMULATED, "position")
+_ERRORS = {
+    "azimuth": "azimuth_sd_deg",
+    "elevation": "elevation_sd_deg",
+    "toa": "toa_sd_s",
+    "range": "range_sd_m",
+    "phase": "phase_sd_deg",
+}
+"""Which of ``FixedErrors`` is the error of each of ``radio.measure.QUANTITIES``."""
 
 
 class LineOfSight(Section):
@@ -61,7 +71,7 @@ class Measurement(Section):
     """What the RSUs measure of each beacon; the ``nearest`` RSUs with a line of sight report it,
     or of these a number drawn evenly for each beacon, at least ``fewest`` (deng2022)."""
 
-    quantities: tuple[Quantity, ...] = ("azimuth", "toa")
+    quantities: tuple[str, ...] = ("azimuth", "toa")
     nearest: int = Field(default=2, ge=1)
     fewest: int | None = Field(default=None, ge=1)
     los: LineOfSight = LineOfSight()
@@ -71,22 +81,17 @@ class Measurement(Section):
     def _complete(self) -> Self:
         if self.fewest is not None and self.fewest > self.nearest:
             raise ValueError(f"fewest must be at most nearest ({self.nearest}), got {self.fewest}")
-        if not self.quantities or len(set(self.quantities)) < len(self.quantities):
+        unknown = set(self.quantities) - set(_QUANTITIES)
+        if unknown or not self.quantities or len(set(self.quantities)) < len(self.quantities):
             raise ValueError(
-                "quantities must name each of azimuth, elevation, toa, range, position, phase at"
-                " most once"
+                f"quantities must name each of {', '.join(_QUANTITIES)} at most once, "
+                f"got {', '.join(self.quantities) or 'none'}"
             )
         if isinstance(self.errors, FixedErrors):
-            keys = {
-                "azimuth": "azimuth_sd_deg",
-                "elevation": "elevation_sd_deg",
-                "toa": "toa_sd_s",
-                "range": "range_sd_m",
-                "position": "position_sd_m",
-                "phase": "phase_sd_deg",
-            }
+            keys = {quantity: _ERRORS[drawn] for quantity, drawn in _SIMULATED.items()}
+            keys["position"] = "position_sd_m"
             if self.errors.two_way_ranging is not None:
-                keys["range"] = "two_way_ranging"
+                keys = {q: k.replace("range_sd_m", "two_way_ranging") for q, k in keys.items()}
             for quantity in self.quantities:
                 if getattr(self.errors, keys[quantity]) is None:
                     raise ValueError(

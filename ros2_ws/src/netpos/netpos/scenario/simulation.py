@@ -10,10 +10,12 @@ from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from netpos.filters.sensors.table import readings
 from netpos.inertial.imu import NS, ImuSamples, interval_ns, simulate_imu, simulate_magnetometer
 from netpos.messages.values import (
     Beacon,
@@ -27,17 +29,7 @@ from netpos.messages.values import (
     RsuMeasurement,
 )
 from netpos.radio.clocks import simulate_clock
-from netpos.radio.measure import (
-    AZIMUTH,
-    ELEVATION,
-    PHASE,
-    RANGE,
-    TOA,
-    Observations,
-    Sight,
-    Sites,
-    observe,
-)
+from netpos.radio.measure import QUANTITIES, Observations, Sight, Sites, observe
 from netpos.radio.noise import generator
 from netpos.scenario.build import (
     clock_tones_of,
@@ -56,21 +48,8 @@ Array = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
 Event = Odometry | ClockState | Beacon | ImuSample | MagneticSample | InitialPose
 
-_FIELDS = {
-    "azimuth": Field.AZIMUTH,
-    "elevation": Field.ELEVATION,
-    "toa": Field.TOA,
-    "range": Field.RANGE,
-    "position": Field.POSITION,
-    "phase": Field.PHASE,
-}
-_COLUMNS = (
-    Field.AZIMUTH,
-    Field.ELEVATION,
-    Field.TOA,
-    Field.RANGE,
-    Field.PHASE,
-)  # of Observations.values
+_READINGS = {r.quantity: r for _, r in readings() if r.simulated is not None}
+_FIELDS = {"position": Field.POSITION, **{name: r.field for name, r in _READINGS.items()}}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,8 +71,14 @@ class Simulation:
         self.scenario = scenario
         self.rsus: tuple[RsuInfo, ...] = rsus_of(scenario)
         """The RSUs, in the order of ``Observations.rsu``."""
-        self.fields = Field(sum(_FIELDS[q] for q in scenario.measurement.quantities))
+        quantities = scenario.measurement.quantities
+        self.fields = Field(sum(_FIELDS[q] for q in quantities))
         """The quantities every measurement carries."""
+        self._carried = [
+            (r.value, r.variance, QUANTITIES.index(str(r.simulated)))
+            for name, r in _READINGS.items()
+            if name in quantities
+        ]
         self._rotations = rotations_of(self.rsus)
         self._errors = errors_of(scenario)
         self._sights = {vue: sight_of(scenario, device) for vue, device in scenario.each_device}
@@ -217,12 +202,13 @@ class Simulation:
     def _measurement(
         self, beacon: Beacon, part: Answering, seen: Observations, j: int
     ) -> RsuMeasurement:
-        value, variance, fields = seen.values[0, j], seen.variances[0, j], self.fields
-        masked = np.array([bool(fields & f) for f in _COLUMNS])
-        value, variance = np.where(masked, value, 0.0), np.where(masked, variance, 0.0)
+        scalars: dict[str, Any] = {}
+        for value, variance, column in self._carried:
+            scalars[value] = float(seen.values[0, j, column])
+            scalars[variance] = float(seen.variances[0, j, column])
         rsu_id = self.rsus[int(part.rsus[seen.rsu[0, j]])].rsu_id
         fix, fix_cov = np.zeros(3), np.zeros((3, 3))
-        if fields & Field.POSITION:
+        if self.fields & Field.POSITION:
             fix, fix_cov = part.fix(beacon, rsu_id, self.scenario.seed)
         return RsuMeasurement(
             stamp_ns=beacon.stamp_ns,
@@ -230,21 +216,12 @@ class Simulation:
             vue_id=part.names[beacon.vue_id],
             sequence=beacon.sequence,
             expected=int(seen.heard_by[0]),
-            fields=fields,
+            fields=self.fields,
             rssi_dbm=float(seen.rssi_dbm[0, j]),
-            azimuth_rad=float(value[AZIMUTH]),
-            azimuth_var=float(variance[AZIMUTH]),
-            elevation_rad=float(value[ELEVATION]),
-            elevation_var=float(variance[ELEVATION]),
-            toa_s=float(value[TOA]),
-            toa_var=float(variance[TOA]),
-            range_m=float(value[RANGE]),
-            range_var=float(variance[RANGE]),
             position=fix,
             position_cov=fix_cov,
             lever_arm=self._vues[beacon.vue_id].lever_arm_m,
-            phase_difference_rad=float(value[PHASE]),
-            phase_difference_var=float(variance[PHASE]),
+            **scalars,
         )
 
 

@@ -8,12 +8,14 @@ from statistics import median
 
 from netpos.filters.measurement import wrap
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.filters.sensors.model import Wraps
+from netpos.filters.sensors.table import SENSORS
 from netpos.tracking.observations import Observation
 
 _OFF = _SCATTERS = 3.0  # median and sd of the normalised innovations of what is refused
 _NORMAL_QUARTILE = 0.6744897501960817
 _RATE_NS = 10_000_000_000
-_CYCLIC = {"azimuth", "elevation", "phase"}
+_CYCLIC = {sensor.name.lower() for sensor in SENSORS if sensor.wraps != Wraps.NEVER}
 
 
 def words(entries: Sequence[Observation]) -> str:

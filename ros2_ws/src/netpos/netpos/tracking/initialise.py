@@ -38,6 +38,7 @@ from netpos.filters.measurement import (
     wrap,
 )
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.filters.sensors.table import BY_KIND
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.rsus import Rsu
@@ -211,7 +212,7 @@ class Initialiser:
             tuple(row[ORIGIN:AXES])
             for e in self._window
             for row in e[1]
-            if int(row[KIND]) in (Kind.RANGE, Kind.TOA)
+            if BY_KIND[int(row[KIND])].is_range
         }
         for rsu in heard.values():
             dx, dy = state[:2] - rsu.info.position[:2]
@@ -302,9 +303,9 @@ def _starts(rows: Array, centre: Array) -> list[Array]:
             angle = row[VALUE] if kind is Kind.AZIMUTH else math.asin(np.clip(row[VALUE], -1, 1))
             ray = A.T @ np.array([math.cos(angle), math.sin(angle), 0.0])
             starts += [origin + r * ray[:2] for r in _RAY_M]
-        elif kind is Kind.RANGE:
+        elif BY_KIND[kind].is_range and not BY_KIND[kind].has_clock:
             starts += [origin + row[VALUE] * np.array([math.cos(a), math.sin(a)]) for a in _CIRCLE]
-        elif kind is Kind.TOA:
+        elif BY_KIND[kind].is_range:
             starts += [origin + 30.0 * np.array([math.cos(a), math.sin(a)]) for a in _CIRCLE[::3]]
     fix = rows[rows[:, KIND] == Kind.LINEAR]
     if len(fix) >= 2:

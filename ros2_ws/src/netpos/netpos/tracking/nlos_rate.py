@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from netpos.filters.measurement import BLOCKED, GROUP, KIND, Kind
+from netpos.filters.measurement import BLOCKED, GROUP, KIND
 from netpos.filters.robust import update_prior
+from netpos.filters.sensors.table import SENSORS
 from netpos.messages.values import RsuMeasurement
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import EpochRows
 
-_LATE = (Kind.TOA, Kind.RANGE)
+_LATE = {sensor.kind for sensor in SENSORS if sensor.is_range}
 _STRENGTH = 10.0  # measurements the configured share counts for
 
 

@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netpos.filters.measurement import GROUP, KIND, Kind
+from netpos.filters.measurement import GROUP, KIND
+from netpos.filters.sensors.table import SENSORS
 from netpos.messages.values import Array, GroundSpeed, RsuMeasurement, Velocity
 
 _KIND_AND_GROUP = slice(KIND, GROUP + 1, GROUP - KIND)
-# What is told of: a position fix has rows along no axis anyone can name.
-_KIND_NAMES = {int(kind): kind.name for kind in Kind if kind is not Kind.LINEAR}
+_KIND_NAMES = {sensor.kind: sensor.name for sensor in SENSORS if sensor.is_reported}
 
 
 class Observation(NamedTuple):

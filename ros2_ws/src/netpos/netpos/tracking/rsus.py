@@ -9,6 +9,7 @@ import numpy as np
 
 from netpos.filters.measurement import Kind
 from netpos.filters.rows import UNCOUPLED, Coupling, rsu_axes, rsu_place, scalar_kinds
+from netpos.filters.sensors.table import BY_KIND, SENSORS
 from netpos.filters.state import N_CORE
 from netpos.messages.values import (
     AngleConvention,
@@ -18,9 +19,7 @@ from netpos.messages.values import (
     StepCalibration,
 )
 
-_RANGES = (Kind.TOA, Kind.RANGE)
-_AZIMUTHS = (Kind.AZIMUTH, Kind.COSINE_Y)
-_PHASES = (Kind.PHASE, Kind.UNWRAPPED_PHASE)
+_SLOW = {name for s in SENSORS for name in (s.bias_sd, s.common_bias_sd) if name is not None}
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,26 +38,20 @@ class Rsu:
     @classmethod
     def of(cls, info: RsuInfo) -> Rsu:
         """Rsu of its description."""
-        slow = (
-            info.range_bias_sd_m,
-            info.azimuth_bias_sd_rad,
-            info.elevation_bias_sd_rad,
-            info.common_range_bias_sd_m,
-            info.noise_correlation_time_s,
-        )
+        slow = [getattr(info, name) for name in (*_SLOW, "noise_correlation_time_s")]
         axes = rsu_axes(info)
         cone = info.angle_convention is AngleConvention.CONE
         return cls(info, axes, rsu_place(info, axes), cone, not any(slow))
 
     def bias_sd(self, kind: Kind) -> float:
         """Standard deviation of the RSU's own bias in rows of a kind; 0 where it has none."""
-        if kind in _RANGES:
-            return self.info.range_bias_sd_m
-        if kind in _AZIMUTHS:
-            return self.info.azimuth_bias_sd_rad
-        if kind in _PHASES:
-            return 0.0
-        return self.info.elevation_bias_sd_rad
+        name = BY_KIND[kind].bias_sd
+        return 0.0 if name is None else float(getattr(self.info, name))
+
+    def common_bias_sd(self, kind: Kind) -> float:
+        """Standard deviation of the bias that its network shares in rows of a kind; 0: none."""
+        name = BY_KIND[kind].common_bias_sd
+        return 0.0 if name is None else float(getattr(self.info, name))
 
     def kinds(self, m: RsuMeasurement) -> tuple[Kind, ...]:
         """Kinds of the scalar rows a measurement of this RSU gives."""
@@ -120,10 +113,10 @@ class BiasStates:
             if rsu.bias_sd(kind) > 0.0:
                 name = ("rsu/" + info.rsu_id, kind.name)
                 bias[kind] = self._slot(name, rsu.bias_sd(kind), info.bias_correlation_time_s)
-            if kind in _RANGES and info.common_range_bias_sd_m > 0.0:
-                name = ("network/" + info.network, "range")
+            if rsu.common_bias_sd(kind) > 0.0:
+                name = ("network/" + info.network, str(BY_KIND[kind].common_bias_sd))
                 tau = info.common_bias_correlation_time_s
-                common[kind] = self._slot(name, info.common_range_bias_sd_m, tau)
+                common[kind] = self._slot(name, rsu.common_bias_sd(kind), tau)
             if info.noise_correlation_time_s > 0.0:
                 inflation[kind] = self._inflation(info, kind, m.stamp_ns)
         return Coupling(bias, common, inflation)

@@ -16,16 +16,15 @@ from netpos.filters.error_state import (
     correct,
     doubt_standstill,
 )
-from netpos.filters.measurement import GROUP, KIND, ORIGIN, ROW_WIDTH, VALUE, VARIANCE
+from netpos.filters.measurement import GROUP, KIND, ORIGIN, ROW_WIDTH, VALUE, VARIANCE, Kind
 from netpos.filters.position_fix import fix_position, start_of
-from netpos.filters.space import SpaceKind
 from netpos.filters.state import Nav
 from netpos.inertial.strapdown import ERR, NAV
 from netpos.messages.values import Array
 from netpos.tracking.engine import Epochs
 
 Ints = NDArray[np.int64]
-_PLACE = int(SpaceKind.PLACE)
+_PLACE = int(Kind.PLACE)
 
 
 class Drive(NamedTuple):

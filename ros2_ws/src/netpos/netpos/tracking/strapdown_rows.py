@@ -7,15 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from netpos.filters.measurement import GATE_VARIANCE
+from netpos.filters.measurement import GATE_VARIANCE, Kind
 from netpos.filters.rows import UNCOUPLED, rsu_rows
-from netpos.filters.space import SpaceKind, direction_rows, linearise_in_space, place_rows
+from netpos.filters.sensors.table import readings
+from netpos.filters.space import direction_rows, linearise_in_space, place_rows
 from netpos.messages.values import Array, Field, GroundSpeed, RsuMeasurement
 from netpos.tracking.epoch_rows import EpochRows
 from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sequencer import Item
 
-_SCALARS = Field.AZIMUTH | Field.ELEVATION | Field.RANGE | Field.TOA
+_SCALARS = Field(0)
+for _sensor, _reading in readings():
+    if _sensor.in_strapdown:
+        _SCALARS |= _reading.field
 _AHEAD = np.array([[1.0, 0.0, 0.0]])
 
 Source = RsuMeasurement | GroundSpeed
@@ -37,7 +41,7 @@ def epoch_rows_3d(
     for group, item in enumerate(items):
         if isinstance(item, GroundSpeed):
             value, variance = np.array([item.speed_mps]), np.array([item.speed_var])
-            rows = direction_rows(SpaceKind.BODY_VELOCITY, _AHEAD, value, variance, group)
+            rows = direction_rows(Kind.BODY_VELOCITY, _AHEAD, value, variance, group)
             blocks.append(rows)
             continue
         if item.fields & _SCALARS:

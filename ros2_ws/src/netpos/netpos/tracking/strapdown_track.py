@@ -18,7 +18,7 @@ import numpy as np
 from netpos.filters.conditioning import Robust
 from netpos.filters.error_state import MEMORY, Imu, Sensors, advance, correct, doubt_standstill
 from netpos.filters.measurement import GROUP, KIND, VARIANCE, Kind
-from netpos.filters.space import SpaceKind, place_rows
+from netpos.filters.space import place_rows
 from netpos.filters.space_conditioning import reweight_3d
 from netpos.filters.state import ERR_BIASES, ERR_CLOCK_DRIFT, NAV_CLOCK_DRIFT, POSITION
 from netpos.inertial.strapdown import ERR, NAV
@@ -302,7 +302,7 @@ class StrapdownTrack:
         rsus = [item for item in epoch_rows.items if isinstance(item, RsuMeasurement)]
         if not rsus:
             return ()
-        rows = epoch_rows.rows[epoch_rows.rows[:, KIND] != SpaceKind.BODY_VELOCITY]
+        rows = epoch_rows.rows[epoch_rows.rows[:, KIND] != Kind.BODY_VELOCITY]
         rows[:, VARIANCE] += replace(epoch_rows, rows=rows).slow_variance(state.biases)
         state.start.add_rows(stamp_ns, rows, np.array(rsus[0].lever_arm))
         found = state.start.solve(self.imu)

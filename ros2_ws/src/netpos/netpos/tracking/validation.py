@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 
 from netpos.filters.factor import eigenvalues
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.filters.rows import rsu_axes
+from netpos.filters.sensors.model import Reading, Refusal
+from netpos.filters.sensors.table import readings
 from netpos.messages.fields import MAP_FRAME
 from netpos.messages.topics import is_vue_id
 from netpos.messages.values import (
@@ -25,17 +27,9 @@ from netpos.messages.values import (
 )
 
 # Plain integers: arithmetic of flags costs ten times as much
-_SCALARS = (
-    (int(Field.AZIMUTH), attrgetter("azimuth_rad", "azimuth_var"), 1.0),
-    (int(Field.ELEVATION), attrgetter("elevation_rad", "elevation_var"), 1.0),
-    (int(Field.TOA), attrgetter("toa_s", "toa_var"), SPEED_OF_LIGHT_MPS),
-    (int(Field.RANGE), attrgetter("range_m", "range_var"), 1.0),
-    (int(Field.PHASE), attrgetter("phase_difference_rad", "phase_difference_var"), 1.0),
-)
-_RANGE, _POSITION, _PHASE = int(Field.RANGE), int(Field.POSITION), int(Field.PHASE)
-_KNOWN = int(
-    Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE | Field.POSITION | Field.PHASE
-)
+_READINGS = {int(reading.field): reading for _, reading in reversed(readings())}
+_POSITION = int(Field.POSITION)
+_KNOWN = sum(_READINGS) | _POSITION
 _LARGEST = 1e9
 _LEVER_ARM_MAX_M = 1e3
 _NO_LEVER = (0.0, 0.0, 0.0)
@@ -47,11 +41,22 @@ _ASYMMETRY_MAX = 1e-6  # relative
 _CONDITION_MIN = 1e-12  # smallest over largest eigenvalue; below it a Cholesky factor is rounding
 
 
+class _Checks(NamedTuple):
+    """What is looked at in the scalars of a measurement."""
+
+    quantities: tuple[tuple[attrgetter[tuple[float, float]], float], ...]
+    """What reads value and variance, and the square of what makes the variance one of metres or
+    radians."""
+    values: tuple[tuple[attrgetter[float], Refusal], ...]
+
+
 @lru_cache(256)
-def _quantities(fields: int) -> tuple[tuple[attrgetter[tuple[float, float]], float], ...]:
-    """What reads the value and variance of each scalar in ``fields``, and the square of what makes
-    the variance one of metres or radians."""
-    return tuple((read, scale * scale) for flag, read, scale in _SCALARS if fields & flag)
+def _checks(fields: int) -> _Checks:
+    carried = [reading for field, reading in _READINGS.items() if fields & field]
+    return _Checks(
+        tuple((attrgetter(r.value, r.variance), r.scale * r.scale) for r in carried),
+        tuple((attrgetter(r.value), refusal) for r in carried for refusal in r.refusals),
+    )
 
 
 def measurement_fault(m: RsuMeasurement) -> str | None:
@@ -63,7 +68,8 @@ def measurement_fault(m: RsuMeasurement) -> str | None:
     fields = int(m.fields)
     if not fields or fields & ~_KNOWN:
         return "no_fields" if not fields else "unknown_fields"
-    for quantity, scale2 in _quantities(fields):
+    checks = _checks(fields)
+    for quantity, scale2 in checks.quantities:
         value, variance = quantity(m)
         if not (abs(value) < _LARGEST and math.isfinite(variance)):
             return "not_finite"
@@ -71,13 +77,37 @@ def measurement_fault(m: RsuMeasurement) -> str | None:
             return "variance"
     if m.lever_arm != _NO_LEVER and not all(abs(arm) < _LEVER_ARM_MAX_M for arm in m.lever_arm):
         return "lever_arm"
-    if fields & _RANGE and m.range_m < 0.0:
-        return "negative_range"
-    if fields & _PHASE and abs(m.phase_difference_rad) > math.pi:
-        return "phase_not_wrapped"
+    for value_of, refusal in checks.values:
+        if refusal.is_bad(value_of(m)):
+            return refusal.reason
     if fields & _POSITION:
         return _frame_fault(m.frame_id) or _gaussian_fault(m.position, m.position_cov)
     return None
+
+
+def explanation(m: RsuMeasurement, reason: str) -> str:
+    """Sentence about the scalar for which a measurement was refused: its name, its value and the
+    remedy. Empty where the reason concerns no scalar."""
+    for field, reading in _READINGS.items():
+        if not int(m.fields) & field:
+            continue
+        value, variance = getattr(m, reading.value), getattr(m, reading.variance)
+        for refusal in reading.refusals:
+            if refusal.reason == reason and refusal.is_bad(value):
+                return f"{reading.value} is {value:g} {reading.unit}; {refusal.remedy}"
+        if reason == "not_finite" and not abs(value) < _LARGEST:
+            return f"{reading.value} is {value:g} {reading.unit}; leave out what was not measured"
+        if reason in ("not_finite", "variance") and not _var_limits(reading, variance):
+            low, high = (limit / reading.scale**2 for limit in (_VAR_MIN, _VAR_MAX))
+            return (
+                f"{reading.variance} is {variance:g} {reading.unit}^2; "
+                f"send one from {low:g} to {high:g}"
+            )
+    return ""
+
+
+def _var_limits(reading: Reading, variance: float) -> bool:
+    return _variance_in_range(reading.scale * reading.scale * variance)
 
 
 def velocity_fault(v: Velocity) -> str | None:

@@ -18,7 +18,7 @@ from netpos.filters.error_state import (
     doubt_standstill,
 )
 from netpos.filters.measurement import VARIANCE, Kind
-from netpos.filters.space import SpaceKind, bend_variance, direction_rows, place_rows
+from netpos.filters.space import bend_variance, direction_rows, place_rows
 from netpos.filters.state import ERR_POSITION, NAV_POSITION, NAV_QUATERNION, NAV_VELOCITY, Err, Nav
 from netpos.inertial.strapdown import ERR, GYRO_BIAS, NAV, InertialNoise, inject, still_earth
 from netpos.messages.values import Array
@@ -231,7 +231,7 @@ def test_estimated_biases_fade_with_their_time() -> None:
 def test_constraint_rows_follow_their_covariance() -> None:
     """Velocity rows on a velocity of variance P and R: the posterior of a scalar."""
     nav, cov = moving(0.0), np.diag([1.0] * 3 + [4.0] * 3 + [1e-9] * 9)
-    rows = direction_rows(SpaceKind.BODY_VELOCITY, np.eye(3), np.ones(3), np.ones(3), 0)
+    rows = direction_rows(Kind.BODY_VELOCITY, np.eye(3), np.ones(3), np.ones(3), 0)
     correct(nav, cov, rows, OPEN, np.zeros(1))
     np.testing.assert_allclose(nav[NAV_VELOCITY], 4.0 / 5.0, rtol=1e-6)
     np.testing.assert_allclose(np.diag(cov)[3:6], 4.0 / 5.0, rtol=1e-6)

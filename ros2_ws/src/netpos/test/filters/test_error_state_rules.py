@@ -17,7 +17,7 @@ from netpos.filters.error_state import (
     doubt_standstill,
 )
 from netpos.filters.measurement import GATE_VARIANCE, GROUP, VALUE, VARIANCE, Kind
-from netpos.filters.space import SpaceKind, bend_variance, direction_rows, place_rows
+from netpos.filters.space import bend_variance, direction_rows, place_rows
 from netpos.filters.state import NAV_POSITION, NAV_VELOCITY
 from netpos.inertial.strapdown import ERR, GYRO_BIAS, NAV, inject, still_earth
 from netpos.messages.values import Array
@@ -60,7 +60,7 @@ def problem(seed: int) -> tuple[Array, Array, Array]:
     if seed % 2:
         rows += list(place_rows(np.zeros(3), np.eye(3), LEVER_ARM, 3))
     velocity = direction_rows(
-        SpaceKind.BODY_VELOCITY, np.eye(3)[1:], np.zeros(2), np.full(2, 0.01), 4 if seed % 2 else 3
+        Kind.BODY_VELOCITY, np.eye(3)[1:], np.zeros(2), np.full(2, 0.01), 4 if seed % 2 else 3
     )
     both = np.vstack([*rows, velocity])
     both[:, VALUE] += linearised(both, truth)[0]
@@ -93,7 +93,7 @@ def test_iterating_ends_with_the_place() -> None:
     velocity of the body would still change is left as two steps have it."""
     nav, cov = vehicle(np.random.default_rng(3))
     velocity = direction_rows(
-        SpaceKind.BODY_VELOCITY, np.eye(3)[1:], np.array([2.0, 0.5]), np.full(2, 1e-4), 1
+        Kind.BODY_VELOCITY, np.eye(3)[1:], np.array([2.0, 0.5]), np.full(2, 1e-4), 1
     )
     rows = np.vstack(
         [place_rows(nav[NAV_POSITION] + 1.0, 0.01 * np.eye(3), (0.0, 0.0, 0.0)), velocity]
@@ -198,8 +198,8 @@ def test_standing_is_twenty_quiet_chunks_at_less_than_walking_speed(
         values, rates = np.zeros(3), np.array([0.01, 0.02, -0.015])
         rows = np.vstack(
             [
-                direction_rows(SpaceKind.BODY_VELOCITY, np.eye(3), values, np.full(3, sd**2), 0),
-                direction_rows(SpaceKind.BODY_RATE, np.eye(3), rates, np.full(3, rate_var), 0),
+                direction_rows(Kind.BODY_VELOCITY, np.eye(3), values, np.full(3, sd**2), 0),
+                direction_rows(Kind.BODY_RATE, np.eye(3), rates, np.full(3, rate_var), 0),
             ]
         )
         rows[:, GROUP] = range(6)
@@ -216,9 +216,7 @@ def test_a_vehicle_under_way_is_held_across_it(sideways: float, upwards: float) 
     sds = {1: sideways, 2: upwards}
     axes = [axis for axis, sd in sds.items() if sd > 0.0]
     variances = np.array([sds[axis] ** 2 for axis in axes])
-    rows = direction_rows(
-        SpaceKind.BODY_VELOCITY, np.eye(3)[axes], np.zeros(len(axes)), variances, 0
-    )
+    rows = direction_rows(Kind.BODY_VELOCITY, np.eye(3)[axes], np.zeros(len(axes)), variances, 0)
     rows[:, GROUP] = range(len(axes))
     correct(x, P, rows, np.array([0.0, 15.14]), np.zeros(2))
     np.testing.assert_allclose(nav, x, rtol=1e-12, atol=1e-15)

@@ -95,18 +95,6 @@ def test_an_innovation_scatters_by_noise_curvature_and_prior(kind: Kind) -> None
     assert found == pytest.approx(expected, rel=1e-12)
 
 
-@pytest.mark.parametrize("kind", [Kind.RANGE, Kind.TOA])
-@pytest.mark.parametrize("height_m", [3.0, 3.5, -5.5, 40.0])
-@pytest.mark.parametrize("seed", range(5))
-def test_curvature_of_a_range_is_exact(kind: Kind, height_m: float, seed: int) -> None:
-    """Level with the RSU and well below or above it, against finite differences."""
-    rng = np.random.default_rng(seed)
-    row, x = level_row(kind, np.array([1.0, -2.0, 3.0])), random_state(rng)
-    A = rng.normal(size=(9, 9))
-    expected = half_trace(row, x, A @ A.T, height_m)
-    assert curvature_variance(row, x, A @ A.T, height_m) == pytest.approx(expected, rel=1e-4)
-
-
 @pytest.mark.parametrize(
     ("aside_m", "expected"), [(0.0, 16.0 / 8.5**2), (1.0, None), (8.5, None), (85.0, None)]
 )

@@ -14,7 +14,6 @@ from netpos.filters.measurement import (
     ORIGIN,
     VALUE,
     Kind,
-    curvature_variance,
     innovation_row,
     predict_row,
 )
@@ -107,28 +106,6 @@ def test_the_paper_s_signs() -> None:
     assert phase == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.parametrize("kind", [Kind.PHASE, Kind.UNWRAPPED_PHASE])
-@pytest.mark.parametrize("heading", [-1, 6])
-@pytest.mark.parametrize("seed", range(3))
-def test_jacobian_by_central_differences(kind: Kind, heading: int, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    row = rows_by_kind(anchor(rng), heading)[Kind.PHASE]
-    row[KIND] = kind
-    x = rng.normal(size=8) * [5.0, 5.0, 1.0, 1.0, 100.0, 1.0, 2.0, 0.1]
-    h, spare, step = np.empty(8), np.empty(8), 1e-6
-    predict_row(row, x, HEIGHT, h)
-    numeric = [
-        (
-            predict_row(row, x + step * e, HEIGHT, spare)
-            - predict_row(row, x - step * e, HEIGHT, spare)
-        )
-        / (2 * step)
-        for e in np.eye(8)
-    ]
-    np.testing.assert_allclose(h, numeric, atol=2e-7 * max(1.0, np.abs(h).max()))
-    assert (abs(h[6]) > 1e-3) == (heading == 6)
-
-
 def test_only_a_phase_without_its_turns_wraps_its_innovation() -> None:
     row = rows_by_kind(anchor(np.random.default_rng(2)))[Kind.PHASE]
     x, h = np.array([3.0, 4.0, 0, 0, 0, 0]), np.empty(6)
@@ -140,27 +117,6 @@ def test_only_a_phase_without_its_turns_wraps_its_innovation() -> None:
         row[KIND] = Kind.UNWRAPPED_PHASE
         expected = 0.25 + 2 * math.pi * turns
         assert innovation_row(row, x, HEIGHT, h) == pytest.approx(expected, abs=1e-9)
-
-
-def test_the_curvature_bounds_the_second_derivative() -> None:
-    """Half the trace of (h'' P)^2 of the true h'' by differences of the Jacobian."""
-    rng = np.random.default_rng(6)
-    row = rows_by_kind(anchor(rng))[Kind.PHASE]
-    for _ in range(20):
-        x = np.append(rng.normal(size=2) * 6.0, np.zeros(4))
-        A = rng.normal(size=(6, 6))
-        P = 0.01 * A @ A.T
-        second, up, down = np.zeros((2, 2)), np.empty(6), np.empty(6)
-        for axis in range(2):
-            e = 1e-5 * np.eye(6)[axis]
-            predict_row(row, x + e, HEIGHT, up)
-            predict_row(row, x - e, HEIGHT, down)
-            second[axis] = (up - down)[:2] / 2e-5
-        hp = second @ P[POSITION, POSITION]
-        true = 0.5 * float(np.trace(hp @ hp))
-        bound = curvature_variance(row, x, P, HEIGHT)
-        assert bound >= true / 1.34  # its largest curvature is up to 1.155 over r^2
-        assert bound > 0.0
 
 
 @pytest.mark.parametrize("filter_name", ["ekf", "srukf"])

@@ -8,6 +8,7 @@ import filter_rows
 import numpy as np
 import pytest
 from error_states import moving
+from measurement_rows import SPATIAL
 from netpos.filters.measurement import (
     BIAS,
     COMMON,
@@ -19,7 +20,6 @@ from netpos.filters.measurement import (
 )
 from netpos.filters.rows import rsu_axes, rsu_rows
 from netpos.filters.space import (
-    SpaceKind,
     bend_variance,
     direction_rows,
     innovation_at,
@@ -52,12 +52,14 @@ def all_rows(rng: np.random.Generator) -> Array:
             position=np.array([30.0, -20.0, 8.0]),
             quaternion=Rotation.random(rng=rng).as_quat(),
             angle_convention=convention,
+            baseline_m=0.3,
+            wavelength_m=0.1,
         )
         m = RsuMeasurement(
             stamp_ns=1,
             rsu_id="a",
             vue_id="v",
-            fields=Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE,
+            fields=Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE | Field.PHASE,
             azimuth_rad=3.0,
             azimuth_var=0.01,
             elevation_rad=0.3,
@@ -66,14 +68,18 @@ def all_rows(rng: np.random.Generator) -> Array:
             toa_var=1e-18,
             range_m=30.0,
             range_var=1.0,
+            phase_difference_var=1.0,
             lever_arm=LEVER_ARM,
         )
         blocks.append(rsu_rows(m, info, rsu_axes(info), 0))
+    unwrapped = blocks[0][-1:].copy()
+    unwrapped[:, KIND] = Kind.UNWRAPPED_PHASE
+    blocks.append(unwrapped)
     A = rng.normal(size=(3, 3))
     blocks.append(place_rows(np.array([1.0, 2.0, 3.0]), A @ A.T + np.eye(3), LEVER_ARM))
     blocks += [
         direction_rows(kind, rng.normal(size=(2, 3)), np.zeros(2), np.ones(2), 0)
-        for kind in (SpaceKind.BODY_VELOCITY, SpaceKind.BODY_RATE)
+        for kind in (Kind.BODY_VELOCITY, Kind.BODY_RATE)
     ]
     return np.vstack(blocks)
 
@@ -108,8 +114,7 @@ def test_jacobians_are_central_differences() -> None:
                 h, slopes(row, nav, ERR), rtol=0, atol=2e-6, err_msg=str(row[KIND])
             )
             kinds.add(int(row[KIND]))
-    assert kinds == {0, 1, 2, 3, 6, 7, *map(int, SpaceKind)}
-    assert not set(SpaceKind) & set(Kind)
+    assert kinds == set(map(int, SPATIAL))
 
 
 def test_clock_and_biases_are_states_of_their_own() -> None:
@@ -124,7 +129,7 @@ def test_clock_and_biases_are_states_of_their_own() -> None:
         plain = innovation(row, nav[:NAV])[0]
         row[[BIAS, COMMON]] = ERR_BIASES, ERR_BIASES + 1
         value, h = innovation(row, nav)
-        from_rsu = int(row[KIND]) not in (SpaceKind.BODY_VELOCITY, SpaceKind.BODY_RATE)
+        from_rsu = int(row[KIND]) not in (Kind.BODY_VELOCITY, Kind.BODY_RATE)
         clock = slow[0] if row[KIND] == Kind.TOA else 0.0
         expected = clock + (slow[2] + slow[3] if from_rsu else 0.0)
         assert math.remainder(plain - value - expected, math.tau) == pytest.approx(0.0, abs=1e-9)
@@ -140,7 +145,8 @@ def test_values_are_those_of_the_geometry() -> None:
     for row in all_rows(rng):
         kind, predicted = int(row[KIND]), row[VALUE] - innovation(row, nav)[0]
         u = row[10:19].reshape(3, 3) @ (antenna - row[ORIGIN : ORIGIN + 3])
-        r = max(float(np.linalg.norm(u)), 1e-9)  # rows of a direction have no origin
+        d = antenna - row[ORIGIN : ORIGIN + 3]
+        r = max(float(np.linalg.norm(d)), 1e-9)  # rows of a direction have no origin
         body = Rotation.from_quat(nav[NAV_QUATERNION]).inv().apply(nav[NAV_VELOCITY])
         expected = {
             Kind.AZIMUTH: math.atan2(u[1], u[0]),
@@ -149,11 +155,13 @@ def test_values_are_those_of_the_geometry() -> None:
             Kind.TOA: r,
             Kind.COSINE_Y: u[1] / r,
             Kind.COSINE_Z: u[2] / r,
-            SpaceKind.PLACE: row[ORIGIN : ORIGIN + 3] @ antenna,
-            SpaceKind.BODY_VELOCITY: row[ORIGIN : ORIGIN + 3] @ body,
-            SpaceKind.BODY_RATE: row[ORIGIN : ORIGIN + 3] @ nav[GYRO_BIAS:],
+            Kind.PHASE: row[10:13] @ d / r,
+            Kind.UNWRAPPED_PHASE: row[10:13] @ d / r,
+            Kind.PLACE: row[ORIGIN : ORIGIN + 3] @ antenna,
+            Kind.BODY_VELOCITY: row[ORIGIN : ORIGIN + 3] @ body,
+            Kind.BODY_RATE: row[ORIGIN : ORIGIN + 3] @ nav[GYRO_BIAS:],
         }[kind]
-        if kind not in (Kind.AZIMUTH, Kind.ELEVATION):
+        if kind not in (Kind.AZIMUTH, Kind.ELEVATION, Kind.PHASE):
             assert predicted == pytest.approx(expected, abs=1e-9)
         else:
             assert math.remainder(predicted - expected, math.tau) == pytest.approx(0, abs=1e-9)
@@ -189,31 +197,6 @@ def test_place_rows_hold_the_whole_covariance() -> None:
 def test_a_flat_covariance_is_refused() -> None:
     with pytest.raises(np.linalg.LinAlgError):
         place_rows(np.zeros(3), np.diag([1.0, 1.0, 0.0]), (0.0, 0.0, 0.0))
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_bend_variance_of_each_kind(seed: int) -> None:
-    """Of ranges half the trace of (h'' P)^2; of angles half the squared entries of P over the
-    fourth power of the distance, of a bearing in the plane."""
-    rng = np.random.default_rng(seed)
-    nav, A = state(rng), rng.normal(size=(ERR, ERR))
-    cov, origin = A @ A.T, rng.normal(0.0, 20.0, 3)
-    d, P = nav[NAV_POSITION] - origin, cov[:3, :3]
-    r2, rho2 = d @ d, d[:2] @ d[:2]
-    bent = (np.eye(3) - np.outer(d, d) / r2) @ P
-    ranged = np.trace(bent @ bent) / r2
-    angle = np.linalg.norm(P) ** 2 / r2**2
-    for kind, twice in (
-        (Kind.RANGE, ranged),
-        (Kind.TOA, ranged),
-        (Kind.AZIMUTH, np.linalg.norm(P[:2, :2]) ** 2 / rho2**2),
-        (Kind.ELEVATION, angle),
-        (Kind.COSINE_Y, angle),
-        *((kind, 0.0) for kind in SpaceKind),
-    ):
-        row = filter_rows.row(Kind.RANGE, 0.0, 1.0, 0, origin)
-        row[KIND] = kind
-        assert bend_variance(row, nav, cov) == pytest.approx(twice / 2.0, rel=1e-10)
 
 
 def test_all_rows_are_linearised_in_their_order() -> None:

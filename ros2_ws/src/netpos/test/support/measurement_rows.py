@@ -6,9 +6,13 @@ import numpy as np
 from filter_rows import row
 from netpos.filters.measurement import AXES, COMMON, HEADING, KIND, LEVER, ORIGIN, Kind
 from netpos.filters.rows import rsu_axes
+from netpos.filters.sensors.table import SENSORS
 from netpos.filters.state import POSITION, X
 from netpos.messages.values import AngleConvention, Array, RsuInfo
 from scipy.spatial.transform import Rotation
+
+PLANAR = [Kind(s.kind) for s in SENSORS if s.of_offset or s.of_state]
+SPATIAL = [Kind(s.kind) for s in SENSORS if s.of_offset or s.of_antenna or s.of_navigation]
 
 
 def random_info(rng: np.random.Generator, convention: AngleConvention) -> RsuInfo:

@@ -13,7 +13,15 @@ from scipy.spatial.transform import Rotation
 
 ALL = Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE
 
-OTHERS = (Kind.LINEAR, Kind.SPEED, Kind.STEP_VELOCITY)  # no RSU measures them
+# No RSU measures them
+OTHERS = (
+    Kind.LINEAR,
+    Kind.SPEED,
+    Kind.STEP_VELOCITY,
+    Kind.PLACE,
+    Kind.BODY_VELOCITY,
+    Kind.BODY_RATE,
+)
 
 
 def info(rsu_id: str = "a", **change: object) -> RsuInfo:

@@ -17,6 +17,7 @@ from netpos.messages.values import (
     Velocity,
 )
 from netpos.tracking.validation import (
+    explanation,
     measurement_fault,
     pose_fault,
     rsu_fault,
@@ -36,11 +37,12 @@ GOOD = RsuMeasurement(
     stamp_ns=1,
     rsu_id="a",
     vue_id="v",
-    fields=Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE | Field.POSITION,
+    fields=Field(63),
     azimuth_var=1.0,
     elevation_var=1.0,
     toa_var=1e-16,
     range_var=1.0,
+    phase_difference_var=1.0,
     position_cov=np.diag([1.0, 1.0, 0.0]),
 )
 INFO = RsuInfo(rsu_id="a", position=np.zeros(3))
@@ -294,3 +296,37 @@ def test_rsu(change: dict[str, Any], text: str | None) -> None:
         assert fault is None
     else:
         assert fault == text
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason", "sentence"),
+    [
+        ({"range_m": -1.5}, "negative_range", "range_m is -1.5 m; send a distance >= 0 m, or no"),
+        (
+            {"phase_difference_rad": 4.0},
+            "phase_not_wrapped",
+            "phase_difference_rad is 4 rad; wrap",
+        ),
+        ({"azimuth_rad": NAN}, "not_finite", "azimuth_rad is nan rad; leave out"),
+        ({"elevation_var": INF}, "not_finite", "elevation_var is inf rad^2; send one from 1e-12"),
+        (
+            {"toa_var": 0.0},
+            "variance",
+            "toa_var is 0 s^2; send one from 1.11265e-29 to 1.11265e-05",
+        ),
+        ({"lever_arm": (NAN, 0.0, 0.0)}, "lever_arm", ""),
+    ],
+)
+def test_a_refusal_names_value_and_remedy(
+    changes: dict[str, Any], reason: str, sentence: str
+) -> None:
+    bad = replace(GOOD, **changes)
+    assert measurement_fault(bad) == reason
+    assert explanation(bad, reason).startswith(sentence)
+    assert bool(explanation(bad, reason)) == bool(sentence)
+
+
+def test_a_scalar_that_is_not_sent_is_not_explained() -> None:
+    bad = replace(GOOD, fields=Field.AZIMUTH, range_m=-1.0, toa_var=0.0, azimuth_var=-1.0)
+    assert explanation(bad, "negative_range") == ""
+    assert explanation(bad, "variance").startswith("azimuth_var is -1 rad^2")

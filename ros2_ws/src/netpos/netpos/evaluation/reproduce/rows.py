@@ -18,21 +18,13 @@ from netpos.filters.measurement import (
     VARIANCE,
     Kind,
 )
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.filters.rows import rsu_axes, rsu_rows
+from netpos.filters.sensors.table import readings
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
-from netpos.radio.measure import AZIMUTH, ELEVATION, PHASE, RANGE, TOA, Observations
+from netpos.radio.measure import QUANTITIES, Observations
 from netpos.tracking.rsus import Rsu
 
 Ints = npt.NDArray[np.int64]
-
-_COLUMNS = {
-    Kind.AZIMUTH: AZIMUTH,
-    Kind.ELEVATION: ELEVATION,
-    Kind.TOA: TOA,
-    Kind.RANGE: RANGE,
-    Kind.PHASE: PHASE,
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,12 +53,13 @@ class RowTemplates:
         sd = np.array([[Rsu.of(info).bias_sd(kind) for kind in kinds] for info in rsus])
         tau = np.array([info.bias_correlation_time_s for info in rsus])
         bias = np.stack([sd, np.where(sd > 0.0, tau[:, None], 0.0)], axis=-1)
-        scale = [SPEED_OF_LIGHT_MPS if kind is Kind.TOA else 1.0 for kind in kinds]
+        carried = [r for _, r in readings() if fields & r.field and r.simulated is not None]
         order = np.argsort([info.rsu_id for info in rsus])
         rank = np.empty(len(rsus), dtype=np.int64)
         rank[order] = np.arange(len(rsus))
-        column = np.array([_COLUMNS[kind] for kind in kinds], dtype=np.int64)
-        return cls(np.array(rows), column, np.array(scale), rank, bias)
+        scale = np.array([reading.scale for reading in carried])
+        column = np.array([QUANTITIES.index(str(r.simulated)) for r in carried], dtype=np.int64)
+        return cls(np.array(rows), column, scale, rank, bias)
 
 
 @kernel

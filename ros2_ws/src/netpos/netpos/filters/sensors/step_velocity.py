@@ -4,7 +4,9 @@ whose heading is turned against the map:
     u = exp(-k) R(-a) v
 
 v the true velocity in map, k the logarithm of true over modelled step length, a the angle from
-reported to true heading. Either may be missing: state index -1, value 0.
+reported to true heading. Either may be missing: state index -1, value 0. A row is one of a
+decorrelated velocity (``rows.linear_rows``): g u, g in the entries of H that belong to v; BIAS and
+COMMON are the state indices of k and a.
 """
 
 from __future__ import annotations
@@ -14,6 +16,8 @@ import math
 import numpy as np
 
 from netpos.filters.compile import kernel, leaf
+from netpos.filters.sensors.model import Sensor
+from netpos.filters.sensors.row import BIAS, COMMON, ORIGIN
 from netpos.filters.state import X
 from netpos.messages.values import Array
 
@@ -24,9 +28,14 @@ def _state(mean: Array, index: int) -> float:
 
 
 @leaf
-def reported(gx: float, gy: float, mean: Array, length: int, heading: int, h: Array) -> float:
-    """g u at ``mean`` (n,), whose velocity is v; its gradient there is added to ``h``
-    (n,). length, heading : state indices of k and a"""
+def reported(row: Array, mean: Array, h: Array) -> float:
+    """g u at ``mean`` (n,), whose velocity is v; its gradient there is added to ``h`` (n,)."""
+    gx, gy, length, heading = (
+        row[ORIGIN + X.VX],
+        row[ORIGIN + X.VY],
+        int(row[BIAS]),
+        int(row[COMMON]),
+    )
     scale, angle = math.exp(-_state(mean, length)), _state(mean, heading)
     c, s = scale * math.cos(angle), scale * math.sin(angle)
     h[X.VX] += gx * c - gy * s
@@ -41,10 +50,10 @@ def reported(gx: float, gy: float, mean: Array, length: int, heading: int, h: Ar
 
 
 @kernel
-def curvature(gx: float, gy: float, mean: Array, cov: Array, length: int, heading: int) -> float:
+def exact(row: Array, mean: Array, cov: Array) -> float:
     """Half the trace of (h'' P)^2 of ``reported`` at ``mean`` (n,) under ``cov`` (n, n)."""
-    h = np.zeros(mean.size)
-    value = reported(gx, gy, mean, length, heading, h)
+    h, length, heading = np.zeros(mean.size), int(row[BIAS]), int(row[COMMON])
+    value = reported(row, mean, h)
     index = (X.VX.value, X.VY.value, length, heading)
     second, P = np.zeros((4, 4)), np.zeros((4, 4))
     second[0, 2], second[1, 2], second[2, 2] = -h[X.VX], -h[X.VY], value
@@ -57,3 +66,12 @@ def curvature(gx: float, gy: float, mean: Array, cov: Array, length: int, headin
                 P[a, b] = cov[index[a], index[b]]
     spread = second @ P
     return 0.5 * float((spread * spread.T).sum())
+
+
+SENSOR = Sensor(
+    name="STEP_VELOCITY",
+    kind=10,
+    of_state=reported,
+    second_order=exact,
+    adds_biases=False,
+)
