@@ -23,7 +23,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "inertial": {"messages", "common", "world", "radio"},
     "filters": {"messages", "inertial"},
     "bags": {"messages", "inertial"},
-    "scenario": {"messages", "world", "radio", "inertial", "bags"},
+    # The sensors say what a simulator sends.
+    "scenario": {"messages", "world", "radio", "inertial", "filters", "bags"},
     "tracking": {"messages", "common", "filters", "inertial", "bags", "scenario"},
     "evaluation": {
         *("messages", "common", "world", "radio", "inertial", "filters", "bags", "scenario"),
