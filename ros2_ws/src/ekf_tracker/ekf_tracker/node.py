@@ -10,7 +10,7 @@ from netpos.messages import topics
 from netpos.messages.values import RsuMeasurement as Measurement
 from netpos.tracking import Tracker, TrackOutput
 from netpos.tracking.validation import explanation
-from netpos.tracking.warm_up import warm_up, warm_up_anchors
+from netpos.tracking.warm_up import warm_up, warm_up_anchors, warm_up_components
 from netpos_msgs.msg import NetworkTrack, RsuInfo, RsuMeasurement
 from netpos_node import CDR, CODEC, LATCHED, STREAM, patience, run, take_waiting
 from netpos_node.estimating import EstimatingNode
@@ -30,6 +30,8 @@ class EkfTrackerNode(EstimatingNode):
         parameters = declare_parameters(self)
         if parameters.config.network:
             warm_up(parameters.config.network)
+        if parameters.config.manoeuvre_speed_sd_mps > 0.0:
+            warm_up_components()
         self._tracker = Tracker(parameters.config)
         self._network = parameters.config.network
         self._begin(self._tracker, publish_tf=parameters.publish_tf)

@@ -6,7 +6,10 @@ from functools import cache
 
 import numpy as np
 
+from netpos.filters.motion import NO_BIAS
+from netpos.filters.rows import linear_rows
 from netpos.messages.values import Field, GroundSpeed, InitialPose, RsuInfo, RsuMeasurement
+from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.tracker import Tracker
 
@@ -15,16 +18,29 @@ def warm_up(network: str | None = None) -> None:
     """Run tiny tracks through the kernels: first fix, prediction, gate, update.
 
     network : of the tracker, "" where it takes all; None: every kernel, as at set-up. Those for
-        anchors follow with the first anchor (``warm_up_anchors``), those of manoeuvre hypotheses
-        with the first one (9 MB, as much of the compiler, 50 to 80 ms): a kernel that is only
-        loaded costs a tracker memory and time, too.
+        anchors follow with the first anchor (``warm_up_anchors``), those for devices that turn
+        where they are told to (``warm_up_components``, 50 MB): a kernel that is only loaded costs
+        a tracker memory and time, too.
     """
     _angles_and_ranges()
     if network is None:
         warm_up_anchors()
+        warm_up_components()
         Tracker(TrackerConfig(motion_model="strapdown", robust="huber"))
     if network != "":
         _fixes_of_a_network()
+
+
+@cache
+def warm_up_components() -> None:
+    """Two epochs of a mixture, the first of which begins it by a refused fix; once in a
+    process."""
+    config = TrackerConfig(manoeuvre_speed_sd_mps=1.0)
+    estimate = estimates.start(config, 0, np.zeros(6), np.eye(6))
+    for k in (1, 2):
+        rows = linear_rows(np.full(2, 9.0), np.eye(2) / 100.0, np.eye(2, 6), 0)
+        estimate.step(k * 100_000_000, 0.1, 0, rows, NO_BIAS)
+    estimate.radius(float(len(estimate.modes)))
 
 
 @cache
@@ -80,7 +96,7 @@ def _angles_and_ranges() -> None:
                 rsu_id=name,
                 vue_id="warm_up",
                 fields=Field.AZIMUTH | Field.RANGE,
-                azimuth_rad=float(np.arctan2(d[1], d[0])) + (1.0 if k == 4 else 0.0),
+                azimuth_rad=float(np.arctan2(d[1], d[0])),
                 azimuth_var=1e-4,
                 range_m=float(np.hypot(d[0], d[1])),
                 range_var=0.01,
