@@ -382,6 +382,6 @@ def test_whatever_comes_nothing_raises_and_no_nan_leaves(config: Any, items: lis
         n
         for counts in tracker.rejected().values()
         for reason, n in counts.items()
-        if reason not in ("gate", "track_lost", "no_initial_pose")
+        if reason not in ("gate", "track_lost", "no_initial_pose", "diverged")
     )
     assert at_the_door == refused
