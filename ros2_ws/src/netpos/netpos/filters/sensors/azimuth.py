@@ -9,10 +9,10 @@ import math
 
 from netpos.filters.compile import inlined, leaf
 from netpos.filters.sensors.geometry import in_map_axes, in_rsu_axes, largest_second_order
-from netpos.filters.sensors.model import Reading, Sensor, Wraps
+from netpos.filters.sensors.model import Sensor, Wraps, angle_reading
 from netpos.filters.sensors.row import AXES
 from netpos.filters.state import X
-from netpos.messages.values import AngleConvention, Array, Field
+from netpos.messages.values import AngleConvention, Array
 
 
 @leaf
@@ -54,13 +54,5 @@ SENSOR = Sensor(
     wraps=Wraps.ALWAYS,
     in_strapdown=True,
     bias_sd="azimuth_bias_sd_rad",
-    reading=Reading(
-        quantity="azimuth",
-        field=Field.AZIMUTH,
-        value="azimuth_rad",
-        variance="azimuth_var",
-        unit="rad",
-        convention=AngleConvention.SPHERICAL,
-        simulated="azimuth",
-    ),
+    reading=angle_reading("azimuth", convention=AngleConvention.SPHERICAL, simulated="azimuth"),
 )

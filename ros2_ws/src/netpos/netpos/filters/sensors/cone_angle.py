@@ -11,30 +11,34 @@ import math
 from netpos.filters.compile import inlined, leaf
 from netpos.filters.sensors.elevation import bound
 from netpos.filters.sensors.geometry import in_map_axes, in_rsu_axes
-from netpos.filters.sensors.model import Reading, Sensor
-from netpos.messages.values import AngleConvention, Array, Field
+from netpos.filters.sensors.model import Kernel, Sensor, angle_reading
+from netpos.messages.values import AngleConvention, Array
+
+
+@inlined
+def _cosine(
+    row: Array, dx: float, dy: float, dz: float, along_y: float, along_z: float
+) -> tuple[float, float, float, float]:
+    """Direction cosine of the offset d with the axis (0, along_y, along_z), and its gradient."""
+    ux, uy, uz = in_rsu_axes(row, dx, dy, dz)
+    r2 = max(ux * ux + uy * uy, 1e-12) + uz * uz
+    r = math.sqrt(r2)
+    value = (along_y * uy + along_z * uz) / r
+    gy, gz = along_y / r - value * uy / r2, along_z / r - value * uz / r2
+    gx, gy, gz = in_map_axes(row, -value * ux / r2, gy, gz)
+    return value, gx, gy, gz
 
 
 @leaf
 def cosine_y(row: Array, dx: float, dy: float, dz: float) -> tuple[float, float, float, float]:
     """Direction cosine of the offset d with the y axis, and its gradient."""
-    ux, uy, uz = in_rsu_axes(row, dx, dy, dz)
-    r2 = max(ux * ux + uy * uy, 1e-12) + uz * uz
-    r = math.sqrt(r2)
-    value = uy / r
-    gx, gy, gz = in_map_axes(row, -value * ux / r2, -value * uy / r2 + 1.0 / r, -value * uz / r2)
-    return value, gx, gy, gz
+    return _cosine(row, dx, dy, dz, 1.0, 0.0)  # type: ignore[no-any-return]
 
 
 @leaf
 def cosine_z(row: Array, dx: float, dy: float, dz: float) -> tuple[float, float, float, float]:
     """Direction cosine of the offset d with the z axis, and its gradient."""
-    ux, uy, uz = in_rsu_axes(row, dx, dy, dz)
-    r2 = max(ux * ux + uy * uy, 1e-12) + uz * uz
-    r = math.sqrt(r2)
-    value = uz / r
-    gx, gy, gz = in_map_axes(row, -value * ux / r2, -value * uy / r2, -value * uz / r2 + 1.0 / r)
-    return value, gx, gy, gz
+    return _cosine(row, dx, dy, dz, 0.0, 1.0)  # type: ignore[no-any-return]
 
 
 @inlined
@@ -45,41 +49,20 @@ def sine(angle: float, variance: float) -> tuple[float, float]:
     return math.sin(angle), of_sine
 
 
+def _sensor(name: str, kind: int, cosine: Kernel, quantity: str) -> Sensor:
+    return Sensor(
+        name=name,
+        kind=kind,
+        of_offset=cosine,
+        second_order=bound,
+        is_bound=True,
+        in_strapdown=True,
+        bias_sd=f"{quantity}_bias_sd_rad",
+        reading=angle_reading(quantity, convention=AngleConvention.CONE, to_row=sine),
+    )
+
+
 SENSORS = (
-    Sensor(
-        name="COSINE_Y",
-        kind=6,
-        of_offset=cosine_y,
-        second_order=bound,
-        is_bound=True,
-        in_strapdown=True,
-        bias_sd="azimuth_bias_sd_rad",
-        reading=Reading(
-            quantity="azimuth",
-            field=Field.AZIMUTH,
-            value="azimuth_rad",
-            variance="azimuth_var",
-            unit="rad",
-            convention=AngleConvention.CONE,
-            to_row=sine,
-        ),
-    ),
-    Sensor(
-        name="COSINE_Z",
-        kind=7,
-        of_offset=cosine_z,
-        second_order=bound,
-        is_bound=True,
-        in_strapdown=True,
-        bias_sd="elevation_bias_sd_rad",
-        reading=Reading(
-            quantity="elevation",
-            field=Field.ELEVATION,
-            value="elevation_rad",
-            variance="elevation_var",
-            unit="rad",
-            convention=AngleConvention.CONE,
-            to_row=sine,
-        ),
-    ),
+    _sensor("COSINE_Y", 6, cosine_y, "azimuth"),
+    _sensor("COSINE_Z", 7, cosine_z, "elevation"),
 )

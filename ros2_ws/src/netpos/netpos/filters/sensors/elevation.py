@@ -6,8 +6,8 @@ import math
 
 from netpos.filters.compile import inlined, leaf
 from netpos.filters.sensors.geometry import in_map_axes, in_rsu_axes, largest_second_order
-from netpos.filters.sensors.model import Reading, Sensor, Wraps
-from netpos.messages.values import AngleConvention, Array, Field
+from netpos.filters.sensors.model import Sensor, Wraps, angle_reading
+from netpos.messages.values import AngleConvention, Array
 
 
 @leaf
@@ -36,13 +36,7 @@ SENSOR = Sensor(
     wraps=Wraps.ALWAYS,
     in_strapdown=True,
     bias_sd="elevation_bias_sd_rad",
-    reading=Reading(
-        quantity="elevation",
-        field=Field.ELEVATION,
-        value="elevation_rad",
-        variance="elevation_var",
-        unit="rad",
-        convention=AngleConvention.SPHERICAL,
-        simulated="elevation",
+    reading=angle_reading(
+        "elevation", convention=AngleConvention.SPHERICAL, simulated="elevation"
     ),
 )

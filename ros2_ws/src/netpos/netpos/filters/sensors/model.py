@@ -59,6 +59,26 @@ class Reading:
     simulator sends it."""
 
 
+def angle_reading(
+    quantity: str,
+    *,
+    convention: AngleConvention,
+    to_row: Kernel | None = None,
+    simulated: str | None = None,
+) -> Reading:
+    """The ``Reading`` of an ``azimuth`` or ``elevation`` [rad]."""
+    return Reading(
+        quantity=quantity,
+        field=Field[quantity.upper()],
+        value=f"{quantity}_rad",
+        variance=f"{quantity}_var",
+        unit="rad",
+        convention=convention,
+        to_row=to_row,
+        simulated=simulated,
+    )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sensor:
     """One kind of measurement row.
