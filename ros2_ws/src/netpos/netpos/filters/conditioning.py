@@ -14,7 +14,6 @@ from netpos.filters.ekf import group_nis
 from netpos.filters.measurement import (
     BLOCKED,
     GATE_VARIANCE,
-    GROUP,
     VALUE,
     VARIANCE,
     curvature_variance,
@@ -24,6 +23,7 @@ from netpos.filters.measurement import (
     linearise,
 )
 from netpos.filters.robust import huber_factor, nlos_mixture_exponential, student_t_factor
+from netpos.filters.sensors.row import group_end
 from netpos.messages.values import Array
 
 # A late range whose equivalent variance would be above this share of the prior's says nothing.
@@ -86,9 +86,7 @@ def m_estimate(
     Jacobian H (m, n), variance ``second_order_var`` (m,) of what linearising leaves out."""
     m, start = rows.shape[0], 0
     while start < m:
-        stop = start + 1
-        while stop < m and rows[stop, GROUP] == rows[start, GROUP]:
-            stop += 1
+        stop = group_end(rows, start)
         variance = rows[start:stop, GATE_VARIANCE] + second_order_var[start:stop]
         d2 = group_nis(cov, innovation[start:stop], H[start:stop], variance)
         if options.kind == Robust.HUBER:

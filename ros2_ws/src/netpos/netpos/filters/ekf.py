@@ -47,6 +47,7 @@ from netpos.filters.motion import (
     propagate,
     transition,
 )
+from netpos.filters.sensors.row import group_end
 from netpos.filters.state import N_CORE, X
 from netpos.messages.values import Array
 
@@ -232,9 +233,7 @@ def gate(
     used, start = 0, 0
     while start < m:
         group = int(rows[start, GROUP])
-        stop = start + 1
-        while stop < m and int(rows[stop, GROUP]) == group:
-            stop += 1
+        stop = group_end(rows, start)
         threshold = gate_nis[min(stop - start, gate_nis.size - 1)]
         taken = is_open or _passes(
             mean, cov, rows, (start, stop), height_m, threshold, iterations, work

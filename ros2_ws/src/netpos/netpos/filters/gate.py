@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from netpos.filters.compile import kernel
 from netpos.filters.fit import distance2
 from netpos.filters.measurement import GROUP
+from netpos.filters.sensors.row import group_end
 from netpos.messages.values import Array
 
 Indices = NDArray[np.int64]
@@ -27,10 +28,7 @@ def gate_groups(
     """
     start = 0
     while start < rows.shape[0]:
-        group = rows[start, GROUP]
-        stop = start + 1
-        while stop < rows.shape[0] and rows[stop, GROUP] == group:
-            stop += 1
+        group, stop = rows[start, GROUP], group_end(rows, start)
         distance = distance2(S[start:stop, start:stop].copy(), innovation[start:stop].copy())
         limit = gate_nis[min(stop - start, gate_nis.size - 1)]
         accepted[int(group)] = 1.0 if distance <= limit else 0.0

@@ -21,6 +21,7 @@ from netpos.filters.compile import kernel, leaf
 from netpos.filters.factor import factor
 from netpos.filters.gate import accepted_rows, gate_groups
 from netpos.filters.measurement import GROUP, KIND, VALUE, VARIANCE, Kind
+from netpos.filters.sensors.row import group_end
 from netpos.filters.sigma import innovation_cov, regress
 from netpos.messages.values import Array
 from netpos.tracking import engine
@@ -74,10 +75,7 @@ def _evidence(rows: Array, innovation: Array, S: Array, gate: Array, accepted: A
         total += rest[i] * rest[i] + 2.0 * math.log(L[i, i])
     start = 0
     while start < rows.shape[0]:
-        group = int(rows[start, GROUP])
-        stop = start + 1
-        while stop < rows.shape[0] and int(rows[stop, GROUP]) == group:
-            stop += 1
+        group, stop = int(rows[start, GROUP]), group_end(rows, start)
         if accepted[group] == 0.0:
             total += gate[min(stop - start, gate.size - 1)]
             L = factor(S[start:stop, start:stop].copy())

@@ -17,7 +17,19 @@ A sensor may keep other figures in ORIGIN and AXES; its module says which.
 
 from __future__ import annotations
 
+from netpos.filters.compile import inlined
+from netpos.messages.values import Array
+
 KIND, VALUE, VARIANCE, GATE_VARIANCE, BIAS, COMMON, GROUP, ORIGIN = range(8)
 AXES = 10
 HEADING, LEVER, BLOCKED = 19, 20, 23
 ROW_WIDTH = 24
+
+
+@inlined
+def group_end(rows: Array, start: int) -> int:
+    """Index after the last row of the group that begins at ``start``."""
+    stop = start + 1
+    while stop < rows.shape[0] and rows[stop, GROUP] == rows[start, GROUP]:
+        stop += 1
+    return stop
