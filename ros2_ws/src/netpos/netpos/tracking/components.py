@@ -7,7 +7,7 @@ A component is one hypothesis about the device. There are three reasons to have 
   device made a manoeuvre that nobody has noticed yet. Each explanation is a component; the
   measurements that follow decide between them (``_add_explanations``).
 - *One RSU at a time is heard.* A turn along the bearing shows in no single measurement. Every
-  quarter of a second a component "the device has turned since" begins (``_add_turn``).
+  quarter of a second a component "the device has turned since" begins (``_at_once``).
 - *The likelihood of a range is a ring.* A component too wide for the tangent of a range is split
   along the ring (``netpos.filters.mixture``).
 """
@@ -19,13 +19,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netpos.filters import ekf, mixture, srukf
+from netpos.filters import ekf, imm, mixture, srukf
 from netpos.filters.compile import kernel
 from netpos.filters.fit import neg2_log_likelihood
 from netpos.filters.gate import accepted_rows
 from netpos.filters.manoeuvre import add_manoeuvre
-from netpos.filters.measurement import GROUP, VARIANCE, innovation_row, innovation_variance
+from netpos.filters.measurement import (
+    GROUP,
+    VARIANCE,
+    innovation_row,
+    innovation_variance,
+)
 from netpos.filters.mixture import Mixture
+from netpos.filters.sensors.row import group_end
 from netpos.messages.values import Array
 from netpos.tracking.engine import (
     GATE_SIZE,
@@ -49,6 +55,14 @@ from netpos.tracking.protection import mixture_radius
 TURN_PERIOD_S = 0.25  # a component "it has turned" begins so long after the last, with one RSU
 _TURNS_HZ = 1.0 / 30.0  # how often a device turns
 _MERGE_SHARE = 0.1  # of the integrity risk: what merging two components may cost
+
+
+class Dynamics(NamedTuple):
+    """How a device moves between epochs: motion (Parameter,), and sd and time constant (2, k) of
+    the biases, as for ``ekf.predict``."""
+
+    motion: Array
+    bias: Array
 
 
 class Update(NamedTuple):
@@ -87,28 +101,17 @@ def one_component(mean: Array, cov: Array) -> Mixture:
 
 
 @kernel
-def move(
-    components: Mixture, dt_s: float, motion: Array, bias: Array, options: FilterOptions
-) -> Mixture:
-    """The components moved by ``dt_s`` seconds; ``motion`` and ``bias`` as for ``ekf.predict``."""
+def move(components: Mixture, dt_s: float, dynamics: Dynamics, options: FilterOptions) -> Mixture:
+    """The components moved by ``dt_s`` seconds."""
     means, covs = components.means.copy(), components.covs.copy()
     for k in range(means.shape[0]):
         if options.filter == Filter.SRUKF:
             factor = srukf.factor(covs[k])
-            predict(means[k], factor, dt_s, motion, bias, options)
+            predict(means[k], factor, dt_s, dynamics.motion, dynamics.bias, options)
             covs[k] = srukf.covariance(factor)
         else:
-            predict(means[k], covs[k], dt_s, motion, bias, options)
+            predict(means[k], covs[k], dt_s, dynamics.motion, dynamics.bias, options)
     return Mixture(means, covs, components.log_weights)
-
-
-@kernel
-def _ends(rows: Array, start: int) -> int:
-    """Index after the last row of the group that begins at ``start``."""
-    stop = start + 1
-    while stop < rows.shape[0] and rows[stop, GROUP] == rows[start, GROUP]:
-        stop += 1
-    return stop
 
 
 @kernel
@@ -123,7 +126,7 @@ def _log_likelihood(
         distance, size = neg2_log_likelihood(mean, cov, rows[kept], height_m, False)
         total = -0.5 * (distance + size)
     while start < rows.shape[0]:
-        stop = _ends(rows, start)
+        stop = group_end(rows, start)
         if accepted[int(rows[start, GROUP])] == 0.0:
             total += mixture.outlier_log(rows[start:stop])
         start = stop
@@ -292,7 +295,7 @@ def _splits(components: Mixture, rows: Array, height_m: float) -> bool:
     """Whether a range of ``rows`` splits a component along its ring."""
     start = 0
     while start < rows.shape[0]:
-        stop = _ends(rows, start)
+        stop = group_end(rows, start)
         for k in range(components.log_weights.size):
             mean, cov = components.means[k], components.covs[k]
             if mixture.splits(rows[start:stop], mean, cov, height_m):
@@ -303,18 +306,14 @@ def _splits(components: Mixture, rows: Array, height_m: float) -> bool:
 
 @kernel
 def is_too_wide(
-    mean: Array,
-    cov: Array,
-    epoch: EpochInput,
-    motion: Array,
-    bias: Array,
-    options: FilterOptions,
+    mean: Array, cov: Array, epoch: EpochInput, dynamics: Dynamics, options: FilterOptions
 ) -> bool:
     """Whether, after a silence, a range of the epoch splits the Gaussian mean (n,), cov (n, n)
     once it is moved to the epoch; nothing is changed."""
-    if epoch.dt_s <= options.coast_after_s:
+    if epoch.dt_s <= options.coast_after_s or epoch.rows.shape[0] == 0:
         return False
-    moved = move(one_component(mean, cov), epoch.dt_s, motion.copy(), bias, options)
+    own = Dynamics(dynamics.motion.copy(), dynamics.bias)
+    moved = move(one_component(mean, cov), epoch.dt_s, own, options)
     return bool(_splits(moved, epoch.rows, options.height_m))
 
 
@@ -360,7 +359,7 @@ def _one_by_one(
     mixture does."""
     nis, used, start = 0.0, 0, 0
     while start < rows.shape[0]:
-        group, stop = int(rows[start, GROUP]), _ends(rows, start)
+        group, stop = int(rows[start, GROUP]), group_end(rows, start)
         alone = rows[start:stop].copy()
         alone[:, GROUP] = 0.0
         count, n = components.means.shape
@@ -407,15 +406,9 @@ def apply_epoch(
 @kernel
 def moments(components: Mixture) -> tuple[Array, Array]:
     """Mean (n,) and covariance (n, n) of the mixture."""
-    means, covs, n = components.means, components.covs, components.means.shape[1]
-    mean, cov = np.zeros(n), np.zeros((n, n))
+    mean, cov = np.empty_like(components.means[0]), np.empty_like(components.covs[0])
     weights = np.exp(components.log_weights)
-    weights /= weights.sum()
-    for k in range(weights.size):
-        mean += weights[k] * means[k]
-    for k in range(weights.size):
-        away = means[k] - mean
-        cov += weights[k] * (covs[k] + np.outer(away, away))
+    imm.combine(components.means, components.covs, weights / weights.sum(), mean, cov)
     return mean, cov
 
 
@@ -427,22 +420,6 @@ def note_turn(found: Update, motion: Array, options: FilterOptions) -> None:
     set_velocity_step_noise(motion, 0.0, 0.0, speed_sd, found.within_s)
 
 
-class Model(NamedTuple):
-    """How a device moves between epochs: motion (Parameter,), and sd and time constant (2, k) of
-    the biases."""
-
-    motion: Array
-    bias: Array
-
-
-@kernel
-def _starts_wide(
-    x: Array, S: Array, epoch: EpochInput, model: Model, options: FilterOptions
-) -> bool:
-    cov = srukf.covariance(S) if options.filter == Filter.SRUKF else S
-    return bool(is_too_wide(x, cov, epoch, model.motion, model.bias, options))
-
-
 @kernel
 def _advance(
     x: Array,
@@ -450,7 +427,7 @@ def _advance(
     components: Mixture,
     epoch: EpochInput,
     since_turn_s: float,
-    model: Model,
+    dynamics: Dynamics,
     options: FilterOptions,
     memory: Scratch,
 ) -> Update:
@@ -458,21 +435,22 @@ def _advance(
     ``components``."""
     square_root, rows = options.filter == Filter.SRUKF, epoch.rows
     several, moved = components.log_weights.size > 1, False
-    if rows.shape[0] > 0 and not several and epoch.dt_s > options.coast_after_s:
-        several = _starts_wide(x, S, epoch, model, options)
+    if not several and epoch.dt_s > options.coast_after_s:
+        P = srukf.covariance(S) if square_root else S
+        several = is_too_wide(x, P, epoch, dynamics, options)
         if several:
-            components = one_component(x, srukf.covariance(S) if square_root else S)
+            components = one_component(x, P)
     if not several and rows.shape[0] == 0:
-        predict(x, S, epoch.dt_s, model.motion, model.bias, options)
+        predict(x, S, epoch.dt_s, dynamics.motion, dynamics.bias, options)
         return Update(components, 0.0, 0, 0.0, 0.0, False)
     if not several:
-        result = step(x, S, epoch, model.motion, model.bias, options, memory)
+        result = step(x, S, epoch, dynamics.motion, dynamics.bias, options, memory)
         if not is_not_enough(result, epoch, since_turn_s, options):
             return Update(components, result.nis, result.used, 0.0, 0.0, False)
         P = srukf.covariance(memory.prior_cov_or_sqrt) if square_root else memory.prior_cov_or_sqrt
         components, moved = one_component(memory.prior_mean, P), True
     if not moved:
-        components = move(components, epoch.dt_s, model.motion, model.bias, options)
+        components = move(components, epoch.dt_s, dynamics, options)
     found = Update(components, 0.0, 0, 0.0, 0.0, False)
     if rows.shape[0] > 0:
         found = apply_epoch(components, epoch, options, since_turn_s, memory.accepted)
@@ -487,7 +465,7 @@ def run_epochs(
     epochs: Epochs,
     mean: Array,
     cov: Array,
-    model: Model,
+    dynamics: Dynamics,
     options: FilterOptions,
     run: Run,
 ) -> int:
@@ -509,7 +487,7 @@ def run_epochs(
         dt, unheard_s = (now_ns - last_ns) * 1e-9, (now_ns - heard_ns) * 1e-9
         epoch = EpochInput(dt, unheard_s, rejected_in_row, rows)
         since_turn_s, last_ns = (now_ns - turn_ns) * 1e-9, now_ns
-        found = _advance(x, S, components, epoch, since_turn_s, model, options, memory)
+        found = _advance(x, S, components, epoch, since_turn_s, dynamics, options, memory)
         components = found.components
         turn_ns = now_ns if found.begun else turn_ns
         run.nis[k], run.dof[k], run.groups[k], run.radius[k] = found.nis, found.used, 0, 0.0

@@ -266,6 +266,12 @@ class TrackerConfig:
                 "robust and nlos_probability need backend compiled and a single motion model;"
                 " leave them at none and 0"
             )
+        several = self.backend == "filterpy" or self.motion_model == "interacting"
+        if several and self.manoeuvre_speed_sd_mps > 0.0:
+            raise ValueError(
+                "manoeuvre_speed_sd_mps needs backend compiled and a single motion model, got"
+                f" {self.manoeuvre_speed_sd_mps}; set it to 0"
+            )
         if self.motion_model == "interacting" and self.filter not in ("ekf", "iekf"):
             raise ValueError(
                 f"motion_model interacting takes filter ekf or iekf, not {self.filter!r}"

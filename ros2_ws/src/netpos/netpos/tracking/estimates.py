@@ -18,7 +18,7 @@ from netpos.filters.motion import Parameter
 from netpos.filters.state import N_CORE, X
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking import components, engine
-from netpos.tracking.components import moments
+from netpos.tracking.components import Dynamics, moments
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.engine import EpochInput, FilterOptions
 from netpos.tracking.models import augmented, initial_extra_sd, motions_of, options_of
@@ -187,7 +187,9 @@ class KalmanEstimate(OneModel):
         if self._components is None:
             engine.predict(self.mean, self._cov_or_sqrt, dt, self._motion, bias, self._options)
         elif dt > 0.0:
-            self._set(components.move(self._components, dt, self._motion, bias, self._options))
+            self._set(
+                components.move(self._components, dt, Dynamics(self._motion, bias), self._options)
+            )
 
     def step(
         self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
@@ -200,9 +202,10 @@ class KalmanEstimate(OneModel):
             self._scratch.accepted,
         )
         motion, options, groups = self._motion, self._options, int(rows.item(-1, GROUP)) + 1
+        dynamics = Dynamics(motion, bias)
         since_turn_s = (stamp_ns - self._turn_ns) * 1e-9
         coasted = self._components is None and dt_s > options.coast_after_s
-        if coasted and components.is_too_wide(self.mean, self.cov, epoch, motion, bias, options):
+        if coasted and components.is_too_wide(self.mean, self.cov, epoch, dynamics, options):
             self._components = components.one_component(self.mean, self.cov)
         if self._components is None:
             result = engine.step(
@@ -216,7 +219,7 @@ class KalmanEstimate(OneModel):
                 return result.nis, result.used, accepted[:groups]
             prior = components.one_component(*self._prior_of_one())
         else:
-            prior = components.move(self._components, dt_s, motion, bias, options)
+            prior = components.move(self._components, dt_s, dynamics, options)
             self.stamp_ns = stamp_ns
         found = components.apply_epoch(prior, epoch, options, since_turn_s, accepted)
         components.note_turn(found, motion, options)
@@ -249,7 +252,7 @@ def modes_of(mixture: Mixture, risk: float) -> tuple[TrackMode, ...]:
 
 
 class GatedEstimate(UnimodalEstimate):
-    """Update and re-update of ``engine.step`` for estimates that are not one compiled step."""
+    """The rules of ``engine.step`` for estimates that are not one compiled step."""
 
     stamp_ns: int
     mean: Array
@@ -272,11 +275,8 @@ class GatedEstimate(UnimodalEstimate):
     def _set_state(self, state: tuple[Array, ...]) -> None:
         raise NotImplementedError
 
-    def _inflate(self, within_s: float) -> None:
-        raise NotImplementedError
-
-    def _set_velocity_step_noise(self, *steps: float) -> None:
-        """Keep the velocity steps allowed for, arguments of ``engine.set_velocity_step_noise``."""
+    def _set_velocity_step_noise(self, opened_sd: float, unheard_s: float) -> None:
+        """Keep the velocity step allowed for, as ``engine.set_velocity_step_noise``."""
 
     @property
     def prior(self) -> tuple[Array, Array]:
@@ -297,31 +297,12 @@ class GatedEstimate(UnimodalEstimate):
         before = tuple(part.copy() for part in self._state())
         opened = rejected_in_row >= self._options.inflate_after
         speed = self._options.initial_speed_sd
-        manoeuvre_sd = within_s = 0.0
         if opened:
             self._open(speed, unheard_s)
         accepted = np.zeros(int(rows[-1, GROUP]) + 1)
         nis, used = self._update(rows, accepted)
-        manoeuvre = self._options.manoeuvre_speed_sd
-        if manoeuvre > 0.0 and not accepted.all():
-            first = self._state()
-            self._restore(before)
-            if opened:
-                self._open(speed, unheard_s)
-            mean, cov = self._prior
-            within_s = engine.manoeuvre_s(mean, cov, rows, unheard_s, self._options)
-            self._inflate(within_s)
-            second = np.zeros_like(accepted)
-            second_nis, second_used = self._update(rows, second)
-            if second.sum() > accepted.sum():
-                nis, used, accepted = second_nis, second_used, second
-                manoeuvre_sd = manoeuvre
-            else:
-                self._set_state(first)
         if accepted.any():
-            self._set_velocity_step_noise(
-                speed if opened else 0.0, unheard_s, manoeuvre_sd, within_s
-            )
+            self._set_velocity_step_noise(speed if opened else 0.0, unheard_s)
         else:
             self._restore(before)
         return nis, used, accepted
@@ -395,10 +376,6 @@ class ImmEstimate(GatedEstimate):
         for cov in self._models.covs:
             engine.open_velocity(cov, sd, unheard_s, self._options)
 
-    def _inflate(self, within_s: float) -> None:
-        for cov in self._models.covs:
-            engine.inflate_for_manoeuvre(cov, within_s, self._options)
-
     def copy(self) -> ImmEstimate:
         twin = copy.copy(self)
         twin._restore(self._state())
@@ -431,8 +408,8 @@ class FilterpyEstimate(OneModel, GatedEstimate):
     def augment(self, sd: Array) -> None:
         self.mean, self.cov = augmented(self.mean, self.cov, sd)
 
-    def _set_velocity_step_noise(self, *steps: float) -> None:
-        engine.set_velocity_step_noise(self._motion, *steps)
+    def _set_velocity_step_noise(self, opened_sd: float, unheard_s: float) -> None:
+        engine.set_velocity_step_noise(self._motion, opened_sd, unheard_s, 0.0, 0.0)
 
     def _move(self, stamp_ns: int, bias: Array) -> None:
         dt = (stamp_ns - self.stamp_ns) * 1e-9
@@ -446,9 +423,6 @@ class FilterpyEstimate(OneModel, GatedEstimate):
 
     def _open(self, sd: float, unheard_s: float) -> None:
         engine.open_velocity(self.cov, sd, unheard_s, self._options)
-
-    def _inflate(self, within_s: float) -> None:
-        engine.inflate_for_manoeuvre(self.cov, within_s, self._options)
 
     def copy(self) -> FilterpyEstimate:
         twin = copy.copy(self)

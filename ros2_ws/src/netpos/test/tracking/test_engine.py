@@ -20,7 +20,7 @@ from netpos.filters.state import POSITION, X
 from netpos.messages.values import Array, Field, InitialPose, RsuInfo, RsuMeasurement
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking import Tracker, TrackerConfig, engine
-from netpos.tracking.components import Model, run_epochs
+from netpos.tracking.components import Dynamics, run_epochs
 from netpos.tracking.engine import EpochInput, Epochs, FilterOptions, Run
 from netpos.tracking.models import motions_of, options_of, pose_state
 
@@ -174,9 +174,9 @@ def run(config: TrackerConfig, mean: Array, cov: Array, inputs: Any) -> tuple[in
     stamps, starts, rows = inputs
     N, n = len(stamps), len(mean)
     out = Run(*(np.full(shape, np.nan) for shape in ((N, n), (N, n, n), N, N, N, N)))
-    before, model = rows.copy(), Model(motions_of(config)[0], NO_BIAS)
+    before, dynamics = rows.copy(), Dynamics(motions_of(config)[0], NO_BIAS)
     epochs = Epochs(stamps, starts, rows)
-    done = run_epochs(epochs, mean, cov, model, options_of(config), out)
+    done = run_epochs(epochs, mean, cov, dynamics, options_of(config), out)
     np.testing.assert_array_equal(rows, before)
     return done, out
 

@@ -83,7 +83,7 @@ def test_every_filter_tracks_with_every_model(world: Any, name: str, model: str)
     "model", ["constant_velocity", "constant_turn", "constant_acceleration", "inertial"]
 )
 def test_filterpy_says_the_same(world: Any, name: str, model: str) -> None:
-    """Every epoch of a track with biases, outliers, a second look and a ground speed."""
+    """Every epoch of a track with biases, outliers and a ground speed."""
     slow = {"range_bias_sd_m": 0.3, "bias_correlation_time_s": 30.0}
     world.rsus = {n: replace(info, **slow) for n, info in world.rsus.items()}
     found = {}
@@ -95,7 +95,6 @@ def test_filterpy_says_the_same(world: Any, name: str, model: str) -> None:
             backend=backend,
             clock_offset_sd_s=3e-8,
             clock_drift_sd=1e-8,
-            manoeuvre_speed_sd_mps=2.0,
         )
         outputs = []
         for k in range(60):
@@ -266,10 +265,12 @@ def test_bad_combinations(values: dict[str, Any], message: str) -> None:
         {"robust": "huber", "backend": "filterpy", "filter": "ekf"},
         {"nlos_probability": 0.1, "motion_model": "interacting"},
         {"robust": "student_t", "motion_model": "interacting"},
+        {"manoeuvre_speed_sd_mps": 2.0, "motion_model": "interacting"},
+        {"manoeuvre_speed_sd_mps": 2.0, "backend": "filterpy", "filter": "ekf"},
     ],
 )
 def test_options_an_estimate_cannot_do_are_refused(values: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"robust|nlos"):
+    with pytest.raises(ValueError, match=r"robust|nlos|manoeuvre_speed_sd_mps needs"):
         TrackerConfig(**values)
 
 

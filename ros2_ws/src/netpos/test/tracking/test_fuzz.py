@@ -53,7 +53,7 @@ CONFIGS: dict[str, dict[str, Any]] = {
     "ukf, no gate": {"filter": "ukf", "gate_probability": 1.0},
     "turn": {"motion_model": "constant_turn", "filter": "ukf"},
     "acceleration": {"motion_model": "constant_acceleration", "process_noise": "werner"},
-    "interacting": {"motion_model": "interacting", "filter": "ekf", "manoeuvre_speed_sd_mps": 2.0},
+    "interacting": {"motion_model": "interacting", "filter": "ekf"},
     "inertial": {"motion_model": "inertial"},
     "robust": {"robust": "student_t", "nlos_probability": 0.2, "isolate_rsus": False},
     "paper's rule": {"filter": "srukf", "ambiguity": "step_heading", "isolate_rsus": False},

@@ -24,7 +24,7 @@ from netpos.radio.noise import generator
 from netpos.scenario.networks import fix_errors
 from netpos.scenario.schema import NS
 from netpos.tracking import estimates
-from netpos.tracking.components import Model, run_epochs
+from netpos.tracking.components import Dynamics, run_epochs
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.engine import Epochs, Run
 from netpos.tracking.epoch_rows import epoch_rows_of
@@ -135,8 +135,8 @@ class Pass:
         mean[TRACK_STATES] = start
         run = Run(np.empty((n, 8)), np.empty((n, 8, 8)), *np.empty((4, n)))
         epochs = Epochs(self._epochs, self._row_start, position_rows(fixes, self._sd))
-        model = Model(self._motion, NO_BIAS)
-        run_epochs(epochs, mean, self._start_cov, model, self._options, run)
+        dynamics = Dynamics(self._motion, NO_BIAS)
+        run_epochs(epochs, mean, self._start_cov, dynamics, self._options, run)
         kept = np.ix_(np.arange(1, n), TRACK_STATES, TRACK_STATES)
         return run.means[1:, TRACK_STATES], run.covs[kept]
 

@@ -13,7 +13,7 @@ from netpos.filters.measurement import BIAS
 from netpos.filters.state import N_CORE
 from netpos.messages.values import Array, ImuSample
 from netpos.tracking import engine, estimates
-from netpos.tracking.components import Model, run_epochs
+from netpos.tracking.components import Dynamics, run_epochs
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.engine import Run
 from netpos.tracking.imu_buffer import ImuBuffer
@@ -143,7 +143,7 @@ class Follower:
         """Epochs done: all in one kernel."""
         mean, cov = self.augmented(mean, cov, epochs.bias)
         done: int = run_epochs(
-            epochs.measured, mean, cov, Model(self._motions[0], epochs.bias), self._options, run
+            epochs.measured, mean, cov, Dynamics(self._motions[0], epochs.bias), self._options, run
         )
         return done
 

@@ -210,7 +210,8 @@ def test_a_run_is_what_the_tracker_makes_of_its_measurements(
     scenario: str, seed: int, model: str, clock: dict[str, float] | None
 ) -> None:
     changes = (("max_duration_s", 25.0), ("rsus.clock", clock))
-    tracker_settings = (("motion_model", model),)
+    several = {"manoeuvre_speed_sd_mps": 0.0} if model == "interacting" else {}
+    tracker_settings = (("motion_model", model), *several.items())
     setup = Setup(
         Experiment(name="x", scenario=scenario, changes=changes, tracker=tracker_settings)
     )
