@@ -21,6 +21,7 @@ import numpy as np
 
 from netpos.filters import ekf, imm, mixture, srukf
 from netpos.filters.compile import kernel
+from netpos.filters.conditioning import Robust, reweight
 from netpos.filters.fit import neg2_log_likelihood
 from netpos.filters.gate import accepted_rows
 from netpos.filters.manoeuvre import add_manoeuvre
@@ -112,6 +113,21 @@ def move(components: Mixture, dt_s: float, dynamics: Dynamics, options: FilterOp
         else:
             predict(means[k], covs[k], dt_s, dynamics.motion, dynamics.bias, options)
     return Mixture(means, covs, components.log_weights)
+
+
+@kernel
+def moved_to_epoch(
+    components: Mixture, epoch: EpochInput, dynamics: Dynamics, options: FilterOptions
+) -> Mixture:
+    """The components moved to the epoch, the rows of which are re-weighted in place as the robust
+    options say: as the most probable component predicts them."""
+    moved: Mixture = move(components, epoch.dt_s, dynamics, options)
+    rows, robust = epoch.rows, options.robust
+    if rows.shape[0] > 0 and (robust.kind != Robust.NONE or robust.nlos_probability > 0.0):
+        best, height_m = int(np.argmax(moved.log_weights)), options.height_m
+        work = ekf.workspace(moved.means.shape[1], rows.shape[0])
+        reweight(moved.means[best], moved.covs[best], rows, height_m, robust, work[0])
+    return moved
 
 
 @kernel
@@ -450,7 +466,7 @@ def _advance(
         P = srukf.covariance(memory.prior_cov_or_sqrt) if square_root else memory.prior_cov_or_sqrt
         components, moved = one_component(memory.prior_mean, P), True
     if not moved:
-        components = move(components, epoch.dt_s, dynamics, options)
+        components = moved_to_epoch(components, epoch, dynamics, options)
     found = Update(components, 0.0, 0, 0.0, 0.0, False)
     if rows.shape[0] > 0:
         found = apply_epoch(components, epoch, options, since_turn_s, memory.accepted)

@@ -219,7 +219,7 @@ class KalmanEstimate(OneModel):
                 return result.nis, result.used, accepted[:groups]
             prior = components.one_component(*self._prior_of_one())
         else:
-            prior = components.move(self._components, dt_s, dynamics, options)
+            prior = components.moved_to_epoch(self._components, epoch, dynamics, options)
             self.stamp_ns = stamp_ns
         found = components.apply_epoch(prior, epoch, options, since_turn_s, accepted)
         components.note_turn(found, motion, options)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from filter_rows import make_cov, row
 from netpos.filters import ekf, mixture
-from netpos.filters.measurement import GROUP, Kind
+from netpos.filters.measurement import GROUP, VARIANCE, Kind
 from netpos.filters.motion import NO_BIAS
 from netpos.filters.rows import linear_rows
 from netpos.messages.values import Array
@@ -14,7 +14,7 @@ from netpos.tracking import TrackerConfig, components
 from netpos.tracking.components import moments, one_component
 from netpos.tracking.engine import EpochInput
 from netpos.tracking.estimates import KalmanEstimate
-from netpos.tracking.models import options_of
+from netpos.tracking.models import motions_of, options_of
 from scipy.stats import multivariate_normal
 
 OPTIONS = options_of(TrackerConfig(filter="ekf"))
@@ -320,3 +320,21 @@ def test_every_filter_follows_a_turn_and_forgets_an_outlier(name: str) -> None:
     assert max(errors[95:]) < 0.6
     assert estimate.modes == ()
     assert rows[-1, GROUP] == 1
+
+
+@pytest.mark.parametrize("name", ["ekf", "srukf"])
+def test_rows_are_reweighted_by_the_most_probable_component(name: str) -> None:
+    """Huber's factor of a fix 4 m off the heavier of two components, and 40 m off the other."""
+    config = TrackerConfig(
+        filter=name, robust="huber", robust_parameter=1.5, manoeuvre_speed_sd_mps=5.0
+    )
+    x, P = prior((1.0, 2.0), (0.2, 0.3))
+    two = mixture.Mixture(np.array([x + 40.0, x]), np.array([P, P]), np.log(np.array([0.1, 0.9])))
+    off = np.array([4.0, 0.0])
+    rows = linear_rows(x[:2] + off, R, H, 0)
+    variance = rows[:, VARIANCE].copy()
+    dynamics = components.Dynamics(motions_of(config)[0], NO_BIAS)
+    epoch = EpochInput(0.0, 0.1, 0, rows)
+    components.moved_to_epoch(two, epoch, dynamics, options_of(config))
+    distance = np.sqrt(off @ np.linalg.solve(H @ P @ H.T + R, off) / 2.0)
+    np.testing.assert_allclose(rows[:, VARIANCE] / variance, distance / 1.5, rtol=1e-9)
