@@ -1,13 +1,13 @@
-"""Attitude from gyro, accelerometer and optional magnetometer: explicit complementary filter.
+"""Attitude from gyro, accelerometer and optional magnetometer.
 
-R. Mahony, T. Hamel, J.-M. Pflimlin, "Nonlinear complementary filters on the special orthogonal
-group", IEEE Trans. Automatic Control 53(5), 2008, eqs. 47-48 (passive form with bias), with two
-changes usual in walking: the accelerometer is down-weighted when it does not measure 1 g, and
-the magnetometer corrects heading only, so that a disturbed field cannot tilt the estimate.
-A field whose norm, dip or heading contradicts what came before is not used: iron beside the way
-may turn the horizontal field by tens of degrees where norm and dip hardly change.
+Tilt and gyro bias are those of VQF (D. Laidig, T. Seel, "VQF: Highly accurate IMU orientation
+estimation with bias estimation and magnetic disturbance rejection", Information Fusion 91, 2023;
+the package ``vqf``): the specific force is averaged in axes that do not turn, where the
+accelerations of fast motion cancel. The magnetometer corrects heading only, so that a disturbed
+field cannot tilt the estimate. A field whose norm, dip or heading contradicts what came before is
+not used: iron beside the way may turn the horizontal field by tens of degrees where norm and dip
+hardly change.
 
-    q' = q * (0, w - b + kp e) / 2,   b' = -ki e,   e = f/|f| x R' z            (A1)
     heading error  d = (pi/2 - declination) - atan2(m_north, m_east)            (A2)
     used while |d| <= 3 sqrt(s^2 + s_m^2); s grows by ``gyro_heading_drift_radps`` t and falls
     with the gain to s_m / 2 as samples are used                                (A3)
@@ -24,6 +24,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
+from vqf import VQF
 
 from netpos.common.parameters import check_fields, not_negative, positive, real
 
@@ -41,22 +42,16 @@ class AttitudeConfig:
     """Gains and gates of ``AttitudeFilter``; a bad value raises ``ValueError`` here."""
 
     alignment_time_s: float = positive(0.5, "the first attitude is the mean over this long")
-    tilt_gain_per_s: float = not_negative(0.3, "gain of the accelerometer on the tilt")
-    bias_gain_per_s2: float = not_negative(0.003, "gain of the accelerometer on the gyro bias")
-    heading_gain_per_s: float = not_negative(0.3, "gain of the magnetometer on the heading")
-    max_bias_radps: float = positive(0.1, "largest gyro bias per axis")
-    acceleration_gate_mps2: float = positive(
-        2.0, "a specific force this far from 1 g says nothing of the tilt"
+    tilt_time_s: float = positive(3.0, "time constant of the accelerometer's hold on the tilt")
+    heading_gain_per_s: float = not_negative(
+        0.11, "gain of the magnetometer on the heading: one over the 9 s of VQF"
     )
+    max_bias_radps: float = positive(0.1, "largest gyro bias per axis")
     gravity_tolerance_mps2: float = positive(
         3.0, "a first mean force further from 1 g than this is no gravity"
     )
     rest_gyro_radps: float = positive(0.15, "first attitude: a body at rest turns slower")
     rest_acceleration_sd_mps2: float = positive(0.15, "first attitude: a body at rest shakes less")
-    rest_bias_memory_s: float = positive(15.0, "the gyro bias is the mean of this much rest")
-    rest_bias_gate_radps: float = positive(
-        0.02, "a rate at rest further from the known bias than this is a turn"
-    )
     declination_rad: float = real(
         0.0, -math.pi, math.pi, "magnetic declination, east of north positive"
     )
@@ -105,15 +100,8 @@ def rotate(q: Quaternion, v: Vector) -> Vector:
     )
 
 
-def _exponential(v: Vector) -> Quaternion:
-    angle = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-    s = 0.5 - angle * angle / 48.0 if angle < 1e-4 else math.sin(0.5 * angle) / angle
-    return (math.cos(0.5 * angle), v[0] * s, v[1] * s, v[2] * s)
-
-
-def _normalised(q: Quaternion) -> Quaternion:
-    n = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    return (q[0] / n, q[1] / n, q[2] / n, q[3] / n)
+def _about_up(angle_rad: float) -> Quaternion:
+    return (math.cos(0.5 * angle_rad), 0.0, 0.0, math.sin(0.5 * angle_rad))
 
 
 def level(specific_force: Vector, forward: Vector = (1.0, 0.0, 0.0)) -> Quaternion:
@@ -147,9 +135,9 @@ def level(specific_force: Vector, forward: Vector = (1.0, 0.0, 0.0)) -> Quaterni
 class AttitudeFilter:
     """Streaming orientation; aligns on the first ``alignment_time_s`` of samples.
 
-    Alignment takes the mean specific force as up. When the window is at rest its mean
-    angular rate becomes the gyro bias; otherwise the bias starts at zero and the tilt gain
-    pulls the error out. Heading is relative until the first accepted magnetic sample.
+    Alignment checks that the mean specific force is gravity. When the window is at rest its mean
+    angular rate becomes the gyro bias. Heading is relative until the first accepted magnetic
+    sample.
     """
 
     def __init__(self, config: AttitudeConfig | None = None) -> None:
@@ -162,7 +150,6 @@ class AttitudeFilter:
         kept = self.heading_rad if keep_heading and self.aligned else 0.0
         if not keep_heading:
             self._bias: Vector = (0.0, 0.0, 0.0)
-            self._rest_s = 0.0  # how much rest the bias is the mean of
             self._reference: HeadingReference = "relative"
             self._field: tuple[float, float] | None = None  # norm [T], dip [rad]
             self._last_field_ns: int | None = None
@@ -171,11 +158,13 @@ class AttitudeFilter:
         self._restart_heading = kept
         self.alignment_failed = False  # the last window had no plausible gravity
         self._q = None
-        self._last_ns: int | None = None
-        self._start_ns: int | None = None
-        self._n = 0
-        self._sum = np.zeros(6)
-        self._sum_sq = np.zeros(3)
+        self._vqf: VQF | None = None
+        self._period_s = 0.0  # of a sample, as VQF has it
+        self._last_ns = 0
+        self._turned = 0.0  # from the heading of VQF
+        self._bias_array = np.array(self._bias)
+        self._gyro, self._force = np.empty(3), np.empty(3)
+        self._window: list[tuple[int, Vector, Vector]] = []
 
     @property
     def aligned(self) -> bool:
@@ -213,29 +202,33 @@ class AttitudeFilter:
         return wrap_angle(math.atan2(y, x))
 
     def add_imu(self, stamp_ns: int, rate: Vector, force: Vector) -> bool:
-        """Propagate by one finite sample with a later stamp; True when aligned (A1).
+        """Propagate by one finite sample with a later stamp; True when aligned.
 
         rate : rad/s, body. force : specific force, m/s^2, body.
         """
-        if self._q is None:
+        if self._vqf is None:
             return self._align(stamp_ns, rate, force)
-        dt = (stamp_ns - self._last_ns) * 1e-9 if self._last_ns is not None else 0.0
+        dt = (stamp_ns - self._last_ns) * 1e-9
         self._last_ns = stamp_ns
-        ex, ey, ez = self._tilt_error(self._q, force)
-        kp = min(self._cfg.tilt_gain_per_s, 1.0 / dt) if dt > 0 else 0.0
-        ki, limit = self._cfg.bias_gain_per_s2 * dt, self._cfg.max_bias_radps
-        bx, by, bz = self._bias
-        bx = min(max(bx - ki * ex, -limit), limit)
-        by = min(max(by - ki * ey, -limit), limit)
-        bz = min(max(bz - ki * ez, -limit), limit)
-        self._bias = (bx, by, bz)
-        step = (
-            (rate[0] - bx + kp * ex) * dt,
-            (rate[1] - by + kp * ey) * dt,
-            (rate[2] - bz + kp * ez) * dt,
-        )
-        self._q = _normalised(multiply(self._q, _exponential(step)))
+        # VQF takes one period for all samples: a rate that turns as far in that is given to it.
+        stretch = dt / self._period_s
+        self._gyro[:] = rate
+        self._gyro *= stretch
+        self._gyro += (1.0 - stretch) * self._bias_array
+        self._force[:] = force
+        self._vqf.updateGyr(self._gyro)
+        self._vqf.updateAcc(self._force)
+        self._take(self._vqf)
         return True
+
+    def _take(self, vqf: VQF) -> None:
+        """Take over attitude and bias of VQF."""
+        w, x, y, z = vqf.getQuat6D().tolist()
+        self._q = multiply(_about_up(self._turned), (w, x, y, z))
+        bias, _ = vqf.getBiasEstimate()
+        self._bias_array = bias
+        bx, by, bz = bias.tolist()
+        self._bias = (bx, by, bz)
 
     def add_magnetic_field(
         self, stamp_ns: int, field_tesla: Vector, quaternion: Quaternion | None = None
@@ -274,35 +267,11 @@ class AttitudeFilter:
         self.turn(gain * error)
         return "used"
 
-    def rest(self, dt_s: float, rate: Vector) -> None:
-        """Learn the gyro bias from a sample at rest, the ``dt_s`` after the last one: the mean of
-        all rest, or of about the last ``rest_bias_memory_s`` of it.
-
-        A rate further than ``rest_bias_gate_radps`` from the present bias is a turn, not rest.
-        """
-        bx, by, bz = self._bias
-        x, y, z = rate[0] - bx, rate[1] - by, rate[2] - bz
-        if self._q is None or max(abs(x), abs(y), abs(z)) > self._cfg.rest_bias_gate_radps:
-            return
-        self._rest_s = min(self._rest_s + dt_s, self._cfg.rest_bias_memory_s)
-        a = dt_s / self._rest_s if dt_s > 0 else 0.0
-        self._bias = (bx + a * x, by + a * y, bz + a * z)
-
     def turn(self, angle_rad: float) -> None:
         """Turn the attitude about map z (up), counter-clockwise."""
         if self._q is not None:
-            self._q = _normalised(multiply(_exponential((0.0, 0.0, angle_rad)), self._q))
-
-    def _tilt_error(self, q: Quaternion, force: Vector) -> Vector:
-        norm = math.sqrt(force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
-        weight = 1.0 - abs(norm - GRAVITY_MPS2) / self._cfg.acceleration_gate_mps2
-        if weight <= 0.0 or norm == 0.0:
-            return (0.0, 0.0, 0.0)
-        w, x, y, z = q
-        ux, uy, uz = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-        s = weight / norm
-        fx, fy, fz = force[0] * s, force[1] * s, force[2] * s
-        return (fy * uz - fz * uy, fz * ux - fx * uz, fx * uy - fy * ux)
+            self._turned += angle_rad
+            self._q = multiply(_about_up(angle_rad), self._q)
 
     def _disturbed(self, stamp_ns: int, norm: float, dip: float) -> bool:
         """Compare with, then slowly follow, the local field (it changes along a building)."""
@@ -326,29 +295,47 @@ class AttitudeFilter:
         return abs(error_rad) > 3.0 * math.hypot(kept_sd, self._cfg.magnetic_heading_sd_rad)
 
     def _align(self, stamp_ns: int, rate: Vector, force: Vector) -> bool:
-        if self._start_ns is None:
-            self._start_ns = stamp_ns
-        self._n += 1
-        self._sum += np.array([*rate, *force])
-        self._sum_sq += np.square(np.array(force))
-        self._last_ns = stamp_ns
+        self._window.append((stamp_ns, rate, force))
         self.alignment_failed = False
-        if (stamp_ns - self._start_ns) * 1e-9 < self._cfg.alignment_time_s:
+        start_ns = self._window[0][0]
+        if (stamp_ns - start_ns) * 1e-9 < self._cfg.alignment_time_s:
             return False
-        mean = self._sum / self._n
-        sd = math.sqrt(max(float(np.sum(self._sum_sq / self._n - mean[3:] ** 2)), 0.0))
-        start, self._start_ns, n = self._restart_heading, None, self._n
-        self._n, self._sum, self._sum_sq = 0, np.zeros(6), np.zeros(3)
-        norm = float(np.linalg.norm(mean[3:]))
-        if abs(norm - GRAVITY_MPS2) > self._cfg.gravity_tolerance_mps2:
+        window, self._window = self._window, []
+        rates = np.array([sample[1] for sample in window])
+        forces = np.array([sample[2] for sample in window])
+        mean_rate, mean_force = rates.mean(axis=0), forces.mean(axis=0)
+        cfg, gravity = self._cfg, float(np.linalg.norm(mean_force))
+        if abs(gravity - GRAVITY_MPS2) > cfg.gravity_tolerance_mps2:
             self.alignment_failed = True
             return False  # wrong unit, free fall or shaking: try the next window
-        cfg = self._cfg
-        rest = sd < cfg.rest_acceleration_sd_mps2 and n > 2
-        rate_norm = float(np.linalg.norm(mean[:3]))
-        if rest and rate_norm < min(cfg.rest_gyro_radps, cfg.max_bias_radps):
-            self._bias = (float(mean[0]), float(mean[1]), float(mean[2]))
-            self._rest_s = cfg.alignment_time_s
-        self._q = level((float(mean[3]), float(mean[4]), float(mean[5])))
-        self.turn(start)
+        sd, turn = math.sqrt(float(forces.var(axis=0).sum())), float(np.linalg.norm(mean_rate))
+        rest = sd < cfg.rest_acceleration_sd_mps2 and len(window) > 2
+        if rest and turn < min(cfg.rest_gyro_radps, cfg.max_bias_radps):
+            bx, by, bz = mean_rate.tolist()
+            self._bias = (bx, by, bz)
+        fx, fy, fz = mean_force.tolist()
+        self._begin([stamp for stamp, _, _ in window], rates, forces)
+        self._turn_to(level((fx, fy, fz)))
         return True
+
+    def _begin(self, stamps_ns: list[int], rates: Array, forces: Array) -> None:
+        """Start VQF with the samples (n, 3) of the first window."""
+        self._period_s = (stamps_ns[-1] - stamps_ns[0]) * 1e-9 / (len(stamps_ns) - 1)
+        self._last_ns = stamps_ns[-1]
+        self._vqf = VQF(
+            self._period_s,
+            tauAcc=self._cfg.tilt_time_s,
+            biasClip=math.degrees(self._cfg.max_bias_radps),
+        )
+        self._bias_array = np.array(self._bias)
+        self._vqf.setBiasEstimate(self._bias_array, -1.0)
+        for rate, force in zip(rates, forces, strict=True):
+            self._vqf.updateGyr(rate)
+            self._vqf.updateAcc(force)
+        self._take(self._vqf)
+
+    def _turn_to(self, attitude: Quaternion) -> None:
+        """Turn about map z so that the heading is that of ``attitude``, turned by what is kept."""
+        w, x, y, z = self.quaternion
+        tw, _, _, tz = multiply(attitude, (w, -x, -y, -z))
+        self.turn(2.0 * math.atan2(tz, tw) + self._restart_heading)

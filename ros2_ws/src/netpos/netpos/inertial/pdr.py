@@ -255,8 +255,6 @@ class PedestrianDeadReckoning:
                 self._heading_fix_ns = stamp_ns
         self._watch_field(stamp_ns)
         self._attitudes.append((stamp_ns, self._attitude.quaternion))
-        if self._resting:
-            self._attitude.rest(dt_s, rate)
         bias = self._attitude.bias_radps
         norm = math.sqrt(sum((r - b) ** 2 for r, b in zip(rate, bias, strict=True)))
         a = min(dt_s / 0.5, 1.0) if self._turn_rate < math.inf else 1.0

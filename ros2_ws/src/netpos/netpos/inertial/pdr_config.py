@@ -11,6 +11,7 @@ from netpos.common.parameters import (
     check_fields,
     choice,
     described,
+    nearest,
     not_negative,
     positive,
     real,
@@ -20,6 +21,7 @@ from netpos.inertial.attitude import AttitudeConfig
 from netpos.inertial.steps import StepConfig
 
 Placement = Literal["carried", "waist"]
+_WAIST_SCALE_SD = 0.4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,7 +122,12 @@ class PdrConfig:
         if placement == "carried":
             return cls()
         if placement == "waist":
-            return cls(steps=StepConfig.waist(), max_mount_tilt_rad=math.radians(60))
+            return cls(
+                steps=StepConfig.waist(),
+                max_mount_tilt_rad=math.radians(60),
+                # a patient's steps are much shorter than the model's, and nothing tells before
+                length_scale_sd=_WAIST_SCALE_SD,
+            )
         raise ValueError(f"placement must be carried or waist, got {placement!r}")
 
     @classmethod
@@ -136,7 +143,7 @@ class PdrConfig:
         known = base.flat()
         for name, value in given.items():
             if name not in known:
-                raise ValueError(f"no parameter {name} of pdr; known: {', '.join(sorted(known))}")
+                raise ValueError(f"no parameter {name} of pdr{nearest(name, known)}")
             known[name] = typed(f"pdr.{name}", known[name], value)
         inner = {
             part: type(getattr(base, part))(

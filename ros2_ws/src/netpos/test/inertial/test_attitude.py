@@ -86,8 +86,8 @@ def test_alignment_recovers_tilt_and_gyro_bias() -> None:
         f.add_imu(i * DT_NS, tup(bias), tup(truth.inv().apply(G_MAP)))
     assert f.aligned
     assert f.reference == "relative"
-    assert angle_deg(f.rotation, truth) < 0.01
-    np.testing.assert_allclose(f.bias_radps, bias, atol=1e-4)
+    assert angle_deg(f.rotation, truth) < 0.02
+    np.testing.assert_allclose(f.bias_radps, bias, atol=5e-4)
 
 
 def test_no_bias_is_learnt_from_a_turning_start() -> None:
@@ -98,52 +98,55 @@ def test_no_bias_is_learnt_from_a_turning_start() -> None:
     assert f.bias_radps == (0.0, 0.0, 0.0)
 
 
-def test_propagation_matches_the_closed_form_of_a_turn_about_a_tilted_axis() -> None:
-    """Constant body rate: R(t) = R(0) exp(w t), here integrated without corrections."""
-    config = AttitudeConfig(tilt_gain_per_s=0.0, bias_gain_per_s2=0.0)
-    start = Rotation.from_euler("ZYX", [0.0, 10.0, 20.0], degrees=True)
-    f = AttitudeFilter(config)
-    last = rest(f, start)
-    rate = np.array([0.4, -0.7, 1.1])
-    for i in range(1, 301):
-        f.add_imu(last + i * DT_NS, tup(rate), (0.0, 0.0, GRAVITY_MPS2))
-    expected = start * Rotation.from_rotvec(rate * 3.0)
-    assert angle_deg(f.rotation, expected) < 1e-6
+@pytest.mark.parametrize("jitter", [0.0, 0.6])
+def test_a_turn_is_the_integral_of_the_rate_whatever_the_interval(jitter: float) -> None:
+    """R(t) = R(0) exp(w t) about the vertical; samples come up to 60 % early or late."""
+    rng = np.random.default_rng(3)
+    tilt = Rotation.from_euler("ZYX", [0.0, 10.0, 20.0], degrees=True)
+    f = AttitudeFilter()
+    stamp = rest(f, tilt)
+    start_ns, rate = stamp, 0.9
+    for _ in range(600):
+        stamp += round(DT_NS * (1.0 + jitter * rng.uniform(-1, 1)))
+        truth = Rotation.from_euler("z", rate * (stamp - start_ns) * 1e-9) * tilt
+        f.add_imu(stamp, tup(truth.inv().apply([0.0, 0.0, rate])), tup(truth.inv().apply(G_MAP)))
+    assert angle_deg(f.rotation, truth) < 0.5
 
 
-def test_tilt_error_decays_with_the_configured_gain() -> None:
-    """Small angles: theta' = -kp theta, so 0.1 rad is 0.1 exp(-kp t) after t."""
-    kp = 0.5
-    f = AttitudeFilter(AttitudeConfig(tilt_gain_per_s=kp, bias_gain_per_s2=0.0))
-    last = rest(f, Rotation.identity())
+@pytest.mark.parametrize("tilt_time_s", [1.0, 3.0])
+def test_tilt_error_decays_with_the_configured_time(tilt_time_s: float) -> None:
+    """A body turned by 0.1 rad that the gyro did not see."""
+    f = AttitudeFilter(AttitudeConfig(tilt_time_s=tilt_time_s))
+    last = rest(f, Rotation.identity(), n=1000)
     tilted = Rotation.from_rotvec([0.1, 0.0, 0.0])
-    for i in range(1, 201):
+    errors = []
+    for i in range(1, 2001):
         f.add_imu(last + i * DT_NS, (0.0, 0.0, 0.0), tup(tilted.inv().apply(G_MAP)))
-    error = float((f.rotation.inv() * tilted).magnitude())
-    assert error == pytest.approx(0.1 * math.exp(-kp * 2.0), rel=0.02)
+        errors.append(float((f.rotation.inv() * tilted).magnitude()))
+    half_s = 0.01 * next(i for i, error in enumerate(errors) if error < 0.05)
+    assert 0.3 * tilt_time_s < half_s < 2.0 * tilt_time_s
+    assert errors[-1] < 0.01
+
+
+def test_fast_motion_does_not_tilt() -> None:
+    """A body shaken along one axis with 1 g, three times a second: its mean force is gravity, and
+    its largest 45 deg off."""
+    f = AttitudeFilter()
+    last, worst = rest(f, Rotation.identity(), n=600), 0.0
+    for i in range(1, 3001):
+        shaken = GRAVITY_MPS2 * math.sin(2.0 * math.pi * 3.0 * i * 0.01)
+        f.add_imu(last + i * DT_NS, (0.0, 0.0, 0.0), (shaken, 0.0, GRAVITY_MPS2))
+        worst = max(worst, angle_deg(f.rotation, Rotation.identity()))
+    assert worst < 2.5
 
 
 def test_constant_gyro_bias_is_estimated() -> None:
-    f = AttitudeFilter(AttitudeConfig(tilt_gain_per_s=1.0, bias_gain_per_s2=0.3))
+    bias = (0.02, -0.01, 0.015)
+    f = AttitudeFilter()
     last = rest(f, Rotation.identity())
     for i in range(1, 4001):
-        f.add_imu(last + i * DT_NS, (0.02, -0.01, 0.0), (0.0, 0.0, GRAVITY_MPS2))
-    np.testing.assert_allclose(f.bias_radps[:2], [0.02, -0.01], atol=5e-4)
-
-
-@pytest.mark.parametrize(("rate", "learnt"), [(0.0199, True), (0.0201, False)])
-def test_rest_teaches_the_gyro_bias_within_its_gate(rate: float, learnt: bool) -> None:
-    """The mean with the 0.5 s of alignment at rest, then a memory of 2 s; a larger rate turns."""
-    f = AttitudeFilter(AttitudeConfig(rest_bias_memory_s=2.0, rest_bias_gate_radps=0.02))
-    rest(f, Rotation.identity())
-    for _ in range(100):
-        f.rest(0.01, (0.0, -rate, rate))
-    expected = rate * 1.0 / 1.5 if learnt else 0.0
-    np.testing.assert_allclose(f.bias_radps, [0.0, -expected, expected], atol=1e-12)
-    for _ in range(350):
-        f.rest(0.01, (0.0, -rate, rate))
-    expected = rate * (1 - (0.5 / 2.0) * (1 - 0.005) ** 300) if learnt else 0.0
-    np.testing.assert_allclose(f.bias_radps, [0.0, -expected, expected], atol=1e-12)
+        f.add_imu(last + i * DT_NS, bias, (0.0, 0.0, GRAVITY_MPS2))
+    np.testing.assert_allclose(f.bias_radps, bias, atol=5e-4)
 
 
 @pytest.mark.parametrize("yaw_deg", [-170.0, -90.0, 0.0, 35.0, 179.0])
@@ -156,7 +159,7 @@ def test_first_field_sample_sets_the_heading(yaw_deg: float, declination_rad: fl
     last = rest(f, truth)
     assert f.add_magnetic_field(last, tup(truth.inv().apply(field))) == "used"
     assert f.reference == "map"
-    assert angle_deg(f.rotation, truth) < 0.01
+    assert angle_deg(f.rotation, truth) < 0.02
     assert abs(wrap_angle(f.heading_rad - math.radians(yaw_deg))) < 1e-3
 
 
@@ -204,7 +207,7 @@ def test_heading_gate_at_its_boundary(factor: float, result: str, silent_s: floa
 
 
 def test_heading_trust_grows_with_use_and_a_lasting_change_is_taken_in_the_end() -> None:
-    """sd falls from 0.5 to 0.045 rad: a turn of 0.6 is used at first and refused after 20 s; the
+    """sd falls from 0.5 to 0.045 rad: a turn of 0.6 is used at first and refused after 90 s; the
     gyro's drift opens the gate again after (0.6^2 / 9 - 0.09^2)^0.5 rad - 0.045 at 0.005 rad/s.
     """
     f = AttitudeFilter(AttitudeConfig())
@@ -212,9 +215,9 @@ def test_heading_trust_grows_with_use_and_a_lasting_change_is_taken_in_the_end()
     f.add_magnetic_field(last, tup(FIELD_MAP))
     turned = tup(Rotation.from_euler("z", 0.6).apply(FIELD_MAP))
     assert f.add_magnetic_field(last + DT_NS, turned) == "used"
-    for i in range(2, 2001):
+    for i in range(2, 9001):
         f.add_magnetic_field(last + i * DT_NS, tup(FIELD_MAP))
-    end = last + 2000 * DT_NS
+    end = last + 9000 * DT_NS
     assert f.add_magnetic_field(end + DT_NS, turned) == "disturbed"
     opens_s = (math.sqrt(0.6**2 / 9 - 0.09**2) - 0.045) / 0.005
     assert f.add_magnetic_field(end + round((opens_s - 1.0) * 1e9), turned) == "disturbed"
@@ -258,13 +261,13 @@ def test_reset_keeping_the_heading_aligns_only_the_tilt() -> None:
     tilted = Rotation.from_euler("ZYX", [1.0, 0.3, 0.0])
     rest(f, tilted, start_ns=last + 10**9)
     assert f.heading_rad == pytest.approx(1.0, abs=1e-9)
-    assert angle_deg(f.rotation, tilted) < 0.01
+    assert angle_deg(f.rotation, tilted) < 0.02
 
 
 @pytest.mark.parametrize(
     "bad",
     [
-        {"tilt_gain_per_s": -0.1},
+        {"tilt_time_s": -0.1},
         {"alignment_time_s": 0.0},
         {"declination_rad": 11.0},
         {"field_tolerance": math.nan},

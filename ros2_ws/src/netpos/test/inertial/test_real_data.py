@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,10 @@ from netpos.evaluation.pedestrian import (
 from netpos.inertial import loaders
 from netpos.inertial.pdr import PedestrianDeadReckoning
 from netpos.inertial.pdr_config import PdrConfig, Placement
+from netpos.inertial.pdr_output import StepEvent
+from vqf import VQF
+
+Array = np.ndarray
 
 
 def data_file(relative: str) -> Path:
@@ -122,17 +127,50 @@ def test_phone_walk_shape_and_distance(magnetic: bool) -> None:
     assert score.true_distance_m == pytest.approx(122.9, abs=0.1)
     assert score.distance_m == pytest.approx(score.true_distance_m, rel=0.03)
     assert score.steps == pytest.approx(179, rel=0.05)
-    assert score.max_m < 0.03 * score.true_distance_m
     assert score.rmse_m < 0.02 * score.true_distance_m
-    if magnetic:  # the axes of the loader and the field agree with the surveyed map
-        assert abs(math.degrees(score.turn_rad)) < 15.0
+    if not magnetic:
+        assert score.max_m < 0.03 * score.true_distance_m
+        return
+    # The field of this building turns by tens of degrees, for every filter that follows it.
+    package = score_walk(with_heading_of_vqf(got, record.imu), record)
+    assert score.max_m < package.max_m
+    assert score.rmse_m < 1.05 * package.rmse_m
+    # the axes of the loader and the field agree with the surveyed map
+    assert abs(math.degrees(score.turn_rad)) < 15.0
 
 
-@pytest.mark.parametrize(("magnetic", "limit_deg"), [(True, 2.0), (False, 8.0)])
-def test_attitude_against_optical_reference(magnetic: bool, limit_deg: float) -> None:
-    """Undisturbed slow rotation; without a magnetometer the start heading is 0 by accident."""
-    name = "imu_mag_attitude/04_undisturbed_slow_rotation_with_breaks_A.mat"
-    record = loaders.load_imu_mag_attitude(data_file(name))
+def with_heading_of_vqf(got: PdrRun, imu: loaders.ImuRecord) -> list[StepEvent]:
+    """The steps with the headings that the package's own filter of nine axes gives."""
+    assert imu.angular_velocity is not None
+    assert imu.magnetic_field is not None
+    filter_ = VQF(float(np.median(np.diff(imu.stamp_ns))) * 1e-9)
+    samples = (imu.angular_velocity, imu.specific_force, imu.magnetic_field)
+    found = filter_.updateBatch(*map(np.ascontiguousarray, samples))["quat9D"]
+    turned = yaw_of(found) - yaw_of(got.attitude)
+    return [
+        replace(e, heading_rad=e.heading_rad + float(np.interp(e.end_ns, imu.stamp_ns, turned)))
+        for e in got.events
+    ]
+
+
+def yaw_of(quaternion: Array) -> Array:
+    """(n,) rad, without jumps; (n, 4) w x y z."""
+    w, x, y, z = quaternion.T
+    return np.unwrap(np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)))
+
+
+@pytest.mark.parametrize(
+    ("name", "magnetic", "limit_deg"),
+    [
+        ("04_undisturbed_slow_rotation_with_breaks_A", True, 1.5),
+        ("04_undisturbed_slow_rotation_with_breaks_A", False, 8.0),
+        ("15_undisturbed_fast_translation_A", True, 2.5),
+        ("15_undisturbed_fast_translation_A", False, 4.0),
+    ],
+)
+def test_attitude_against_optical_reference(name: str, magnetic: bool, limit_deg: float) -> None:
+    """Without a magnetometer the start heading is 0 by accident."""
+    record = loaders.load_imu_mag_attitude(data_file(f"imu_mag_attitude/{name}.mat"))
     got = run(record.imu, magnetic=magnetic)
     use = record.moving & np.all(np.isfinite(record.quaternion), axis=1)
     errors = heading_and_tilt_error(got.attitude[use], record.quaternion[use])

@@ -251,7 +251,7 @@ def test_conditions_are_told_when_they_begin_and_end() -> None:
     ("values", "message"),
     [
         ({"placement": "ankle"}, "placement must be carried or waist"),
-        ({"height": 1.8}, "no parameter height of pdr; known: .*height_m"),
+        ({"height": 1.8}, "no parameter height of pdr; did you mean height_m\\?"),
         ({"steps.bounce": 1}, "no parameter steps.bounce"),
         ({"height_m": "tall"}, "pdr.height_m must be of type float, got 'tall'"),
         ({"steps.bout_steps": 2.5}, "pdr.steps.bout_steps must be of type int, got 2.5"),
@@ -260,8 +260,8 @@ def test_conditions_are_told_when_they_begin_and_end() -> None:
         ({"field_matrix": "none"}, "pdr.field_matrix must be of type tuple, got 'none'"),
         ({"height_m": True}, "pdr.height_m must be of type float, got True"),
         (
-            {"attitude.tilt_gain_per_s": -1.0},
-            r"attitude.tilt_gain_per_s must be in \[0, 1e\+09\], got -1.0",
+            {"attitude.heading_gain_per_s": -1.0},
+            r"attitude.heading_gain_per_s must be in \[0, 1e\+09\], got -1.0",
         ),
     ],
 )
