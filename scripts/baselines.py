@@ -27,6 +27,7 @@ VARIANCES = (
     "toa_var",
     "range_var",
     "phase_difference_var",
+    "tdoa_var",
     "position_cov",
 )
 DENSITIES = (

@@ -60,8 +60,23 @@ def sources(data: Path) -> Iterator[Source]:
     level = Space(height_m=float(uwb_trolley.TRACKER["device_height_m"]))
     used = {"space": level, "range_sd_m": readers.UWB_SD_M}
     yield "uwb_trolley", data / "uwb_trolley", import_uwb_trolley, used
+    yield from own_recordings(data)
     used = {"space": Space(dimensions=3)}
     yield "car_imu_rtk (stations simulated)", data / "car_imu_rtk", import_car_drive, used
+
+
+def own_recordings(data: Path) -> Iterator[Source]:
+    """Recordings that no importer knows, read by naming their columns (docs/own_recording.md),
+    with the standard deviation of a data sheet."""
+    folder = data / "uwb_ranging"
+    used = {"space": Space(height_m=1.18)}
+    yield "uwb_ranging four_anchors", folder / "four_anchors", readers.import_four_anchors, used
+    used = {"space": Space(height_m=readers.IASL_HEIGHT_M)}
+    yield "uwb_ranging iasl (truth aligned)", folder / "iasl_scenario1", readers.import_iasl, used
+    used = {"space": Space()}
+    yield "range_beacons Plaza1", data / "range_beacons", readers.import_plaza, used
+    used = {"space": Space(dimensions=3, height_m=1.0), "range_sd_m": readers.UWB_SD_M}
+    yield "uwb_tdoa (planar)", data / "uwb_tdoa", readers.import_uwb_tdoa, used
 
 
 def _ble(folder: Path, run: str, _: Path, bag: Path) -> None:
@@ -100,12 +115,6 @@ def unread(
     data: Path,
 ) -> Iterator[tuple[str, Path, Callable[[Path], readers.Series] | None, Space]]:
     """Recordings without an importer: name, place, reader (None: no baseline) and space."""
-    in_3d = Space(dimensions=3, height_m=1.0)
-    yield "uwb_tdoa", data / "uwb_tdoa", readers.uwb_tdoa, in_3d
-    walk = Space(height_m=1.18)
-    yield "uwb_ranging four_anchors", data / "uwb_ranging", readers.four_anchors, walk
-    yield "uwb_ranging iasl", data / "uwb_ranging", None, Space()
-    yield "range_beacons Plaza1", data / "range_beacons", readers.range_beacons, Space()
     yield "adsb_mlat", data / "adsb_mlat", None, Space(dimensions=3)
     for name in ("5x5_square", "trajectory"):
         file = data / "5g_raytraced" / f"{name}_100MHz.csv.gz"
@@ -117,7 +126,8 @@ def unread_row(
 ) -> Json:
     """The row of a recording without an importer; points without time have no plain filter."""
     row: Json = {"name": f"{name} (no importer)", "reference": None}
-    empty = {"snapshot": None, "plain_ekf": None, "ours": None, "defaults": None}
+    empty = {"snapshot": None, "plain_ekf": None, "ours": None}
+    empty |= {"defaults": None, "declared": None, "learned": None}
     if read is None:
         return row | empty
     seen, truth = read(path)
@@ -166,9 +176,11 @@ def table(rows: list[Json]) -> str:
         value = figures["rmse_m"] if isinstance(figures, dict) else figures
         return "–" if value is None else f"{value:.3f}"
 
-    columns = ("reference", "snapshot", "plain_ekf", "ours", "defaults")
-    lines = ["| recording | authors | snapshot | plain EKF | ours | defaults |"]
-    lines.append("|---|---|---|---|---|---|")
+    columns = ("reference", "snapshot", "plain_ekf", "declared", "learned", "ours", "defaults")
+    lines = [
+        "| recording | authors | snapshot | plain EKF | declared | learned | ours | defaults |"
+    ]
+    lines.append("|---|---|---|---|---|---|---|---|")
     lines += [f"| {row['name']} | {' | '.join(cell(row[c]) for c in columns)} |" for row in rows]
     return "\n".join(lines)
 

@@ -1,17 +1,21 @@
-"""Recordings that no importer of netpos reads, as measurements and truth for the baselines."""
+"""Recordings without an importer of their own: read by their columns, or, where netpos has no such
+measurement, as measurements and truth for the baselines."""
 
 from __future__ import annotations
 
 import csv
 import gzip
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.io
+from netpos.bags.importers.own import Columns, Truth, import_csv, import_ros
+from netpos.bags.importers.own.truth import TruthColumns
 from netpos.evaluation.pairing import Trajectory
 from netpos.evaluation.yardsticks import Observations, ranges
-from rosbags.highlevel import AnyReader
+from netpos.messages.values import RsuInfo
 
 NS = 1_000_000_000
 Series = tuple[Observations, Trajectory]
@@ -28,8 +32,12 @@ TDOA_ANCHORS_M = np.array(
         (-2.7228, 3.2191, 0.1583),
     ]
 )
+TDOA_HEIGHT_M = 1.5
 UWB_SD_M = 0.2
-BEACON_SD_M = 1.0  # the ranges of the beacons are off by up to a metre
+SHEET_SD_M = 0.1
+BEACON_SD_M = 0.5
+IASL_CORNERS_M = ((0.0, 0.0), (0.0, 8.0), (8.86, 8.0), (8.86, 0.0))
+IASL_HEIGHT_M = 1.4  # at which it flies most of the time
 POINT_SPACING_NS = 10 * NS  # points without time: each is an instant of its own
 
 
@@ -61,57 +69,96 @@ def in_order(
     )
 
 
-def uwb_tdoa(folder: Path) -> Series:
-    """Time differences of eight anchors to a drone: |p - B| - |p - A|."""
-    stamps, first, second, values, times, poses = [], [], [], [], [], []
-    with gzip.open(folder / "const1_trial1_tdoa2.csv.gz", "rt", newline="") as stream:
-        for row in csv.DictReader(stream):
-            stamps.append(round(float(row["t_tdoa"]) * NS))
-            first.append(TDOA_ANCHORS_M[int(row["idA"])])
-            second.append(TDOA_ANCHORS_M[int(row["idB"])])
-            values.append(float(row["tdoa_meas"]))
-            pose = [row[f"pose_{axis}"] for axis in "xyz"]
-            if all(pose) and "nan" not in [text.lower() for text in pose]:
-                times.append(round(float(row["t_pose"]) * NS))
-                poses.append([float(text) for text in pose])
-    seen = in_order(stamps, first, values, UWB_SD_M, second)
-    return seen, path_of(np.array(times), np.array(poses))
+def import_uwb_tdoa(folder: Path, bag: Path) -> object:
+    """Time differences of eight anchors to a drone, one pair after the other. It flies at 1.5 m
+    most of the time; its antenna is 0.18 m below the tracked body."""
+    file = folder / "const1_trial1_tdoa2.csv.gz"
+    return import_csv(
+        file,
+        bag,
+        Columns.parse(
+            "time=t_tdoa,rsu=idB,reference=idA,tdoa=tdoa_meas",
+            "tdoa=m",
+            f"tdoa={SHEET_SD_M}",
+            lever_arm_m=(0.0, 0.0, -0.18),
+        ),
+        [
+            RsuInfo(rsu_id=str(name), position=position)
+            for name, position in enumerate(TDOA_ANCHORS_M)
+        ],
+        truth=Truth(
+            source=file,
+            columns=TruthColumns.parse("time=t_pose,x=pose_x,y=pose_y,z=pose_z"),
+        ),
+        tracker={"device_height_m": TDOA_HEIGHT_M},
+    )
 
 
-def four_anchors(folder: Path) -> Series:
+def import_four_anchors(folder: Path, bag: Path) -> object:
     """Ranges of four anchors to a walking person (a ROS 1 bag)."""
-    stamps, rsus, values, times, poses = [], [], [], [], []
-    with AnyReader([folder / "four_anchors" / "data_example.bag"]) as bag:
-        topics = ("/uwb_endorange_info", "/vicon_xb/viconPoseTopic")
-        for connection, _, raw in bag.messages([c for c in bag.connections if c.topic in topics]):
-            message = bag.deserialize(raw, connection.msgtype)
-            stamp = message.header.stamp.sec * NS + message.header.stamp.nanosec
-            if connection.topic == topics[0]:
-                at = message.responder_location
-                stamps.append(stamp)
-                rsus.append([at.x, at.y, at.z])
-                values.append(message.distance)
-            else:
-                at = message.pose.position
-                times.append(stamp)
-                poses.append([at.x, at.y, at.z])
-    return in_order(stamps, rsus, values, UWB_SD_M), path_of(np.array(times), np.array(poses))
+    place = ",".join(f"rsu_{axis}=responder_location.{axis}" for axis in "xyz")
+    return import_ros(
+        folder / "data_example.bag",
+        bag,
+        Columns.parse(
+            f"time=header.stamp,rsu=responder_id,range=distance,{place}", sd=f"range={SHEET_SD_M}"
+        ),
+        "/uwb_endorange_info",
+        [],
+        truth=Truth(
+            source="/vicon_xb/viconPoseTopic",
+            columns=TruthColumns.parse(
+                "time=header.stamp,x=pose.position.x,y=pose.position.y,z=pose.position.z"
+            ),
+        ),
+        tracker={"device_height_m": 1.18},
+    )
 
 
-def range_beacons(folder: Path) -> Series:
+def import_iasl(folder: Path, bag: Path) -> object:
+    """Ranges of eight anchors; the truth has axes and a clock of its own."""
+    places = [(x, y, z) for z in (0.0, 2.2) for x, y in IASL_CORNERS_M]
+    names = range(1, len(places) + 1)
+    ranges = ",".join(f"range:{name}=Distance {name}" for name in names)
+    return import_csv(
+        folder / "uwb.csv",
+        bag,
+        Columns.parse(f"time=Local Time,{ranges}", "time=ms", f"range={SHEET_SD_M}"),
+        [
+            RsuInfo(rsu_id=str(name), position=np.array(xyz))
+            for name, xyz in zip(names, places, strict=True)
+        ],
+        truth=Truth(
+            source=folder / "gt.csv",
+            columns=TruthColumns.parse("time=Time,x=Position X,y=Position Y,z=Position Z"),
+            offset_s=None,
+            align="rigid",
+            height_m=IASL_HEIGHT_M,
+        ),
+        tracker={"device_height_m": IASL_HEIGHT_M},
+    )
+
+
+def import_plaza(folder: Path, bag: Path) -> object:
     """Ranges of four radio beacons, taken as known, to a lawn mower (Plaza1)."""
     data = scipy.io.loadmat(folder / "Plaza1_.mat")
-    beacons = {int(row[0]): [row[1], row[2], 0.0] for row in data["TL"]}
-    rows = [row for row in data["TD"] if int(row[2]) in beacons]
-    seen = in_order(
-        [round(row[0] * NS) for row in rows],
-        [beacons[int(row[2])] for row in rows],
-        [row[3] for row in rows],
-        BEACON_SD_M,
-    )
-    truth = data["GT"]
-    level = np.column_stack([truth[:, 1:3], np.zeros(len(truth))])
-    return seen, path_of(np.rint(truth[:, 0] * NS), level)
+    with tempfile.NamedTemporaryFile("w", suffix=".csv") as truth:
+        np.savetxt(truth, data["GT"], delimiter=",")
+        truth.flush()
+        return import_csv(
+            folder / "Plaza1_TD.txt",
+            bag,
+            Columns.parse("time=1,rsu=3,range=4", sd=f"range={BEACON_SD_M}"),
+            [
+                RsuInfo(rsu_id=str(int(row[0])), position=np.array([row[1], row[2], 0.0]))
+                for row in data["TL"]
+            ],
+            truth=Truth(
+                source=Path(truth.name), columns=TruthColumns.parse("time=1,x=2,y=3,yaw=4")
+            ),
+            skip_bad_lines=True,
+            any_order=True,
+        )
 
 
 def raytraced(file: Path) -> Series:

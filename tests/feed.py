@@ -22,7 +22,7 @@ PLACES = {"a": (0.0, 10.0), "b": (60.0, -10.0), "c": (120.0, 10.0)}
 
 def arrive(node: EkfTrackerNode, topic: str, msg: Any) -> None:
     """As the executor does when a message has arrived."""
-    (subscription,) = (s for s, _ in node._inputs if s.topic_name == topic)
+    subscription = next(s for s, _ in node._inputs if s.topic_name == topic)
     subscription.callback(serialize_message(msg) if subscription.raw else msg)
 
 

@@ -22,9 +22,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "radio": {"messages", "world"},
     "inertial": {"messages", "common", "world", "radio"},
     "filters": {"messages", "inertial"},
-    "bags": {"messages", "inertial"},
+    "bags": {"messages", "common", "inertial"},
     # The sensors say what a simulator sends.
-    "scenario": {"messages", "world", "radio", "inertial", "filters", "bags"},
+    "scenario": {"messages", "common", "world", "radio", "inertial", "filters", "bags"},
     "tracking": {"messages", "common", "filters", "inertial", "bags", "scenario"},
     "evaluation": {
         *("messages", "common", "world", "radio", "inertial", "filters", "bags", "scenario"),

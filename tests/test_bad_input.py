@@ -106,6 +106,7 @@ NODES: dict[str, tuple[str, str, list[str], str]] = {
     "tracker range": ("ekf_tracker", "ekf_tracker", ["gate_probability:=1.5"], "gate_probability"),
     "tracker choice": ("ekf_tracker", "ekf_tracker", ["filter:=magic"], "ekf, iekf"),
     "tracker type": ("ekf_tracker", "ekf_tracker", ["hold_s:=soon"], "hold_s"),
+    "misspelt": ("vue_sim", "vue_sim", ["seeed:=3"], "no parameter 'seeed'; did you mean seed?"),
     "pdr range": ("pdr_node", "pdr_node", ["weinberg_k:=-1.0"], "weinberg_k"),
     "record output": ("netpos_bag", "record", ["output:={f}/good"], "never overwritten"),
     "record nothing": ("netpos_bag", "record", [], "--output DIR"),
@@ -148,7 +149,7 @@ COMMANDS: dict[str, tuple[str, int, str]] = {
     "replay parameter": ("replay {f}/good --out {f}/new --set gate=1", 2, "gate"),
     "evaluate missing": ("evaluate {f}/absent", 2, "absent"),
     "evaluate cut": ("evaluate {f}/cut", 2, "netpos recover"),
-    "evaluate blind": ("evaluate {f}/blind", 2, "without ground truth"),
+    "evaluate blind": ("evaluate {f}/blind --errors {f}/x.png", 2, "needs ground truth"),
     "import of nothing": ("import ble-aoa {f}/absent {f}/new", 2, "does not exist"),
     "recover missing": ("recover {f}/absent", 2, "absent"),
 }

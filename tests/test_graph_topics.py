@@ -102,7 +102,7 @@ def test_topic_type_and_publisher(run: Run, topic: str) -> None:
     assert offer.topic_type == f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
     assert offer.qos_profile.reliability == ReliabilityPolicy.RELIABLE
     latched = offer.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-    assert latched is (topic == "/rsu/info")
+    assert latched is (topic in ("/rsu/info", "/vue_1/initialpose"))
     assert run.heard[topic].messages
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import pytest
 from graph import Graph, wait_until
 from nav_msgs.msg import Odometry
 from netpos_msgs.msg import TrackStatus
@@ -21,8 +22,12 @@ AFTER = 40  # estimates watched before the kill and after the restart
 SETTLED = 20  # of these, the first ones do not count
 
 
-def test_a_restarted_tracker_finds_the_device_again(graph: Graph, tmp_path: Path) -> None:
-    scenario = str(long_road(tmp_path / "long_road.yaml"))
+@pytest.mark.parametrize("name", ["long_road", "metis_madrid"])
+def test_a_restarted_tracker_finds_the_device_again(
+    graph: Graph, tmp_path: Path, name: str
+) -> None:
+    """In METIS the tracker is given a pose, at a start that it has not seen the second time."""
+    scenario = str(long_road(tmp_path / "long_road.yaml")) if name == "long_road" else name
     truth = graph.collect(TRUTH, Odometry)
     odometry = graph.collect(ODOMETRY, Odometry)
     status = graph.collect(TRACK_STATUS, TrackStatus)

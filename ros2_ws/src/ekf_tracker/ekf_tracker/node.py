@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -11,13 +13,15 @@ from netpos.messages.values import RsuMeasurement as Measurement
 from netpos.tracking import Tracker, TrackOutput
 from netpos.tracking.validation import explanation
 from netpos.tracking.warm_up import warm_up, warm_up_anchors, warm_up_components
-from netpos_msgs.msg import NetworkTrack, RsuInfo, RsuMeasurement
-from netpos_node import CDR, CODEC, LATCHED, STREAM, patience, run, take_waiting
+from netpos_msgs.msg import NetworkTrack, RsuErrors, RsuInfo, RsuMeasurement
+from netpos_node import BACKLOG, CDR, CODEC, LATCHED, STREAM, patience, run, take_waiting
 from netpos_node.estimating import EstimatingNode
 from sensor_msgs.msg import Imu
 
 from ekf_tracker.conversions import diagnostics_to_msg, network_track_to_msg
 from ekf_tracker.parameters import declare_parameters
+
+_COPY_S = 2.0
 
 
 class EkfTrackerNode(EstimatingNode):
@@ -34,9 +38,12 @@ class EkfTrackerNode(EstimatingNode):
             warm_up_components()
         self._tracker = Tracker(parameters.config)
         self._network = parameters.config.network
+        self._poses: dict[str, tuple[Any, float]] = {}
         self._begin(self._tracker, publish_tf=parameters.publish_tf)
         self._diagnostics_pub = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
-        self._track_pub = None
+        self._track_pub = self._errors_pub = None
+        if parameters.config.learn_errors:
+            self._errors_pub = self.create_publisher(RsuErrors, topics.RSU_LEARNED, STREAM)
         if self._network:
             self._track_pub = self.create_publisher(
                 NetworkTrack, topics.tracks_of(self._network), STREAM
@@ -93,11 +100,10 @@ class EkfTrackerNode(EstimatingNode):
         smoothed = self._tracker.config.fixed_lag_s > 0.0
         self._add_outputs(vue_id, self._network, smoothed=smoothed)
         pose, twist = PoseWithCovarianceStamped, TwistWithCovarianceStamped
-        self._listen(
-            pose,
-            topic(topics.INITIAL_POSE),
-            lambda msg: self._add(CODEC.initial_pose_from_msg(msg, vue_id)),
-        )
+        for qos in (BACKLOG, LATCHED):  # a tool's pose is not latched, one from before us is
+            self._listen(
+                pose, topic(topics.INITIAL_POSE), lambda msg: self._on_pose(msg, vue_id), qos
+            )
         self._listen(
             twist,
             topic(topics.STEP_VELOCITY),
@@ -111,6 +117,15 @@ class EkfTrackerNode(EstimatingNode):
         if self._tracker.config.use_imu:
             self._listen(Imu, topic(topics.IMU), lambda cdr: self._on_imu(cdr, vue_id), raw=True)
 
+    def _on_pose(self, msg: Any, vue_id: str) -> None:
+        """A latched pose comes twice; its second copy says nothing new."""
+        last, heard_s = self._poses.get(vue_id, (None, 0.0))
+        now_s = time.monotonic()
+        if msg == last and now_s - heard_s < _COPY_S:
+            return
+        self._poses[vue_id] = msg, now_s
+        self._add(CODEC.initial_pose_from_msg(msg, vue_id))
+
     def _on_imu(self, cdr: bytes, vue_id: str) -> None:
         sample = CDR.imu(cdr, vue_id)
         if sample is None:
@@ -122,29 +137,35 @@ class EkfTrackerNode(EstimatingNode):
 
     def _publish_one(self, output: TrackOutput) -> None:
         super()._publish_one(output)
+        if self._errors_pub is not None:
+            for errors in output.errors:
+                self._errors_pub.publish(CODEC.rsu_errors_to_msg(errors))
         if self._track_pub is not None and output.track is not None:
             self._track_pub.publish(network_track_to_msg(CODEC, output.track))
 
     def _publish_diagnostics(self) -> None:
-        self._diagnostics_pub.publish(
-            diagnostics_to_msg(
-                self._statuses.values(),
-                self._tracker.rsu_count,
-                self._tracker.rsu_reports(self._unheard_s()),
-                self._network,
-                silent_s=self._silent_s(),
-                warning=self._warning(),
-            )
+        silent_s = self._silent_s()
+        for vue_id, stamp_ns in self._now_ns(silent_s.keys() & self._seen_ns.keys()).items():
+            coasting = self._tracker.coasting(vue_id, stamp_ns)
+            if coasting is not None:
+                self._publish_status(coasting.status)
+        findings = self._tracker.findings(
+            self._statuses, silent_s, self._unheard_s(), self._warnings()
         )
+        newest_ns = max((status.stamp_ns for status in self._statuses.values()), default=0)
+        self._diagnostics_pub.publish(diagnostics_to_msg(findings, newest_ns, self._network))
 
-    def _warning(self) -> str:
-        """What keeps the tracker from hearing anything."""
+    def _warnings(self) -> list[str]:
+        """What keeps the tracker from hearing anything, or from being heard as the only one."""
+        found = self._input_warnings()
         if not self._tracker.enabled:
-            return "disabled: measurements are refused"
+            return ["disabled: measurements are refused", *found]
         unheard_s = self._unheard_s()
-        return f"nothing heard for {unheard_s:.0f} s" if unheard_s and self._statuses else ""
+        if unheard_s and self._statuses:
+            found.insert(0, f"nothing heard for {unheard_s:.0f} s")
+        return found
 
 
 def main() -> None:
     """Entry point of ``ros2 run ekf_tracker ekf_tracker``."""
-    run(EkfTrackerNode)
+    run(EkfTrackerNode, arguments=sys.argv[1:])

@@ -19,6 +19,7 @@ from netpos.messages.values import (
     TrackState,
     Velocity,
 )
+from netpos_msgs.msg import TrackStatus
 from netpos_node import CODEC
 from nodes import Kept, nodes_of
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -58,7 +59,11 @@ def test_topics_types_and_qos(make: Any) -> None:
     (latched,) = node.get_subscriptions_info_by_topic("/rsu/info")
     assert latched.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
     assert latched.qos_profile.reliability == ReliabilityPolicy.RELIABLE
-    for topic in ("/rsu/measurements", "/car/step_velocity", "/car/initialpose"):
+    kept = {
+        e.qos_profile.durability for e in node.get_subscriptions_info_by_topic("/car/initialpose")
+    }
+    assert kept == {DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE}
+    for topic in ("/rsu/measurements", "/car/step_velocity"):
         (end,) = node.get_subscriptions_info_by_topic(topic)
         assert end.qos_profile.durability == DurabilityPolicy.VOLATILE
         assert end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
@@ -238,12 +243,14 @@ def test_enable_service(make: Any) -> None:
     response = node._on_enable(SetBool.Request(data=False), SetBool.Response())
     assert (response.success, response.message) == (True, "disabled: measurements are refused")
     drive(node, range(2))
-    assert status.messages == []
+    (said,) = status.messages
+    assert said.state == TrackStatus.WAITING
+    assert "the tracker is disabled; call its service enable" in said.reason
     assert node._tracker.rejected()["vue_1"]["disabled"] == 6
     response = node._on_enable(SetBool.Request(data=True), SetBool.Response())
     assert (response.success, response.message) == (True, "enabled")
     drive(node, range(2, 4))
-    assert len(status.messages) == 2
+    assert len(status.messages) == 3
 
 
 def test_simulated_clock_that_jumps_back_resets(make: Any) -> None:

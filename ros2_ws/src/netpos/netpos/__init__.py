@@ -19,10 +19,31 @@ Rooms
 ``cli``         the ``netpos`` command
 """
 
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from netpos import kernel_cache
 
 __version__ = "0.1.0"
+
+# What a program that uses netpos imports from here; loaded when it is asked for.
+_PUBLIC = {
+    "Field": "netpos.messages.values",
+    "Odometry": "netpos.messages.values",
+    "RsuInfo": "netpos.messages.values",
+    "RsuMeasurement": "netpos.messages.values",
+    "Tracker": "netpos.tracking.tracker",
+    "TrackerConfig": "netpos.tracking.config",
+    "write_bag": "netpos.bags.recording",
+}
+__all__ = list(_PUBLIC)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PUBLIC:
+        raise AttributeError(f"netpos has no {name!r}; it offers {', '.join(_PUBLIC)}")
+    return getattr(import_module(_PUBLIC[name]), name)
+
 
 kernel_cache.select(Path(__file__).resolve().parent)

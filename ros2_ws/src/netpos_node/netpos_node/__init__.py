@@ -8,12 +8,12 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import fields
 from pathlib import Path
-from threading import Timer
-from typing import Any, NoReturn, TypeVar
+from threading import Event, Thread
+from typing import Any, TypeVar
 
 import rclpy
 from netpos.bags import cdr_codec
@@ -34,12 +34,15 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import uninstall_signal_handlers
 from rclpy.subscription import Subscription
 
+from netpos_node.arguments import check_arguments, refuse
+
 Config = TypeVar("Config")
 
 STREAM = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 # Of a subscription: what may wait while the node is busy. A stalled tracker hears 1500 messages
 # per second from a bag of four arrays at ten times real time, and what does not fit is lost.
 BACKLOG = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.RELIABLE)
+RELAXED = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)  # heard of anybody
 LATCHED = QoSProfile(
     depth=1000,
     reliability=ReliabilityPolicy.RELIABLE,
@@ -84,18 +87,26 @@ def spin_and_finish(node: Any) -> None:
     spin_until_stopped(node, node.finish)
 
 
-def run(factory: Callable[[], Any], spin: Callable[[Any], None] = spin_and_finish) -> None:
+def run(
+    factory: Callable[[], Any],
+    spin: Callable[[Any], None] = spin_and_finish,
+    arguments: Sequence[str] = (),
+) -> None:
     """Start a node, spin it, shut down; a bad parameter ends the process with one sentence and
-    code 2."""
+    code 2. ``arguments``: those of the command line; ``--help`` tells the parameters, and what no
+    node can take is refused."""
     with _ends_when_stopped():
-        spin(_made(factory))
+        node = _made(factory)
+        if arguments:
+            check_arguments(node, arguments)
+        spin(node)
 
 
 def _made(factory: Callable[[], Any]) -> Any:
     try:
         init()
     except rclpy_implementation.RCLError as error:  # of the arguments after --ros-args
-        _refuse(str(error).partition(", at ")[0])
+        refuse(str(error).partition(", at ")[0])
     try:
         return factory()
     except (
@@ -104,24 +115,26 @@ def _made(factory: Callable[[], Any]) -> Any:
         InvalidParameterTypeException,
         InvalidParameterValueException,
     ) as error:
-        _refuse(str(error))
-
-
-def _refuse(why: str) -> NoReturn:
-    print(f"error: {why}", file=sys.stderr)
-    sys.exit(2)
+        refuse(str(error))
 
 
 @contextmanager
 def patience(doing: str, after_s: float = 5.0) -> Iterator[None]:
-    """Say on the error output what is being done, if the block takes longer."""
-    timer = Timer(after_s, print, [f"netpos: {doing}"], {"file": sys.stderr, "flush": True})
-    timer.daemon = True
-    timer.start()
+    """Say on the error output what is being done, if the block takes more than ``after_s`` of this
+    process's own work: on a busy machine everything takes longer."""
+    done, begun_s = Event(), time.process_time()
+
+    def watch() -> None:
+        while not done.wait(min(after_s, 0.2)):
+            if time.process_time() - begun_s >= after_s:
+                print(f"netpos: {doing}", file=sys.stderr, flush=True)
+                return
+
+    Thread(target=watch, daemon=True).start()
     try:
         yield
     finally:
-        timer.cancel()
+        done.set()
 
 
 @contextmanager

@@ -16,9 +16,11 @@ from netpos_msgs.msg import ClockState
 from netpos_msgs.msg import TrackStatus as TrackStatusMsg
 from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from std_srvs.srv import SetBool, Trigger
@@ -27,6 +29,7 @@ from tf2_msgs.msg import TFMessage
 from netpos_node import (
     BACKLOG,
     CDR,
+    RELAXED,
     STREAM,
     see_delivered,
     take_waiting,
@@ -35,6 +38,7 @@ from netpos_node import (
 
 _SILENCE_S = 2.0  # long: a stalled machine must not look like the end of the measurements
 _PATIENCE_S = 30.0
+_RELAXED = "best effort or volatile, as one of its publishers offers no more; what is lost is lost"
 _STALE_S = 3.0  # a device, or all of them, unheard for so long shows in the diagnostics
 
 
@@ -67,6 +71,9 @@ class EstimatingNode(Node):
         self._outputs: dict[str, tuple[Publisher, ...]] = {}
         self._statuses: dict[str, TrackStatus] = {}
         self._told_s: dict[str, float] = {}
+        self._seen_ns: dict[str, tuple[int, int]] = {}
+        self._unheard_topics: set[str] = set()
+        self._relaxed: set[str] = set()
         self._heard_since_tick = False
         self._heard_s = time.monotonic()
         self._tick_ns = self._quiet_ns = 0
@@ -78,7 +85,7 @@ class EstimatingNode(Node):
         self.create_service(SetBool, "~/enable", self._on_enable)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # /clock may stand still
         self.create_timer(_SILENCE_S, self._on_silence_tick, clock=steady)
-        self.create_timer(1.0, self._publish_diagnostics, clock=steady)
+        self.create_timer(1.0, self._on_diagnostics_tick, clock=steady)
         threshold = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
         )
@@ -119,8 +126,47 @@ class EstimatingNode(Node):
             handler(msg)
             self._publish(self._core.process())
 
-        subscription = self.create_subscription(msg_type, topic, on_message, qos, raw=raw)
+        heard = any(sub.topic_name == topic for sub, _ in self._inputs)
+        events = SubscriptionEventCallbacks(
+            incompatible_qos=lambda _: None if heard else self._unheard_topics.add(topic)
+        )
+        subscription = self.create_subscription(
+            msg_type, topic, on_message, qos, raw=raw, event_callbacks=events
+        )
         self._inputs.append((subscription, on_message))
+
+    def _hear_all(self) -> None:
+        """Ask for less of the publishers of topics that offer less than was asked for."""
+        topics_, self._unheard_topics = self._unheard_topics, set()
+        for topic in topics_:
+            for at, (old, on_message) in enumerate(self._inputs):
+                if old.topic_name != topic or topic in self._relaxed:
+                    continue
+                take_waiting(old, on_message)
+                new = self.create_subscription(
+                    old.msg_type, topic, on_message, RELAXED, raw=old.raw
+                )
+                if old.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL:
+                    self._inputs.append((new, on_message))  # what others keep comes by the old one
+                else:
+                    self._inputs[at] = new, on_message
+                    self.destroy_subscription(old)
+                self._relaxed.add(topic)
+                self.get_logger().warning(f"{topic}: {_RELAXED}")
+                break
+
+    def _input_warnings(self) -> list[str]:
+        """What is unusual about who is heard, and who else publishes what this node does."""
+        found = [f"{topic}: {_RELAXED}" for topic in sorted(self._relaxed)]
+        for publishers in self._outputs.values():
+            topic = publishers[0].topic_name
+            if self.count_publishers(topic) > 1:
+                found.append(
+                    f"another node publishes {topic} too: stop it, or set another ROS_DOMAIN_ID"
+                )
+        if self.count_publishers(topics.CLOCK) > 1:
+            found.append(f"more than one node publishes {topics.CLOCK}")
+        return found
 
     def _read(self, cdr: bytes, kind: Any) -> Any | None:
         """The message in these bytes; None, and a word, where it is none of this kind."""
@@ -169,8 +215,35 @@ class EstimatingNode(Node):
         for odometry in output.smoothed:
             smoothed_pub[0].publish(CDR.odometry(odometry))
 
+    def _publish_status(self, status: TrackStatus) -> None:
+        """Give out a status without an estimate."""
+        _, _, status_pub, *_ = self._outputs[status.vue_id]
+        status_pub.publish(CDR.track_status(status))
+
+    def _on_diagnostics_tick(self) -> None:
+        self._hear_all()
+        self._note_stamps()
+        self._publish_diagnostics()
+
     def _publish_diagnostics(self) -> None:
         raise NotImplementedError
+
+    def _now_ns(self, vue_ids: Iterable[str]) -> dict[str, int]:
+        """The time of devices by their own stamps: the newest, and what this node's clock has gone
+        since it was seen here."""
+        now_ns = self.get_clock().now().nanoseconds
+        found = {}
+        for vue_id in vue_ids:
+            stamp_ns, seen_ns = self._seen_ns[vue_id]
+            found[vue_id] = stamp_ns + max(now_ns - seen_ns, 0)
+        return found
+
+    def _note_stamps(self) -> None:
+        """Note when, by this node's clock, the newest stamps of devices were first seen."""
+        now_ns = self.get_clock().now().nanoseconds
+        for vue_id, status in self._statuses.items():
+            if self._seen_ns.get(vue_id, (-1, 0))[0] != status.stamp_ns:
+                self._seen_ns[vue_id] = status.stamp_ns, now_ns
 
     def _unheard_s(self) -> float:
         """Seconds since anything was heard, 0 while it is not long."""

@@ -70,7 +70,11 @@ def test_a_missing_parameter_file_is_one_sentence_and_code_2() -> None:
 
 
 def test_a_long_start_is_explained(capsys: Any) -> None:
-    with patience("compiling", after_s=0.01):
+    with patience("compiling", after_s=0.05):
+        until_s = time.process_time() + 0.5
+        while time.process_time() < until_s:
+            sum(range(1000))
+    with patience("waiting for others", after_s=0.1):
         time.sleep(0.5)
     with patience("nothing", after_s=60.0):
         pass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from operator import itemgetter
 from typing import Any
@@ -88,4 +89,4 @@ class PdrNode(Node):
 
 def main() -> None:
     """Entry point of ``ros2 run pdr_node pdr_node``."""
-    run(PdrNode)
+    run(PdrNode, arguments=sys.argv[1:])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 from netpos.messages.topics import BEACON, RSU_INFO, RSU_MEASUREMENTS, of_vue
@@ -73,4 +74,4 @@ class RsuSensorNode(Node):
 
 def main() -> None:
     """Entry point of ``ros2 run rsu_sensor rsu_sensor``."""
-    run(RsuSensorNode)
+    run(RsuSensorNode, arguments=sys.argv[1:])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -48,4 +49,4 @@ class TrackFusionNode(EstimatingNode):
 
 def main() -> None:
     """Entry point of ``ros2 run track_fusion track_fusion``."""
-    run(TrackFusionNode)
+    run(TrackFusionNode, arguments=sys.argv[1:])

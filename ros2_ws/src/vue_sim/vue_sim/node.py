@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from contextlib import suppress
 from threading import Thread
@@ -11,7 +12,7 @@ from netpos.messages.topics import BEACON, CLOCK, IMU, INITIAL_POSE, MAG, split
 from netpos.messages.values import InitialPose
 from netpos.scenario import Simulation
 from netpos.scenario.offline import timeline
-from netpos_node import STREAM, run, wait_until_heard
+from netpos_node import LATCHED, STREAM, run, wait_until_heard
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -61,9 +62,7 @@ class VueSimNode(Node):
         self._settings = declare_parameters(self)
         self._simulation = Simulation(self._settings.scenario)
         self._pubs = {
-            topic: self.create_publisher(
-                message_class, topic, _CLOCK_DEPTH if topic == CLOCK else STREAM
-            )
+            topic: self.create_publisher(message_class, topic, _qos(topic))
             for topic, message_class in publications(self._settings.scenario).items()
         }
 
@@ -119,6 +118,13 @@ class VueSimNode(Node):
             )
 
 
+def _qos(topic: str) -> Any:
+    """A pose is latched: whoever tracks may start late, or again."""
+    if split(topic)[1] == INITIAL_POSE:
+        return LATCHED
+    return _CLOCK_DEPTH if topic == CLOCK else STREAM
+
+
 def _told(lost_s: float) -> str:
     """What to say of stalls."""
     return f"; {lost_s:.1f} s behind its rate: this machine had no time" if lost_s else ""
@@ -145,4 +151,4 @@ def _serve(executor: SingleThreadedExecutor) -> None:
 
 def main() -> None:
     """Entry point of ``ros2 run vue_sim vue_sim``."""
-    run(VueSimNode, _play)
+    run(VueSimNode, _play, sys.argv[1:])

@@ -11,7 +11,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 
-from netpos.messages.topics import CLOCK, RSU_INFO
+from netpos.messages.topics import CLOCK, INITIAL_POSE, RSU_INFO, split
 
 INFINITE = QosTime(9223372036, 854775807)
 
@@ -32,10 +32,11 @@ def profile(*, reliable: bool = True, latched: bool = False, depth: int = 1000) 
 
 
 def default_profile(topic: str) -> Qos:
-    """What the nodes of netpos offer on ``topic``: all reliable, /rsu/info latched."""
+    """What the nodes of netpos offer on ``topic``: all reliable; /rsu/info and initial poses
+    latched."""
     if topic == CLOCK:
         return profile(depth=10)
-    return profile(latched=topic == RSU_INFO)
+    return profile(latched=topic == RSU_INFO or split(topic)[1] == INITIAL_POSE)
 
 
 def is_latched(profiles: list[Qos]) -> bool:

@@ -7,6 +7,8 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
+from netpos.common.parameters import FaultsError
+
 _BAD_INPUT = (
     ValueError,
     FileExistsError,
@@ -21,10 +23,18 @@ class WorkFailedError(RuntimeError):
     """The input was fine and the work was not done: exit status 1."""
 
 
-def _sentence(error: BaseException) -> str:
+def _sentences(error: BaseException) -> list[str]:
+    """One sentence, or one for each of several faults."""
     if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
-    return " ".join(str(error).split()) or type(error).__name__
+        return [f"{error.filename}: {error.strerror}"]
+    if isinstance(error, FaultsError):
+        return str(error).splitlines()
+    return [" ".join(str(error).split()) or type(error).__name__]
+
+
+def _tell(error: BaseException) -> None:
+    for sentence in _sentences(error):
+        typer.echo(f"netpos: {sentence}", err=True)
 
 
 class Commands(TyperGroup):
@@ -42,8 +52,8 @@ class Commands(TyperGroup):
         except BrokenPipeError:  # the reader of our output has gone, as in `netpos ... | head`
             raise
         except _BAD_INPUT as error:
-            typer.echo(f"netpos: {_sentence(error)}", err=True)
+            _tell(error)
             raise typer.Exit(2) from error
         except (WorkFailedError, OSError) as error:
-            typer.echo(f"netpos: {_sentence(error)}", err=True)
+            _tell(error)
             raise typer.Exit(1) from error

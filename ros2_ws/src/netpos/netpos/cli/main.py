@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from netpos.cli import recordings, reproduce, results, runs
+from netpos.cli import recordings, reproduce, results, rsus, runs
 from netpos.cli.errors import Commands
 
 app = typer.Typer(
@@ -20,12 +20,14 @@ for command in (
     runs.replay,
     results.evaluate,
     results.report,
+    results.compare,
     results.bench,
     reproduce.reproduce,
     recordings.recover,
 ):
     app.command()(command)
 app.add_typer(recordings.importers, name="import")
+app.add_typer(rsus.rsus, name="rsus")
 
 
 def main() -> None:

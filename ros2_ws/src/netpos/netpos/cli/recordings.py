@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from netpos.cli.own_recordings import Bag, import_csv, import_ros, tell, three
+
 importers = typer.Typer(no_args_is_help=True, help="Turn other people's recordings into bags.")
 
-Bag = Annotated[Path, typer.Argument(help="Bag to write; it must not exist.")]
+importers.command("csv")(import_csv)
+importers.command("ros")(import_ros)
 
 
 def recover(bag: Annotated[Path, typer.Argument(help="Bag that was cut off.")]) -> None:
@@ -32,7 +34,7 @@ def ble_aoa(
     from netpos.bags.importers.ble_aoa import import_ble_aoa  # noqa: PLC0415
 
     counts = import_ble_aoa(path, bag, run=run)
-    _report(bag, counts)
+    tell(bag, counts)
 
 
 @importers.command("uwb-anchors")
@@ -43,7 +45,7 @@ def uwb_anchors(
     from netpos.bags.importers.uwb_anchors import import_uwb_anchors  # noqa: PLC0415
 
     counts = import_uwb_anchors(path, bag)
-    _report(bag, counts)
+    tell(bag, counts)
 
 
 @importers.command("uwb-trolley")
@@ -55,7 +57,7 @@ def uwb_trolley(
     from netpos.bags.importers.uwb_trolley import import_uwb_trolley  # noqa: PLC0415
 
     counts = import_uwb_trolley(path, bag)
-    _report(bag, counts)
+    tell(bag, counts)
 
 
 @importers.command("car-imu-rtk")
@@ -65,12 +67,37 @@ def car_imu_rtk(
     fewest: Annotated[int, typer.Option(help="Fewest stations that hear an epoch.")] = 1,
     nearest: Annotated[int, typer.Option(help="Most stations that hear an epoch.")] = 2,
     seed: Annotated[int, typer.Option(help="Seed of the stations and of their errors.")] = 1,
+    mount: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ROLL,PITCH,YAW",
+            help="Of the IMU against forward-right-down, deg. Default: the car of run 1934.",
+        ),
+    ] = None,
+    antenna: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,Z", help="From the IMU, forward-left-up, m. Default: as above."),
+    ] = None,
+    clock_offset: Annotated[
+        float | None, typer.Option(help="Added to the time of the IMU, s. Default: as above.")
+    ] = None,
 ) -> None:
-    """Real IMU and RTK of a car; stations are simulated along its real way (deng2022)."""
+    """Real IMU and RTK of a car; stations are simulated along its real way (deng2022).
+
+    The mount of the IMU is that of one car, run 1934; another car needs its own.
+    """
+    from netpos.bags.importers.car_imu_rtk import MOUNT, Mount  # noqa: PLC0415
     from netpos.scenario.recorded_drive import import_car_drive  # noqa: PLC0415
 
-    counts = import_car_drive(path, bag, fewest=fewest, nearest=nearest, seed=seed)
-    _report(bag, counts)
+    chosen = Mount(
+        attitude_deg=three(mount, "--mount") if mount else MOUNT.attitude_deg,
+        lever_arm_m=three(antenna, "--antenna") if antenna else MOUNT.lever_arm_m,
+        clock_offset_s=MOUNT.clock_offset_s if clock_offset is None else clock_offset,
+    )
+    counts = import_car_drive(path, bag, fewest=fewest, nearest=nearest, seed=seed, mount=chosen)
+    if mount is None:
+        typer.echo("the mount of the IMU is that of run 1934; for another car give --mount")
+    tell(bag, counts)
 
 
 def _imu_command(recording_format: str, what: str) -> None:
@@ -88,9 +115,3 @@ def _imu_command(recording_format: str, what: str) -> None:
 _imu_command("waist-imu", "IMU and magnetometer at the waist (data.mat).")
 _imu_command("steps-phone", "Phone accelerometer (csv).")
 _imu_command("pdr-phone", "Phone IMU and magnetometer (txt).")
-
-
-def _report(bag: Path, counts: Mapping[str, int]) -> None:
-    for topic, count in sorted(counts.items()):
-        typer.echo(f"  {topic}: {count}")
-    typer.echo(f"wrote {bag}; track it with: netpos replay {bag} --out NEW_BAG")

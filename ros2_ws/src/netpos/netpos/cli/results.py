@@ -10,15 +10,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from netpos.cli.own_recordings import Align, Offset, TruthMap, TruthUnits
+
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
-    from netpos.evaluation import Evaluation
+    from netpos.evaluation import Evaluation, Survey
     from netpos.evaluation.bench import Result
+    from netpos.evaluation.evaluate import TruthOf
+    from netpos.messages.values import Odometry, RsuInfo, RsuMeasurement
 
 
 def evaluate(
-    bag: Annotated[Path, typer.Argument(help="Bag with ground truth and estimates.")],
+    bag: Annotated[Path, typer.Argument(help="Bag with estimates, with or without a truth.")],
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write the figures as JSON.")
     ] = None,
@@ -42,26 +47,128 @@ def evaluate(
     ] = None,
     skip: Annotated[int, typer.Option(help="Estimates at the start that do not count.")] = 20,
     vue: Annotated[str | None, typer.Option(help="Only this device.")] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="Ground truth from elsewhere: a text file (TUM), or any bag."),
+    ] = None,
+    truth_topic: Annotated[
+        str | None,
+        typer.Option(help="Topic of the bag with the truth; Odometry needs no --truth-map."),
+    ] = None,
+    truth_map: TruthMap = None,
+    truth_units: TruthUnits = "",
+    truth_time_offset: Offset = "0",
+    truth_align: Align = "none",
 ) -> None:
-    """Score a recording against its ground truth."""
+    """Score a recording against its ground truth; without one, say what it tells of itself."""
     from rich.console import Console  # noqa: PLC0415
 
-    from netpos.evaluation import evaluate_bag  # noqa: PLC0415
+    from netpos.evaluation import Evaluation, assess_bag  # noqa: PLC0415
 
     if json_file is not None:
         check_json(json_file)
-    evaluation = evaluate_bag(bag, skip=skip, vue=vue)
+    for file in (map_file, errors_file, bounds_file):
+        if file is not None:
+            refuse_recording(file)
+    options = (truth_topic, truth_map, truth_units, truth_time_offset, truth_align)
+    elsewhere = None if truth is None else _truth_from(bag, truth, *options)
+    if truth is None and options != (None, None, "", "0", "none"):
+        raise ValueError("there is no truth to map or align; name it with --truth")
+    evaluation = assess_bag(bag, skip=skip, vue=vue, truth=elsewhere)
     if json_file is not None:
         write_json(json_file, evaluation.to_json())
     pictures = (("map", map_file), ("errors", errors_file), ("bounds", bounds_file))
     _draw(evaluation, {kind: path for kind, path in pictures if path is not None})
     console = Console()
+    for note in evaluation.notes:
+        console.print(note, markup=False)
+    if not isinstance(evaluation, Evaluation):
+        _print_survey(console, evaluation)
+        return
     for table in tables(evaluation):
         console.print(table)
 
 
-def _draw(evaluation: Evaluation, files: dict[str, Path]) -> None:
+def _truth_from(
+    bag: Path,
+    source: Path,
+    topic: str | None,
+    mapping: str | None,
+    units: str,
+    offset: str,
+    way: str,
+) -> TruthOf:
+    """What reads a truth and brings it to the measurements of a bag."""
+    from netpos.bags import BagReader  # noqa: PLC0415
+    from netpos.bags.importers.own import truth_of  # noqa: PLC0415
+    from netpos.bags.importers.own.truth import ODOMETRY  # noqa: PLC0415
+    from netpos.cli.own_recordings import truth_option  # noqa: PLC0415
+    from netpos.tracking.config import TrackerConfig  # noqa: PLC0415
+    from netpos.tracking.settings import bag_settings  # noqa: PLC0415
+
+    with BagReader(bag) as reader:
+        config = TrackerConfig.from_mapping(bag_settings(reader.metadata).parameters)
+    if topic is not None and mapping is None:
+        mapping = ",".join(f"{name}={place}" for name, place in ODOMETRY.items())
+    named: Path | str = source if topic is None else topic
+    truth = truth_option(named, mapping, units, offset, way, config.device_height_m)
+    assert truth is not None
+
+    def read(
+        infos: list[RsuInfo], measurements: list[RsuMeasurement], vue: str
+    ) -> tuple[list[Odometry], str]:
+        within = source if topic is not None else None
+        poses, sentence = truth_of(truth, infos, measurements, within=within)
+        return poses.odometry(vue), sentence or f"truth from {source.name}"
+
+    return read
+
+
+def _print_survey(console: Console, survey: Survey) -> None:
+    """What a recording without ground truth tells of itself; what to look at comes first."""
+    from rich.box import SIMPLE  # noqa: PLC0415
+    from rich.markup import escape  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+
+    from netpos.evaluation.summary import (  # noqa: PLC0415
+        RESIDUAL_HEAD,
+        residual_rows,
+        survey_rows,
+    )
+
+    console.print("No ground truth: no errors, but what the recording tells of itself.")
+    for name, vue in survey.vues.items():
+        for text in vue.figures.suggestions:
+            console.print(f"{name}: {text}", markup=False, highlight=False)
+    table = Table("figure", "unit", title=survey.path.name)
+    for name in survey.vues:
+        table.add_column(name, justify="right")
+    for row in survey_rows(survey):
+        table.add_row(*map(escape, row))
+    console.print(table)
+    for name, vue in survey.vues.items():
+        title = f"{name}: measured minus where the track is"
+        table = Table(*RESIDUAL_HEAD[:-1], title=title, box=SIMPLE)
+        for *row, _ in residual_rows(vue):
+            table.add_row(*map(escape, row))
+        console.print(table)
+        for rsu_id, *_, learned in residual_rows(vue):
+            if learned:
+                console.print(f"learned of {rsu_id}: {learned}", markup=False, highlight=False)
+
+
+def _draw(evaluation: Evaluation | Survey, files: dict[str, Path]) -> None:
     if not files:
+        return
+    from netpos.evaluation import Evaluation  # noqa: PLC0415
+
+    if not isinstance(evaluation, Evaluation):
+        for kind, path in files.items():
+            if kind != "map":
+                raise ValueError(f"--{kind} {path} needs ground truth, which the bag has not")
+        from netpos.evaluation.pictures import draw_survey, save  # noqa: PLC0415
+
+        save(draw_survey(evaluation), files["map"])
         return
     from netpos.evaluation.pictures import (  # noqa: PLC0415 - slow to load
         draw_bounds,
@@ -89,6 +196,40 @@ def report(
     for reason in left_out:
         typer.echo(f"netpos: left out: {reason}", err=True)
     typer.echo(f"wrote {out}: {len(bags) - len(left_out)} of {len(bags)} bags")
+
+
+def compare(
+    bags: Annotated[
+        list[Path], typer.Argument(metavar="A B...", help="Bags with estimates of the same run.")
+    ],
+    skip: Annotated[int, typer.Option(help="Estimates at the start that do not count.")] = 20,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Write the differences as JSON.")
+    ] = None,
+) -> None:
+    """Say which of several estimates of a run is better, each against the first, with an interval
+    that takes the correlation of the errors into account."""
+    from rich.console import Console  # noqa: PLC0415
+    from rich.markup import escape  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+
+    from netpos.evaluation.compare import compare_bags  # noqa: PLC0415
+
+    if json_file is not None:
+        check_json(json_file)
+    found = compare_bags(bags, skip=skip)
+    console = Console()
+    for difference in found:
+        console.print(difference.sentence(), markup=False, highlight=False)
+    table = Table("device", "A", "B", "epochs", "only A, B", "RMSE A", "RMSE B", "block s")
+    for d in found:
+        a, b = d.rmse_m
+        alone = f"{d.only_first}, {d.only_second}"
+        cells = (f"{d.epochs}", alone, f"{a:.3f}", f"{b:.3f}", f"{d.block_s:.1f}")
+        table.add_row(escape(d.vue), escape(d.first), escape(d.second), *cells)
+    console.print(table)
+    if json_file is not None:
+        write_json(json_file, {"differences": [d.to_json() for d in found]})
 
 
 def refuse_recording(path: Path) -> None:

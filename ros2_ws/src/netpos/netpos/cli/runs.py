@@ -58,6 +58,7 @@ def run(
     if rate is not None and not rate > 0:
         raise ValueError(f"--rate must be > 0, got {rate}")
     chosen = load_scenario(scenario, seed=seed)
+    _check_tracker(scenario, chosen.tracker)
     target = bag or Path("out") / f"{chosen.name}_{datetime.now():%Y%m%d_%H%M%S}"
     refuse_existing(target)
     if offline:
@@ -65,6 +66,26 @@ def run(
     else:
         _run_live(scenario, target, 1.0 if rate is None else rate, chosen.seed)
     typer.echo(f"recorded {target}; score it with: netpos evaluate {target}")
+
+
+def _check_tracker(scenario: str, values: Mapping[str, object]) -> None:
+    """Refuse, before anything is simulated, what no tracker can be given; a line for each."""
+    from netpos.common.parameters import FaultsError  # noqa: PLC0415
+    from netpos.scenario.load import place_of  # noqa: PLC0415
+    from netpos.tracking.config import TrackerConfig  # noqa: PLC0415
+
+    try:
+        TrackerConfig.from_mapping(values)
+    except ValueError as together:
+        faults = []
+        for name, value in values.items():
+            try:
+                TrackerConfig.from_mapping({name: value})
+            except ValueError as error:
+                faults.append(f"{place_of(scenario, 'tracker', name)}: {error}")
+        if not faults:  # each by itself could be
+            faults = [f"{place_of(scenario, 'tracker')}: {together}"]
+        raise FaultsError("\n".join(faults)) from None
 
 
 def replay(

@@ -4,13 +4,18 @@ nodes describe them."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import field, fields
+from difflib import get_close_matches
 from typing import Any, TypeVar
 
 Config = TypeVar("Config")
 
 _LEAST = 1e-9
+
+
+class FaultsError(ValueError):
+    """One complaint or several, a line each."""
 
 
 def real(default: float, low: float, high: float, text: str) -> Any:
@@ -61,14 +66,20 @@ def check_fields(config: Any, prefix: str = "") -> None:
                 raise ValueError(f"{name} must be {size} finite numbers, got {value}")
 
 
+def nearest(name: str, known: Iterable[str]) -> str:
+    """``; did you mean NAME?``, or nothing where none is near."""
+    close = get_close_matches(name, list(known), n=1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
 def from_mapping(config: type[Config], values: Mapping[str, Any], what: str) -> Config:
-    """A configuration of named values over its defaults; raises ``ValueError`` for a name that
-    does not exist."""
-    known = {entry.name for entry in fields(config)}  # type: ignore[arg-type]
-    unknown = sorted(set(values) - known)
+    """A configuration of named values over its defaults; raises ``ValueError``, with a line for
+    each name that does not exist and the nearest one that does."""
+    known = [entry.name for entry in fields(config)]  # type: ignore[arg-type]
+    unknown = [name for name in values if name not in known]
     if unknown:
-        names = ", ".join(entry.name for entry in fields(config))  # type: ignore[arg-type]
-        raise ValueError(f"unknown {what} parameter {unknown[0]!r}; the parameters are {names}")
+        told = [f"unknown {what} parameter {name!r}{nearest(name, known)}" for name in unknown]
+        raise FaultsError("\n".join(told))
     plain = config()
     return config(**{name: typed(name, getattr(plain, name), v) for name, v in values.items()})
 

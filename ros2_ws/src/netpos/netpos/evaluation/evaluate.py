@@ -10,17 +10,20 @@ from pathlib import Path
 from typing import Any
 
 from netpos.bags import BagReader, codec
+from netpos.bags.recording import SKIPPED, TRUTH_ALIGNMENT
 from netpos.evaluation.metrics import SKIP_EPOCHS, Figures, Run, Scored, score
 from netpos.evaluation.pairing import Trajectory
 from netpos.evaluation.recorded_bound import recorded_bound_m
 from netpos.evaluation.requirements import Verdict, judge
 from netpos.evaluation.scene import buildings_of
+from netpos.evaluation.survey import Survey, VueRecord, survey_vue
 from netpos.messages import topics
 from netpos.messages.values import (
     Array,
     ClockState,
     InitialPose,
     Odometry,
+    RsuErrors,
     RsuInfo,
     RsuMeasurement,
     TrackStatus,
@@ -97,7 +100,8 @@ class VueEvaluation:
 class Evaluation:
     """Result of ``evaluate_bag``. ``networks``: of several networks, how each alone did, by
     network and device, under the devices' true names only. ``topics``: type and number of
-    messages; ``buildings``: (k, 4) rectangles x_min, y_min, x_max, y_max [m], none where the bag
+    messages; ``notes``: what the importer did to the data, to be read before the figures;
+    ``buildings``: (k, 4) rectangles x_min, y_min, x_max, y_max [m], none where the bag
     does not hold its scenario."""
 
     path: Path
@@ -107,6 +111,7 @@ class Evaluation:
     rsus: tuple[RsuInfo, ...]
     buildings: Array
     topics: Mapping[str, tuple[str, int]]
+    notes: tuple[str, ...] = ()
 
     def columns(self) -> dict[str, Figures]:
         """Figures by the name of their column in a table: devices, then devices by network."""
@@ -122,6 +127,7 @@ class Evaluation:
         return {
             "bag": self.path.name,
             "skip": self.skip,
+            "notes": list(self.notes),
             "vues": {name: vue.scored.figures.to_json() for name, vue in self.vues.items()},
             "networks": {
                 network: {name: scored.figures.to_json() for name, scored in vues.items()}
@@ -156,6 +162,7 @@ class _Recording:
     rsus: dict[str, RsuInfo] = field(default_factory=dict)
     measured: dict[str, list[RsuMeasurement]] = field(default_factory=lambda: defaultdict(list))
     poses: dict[str, list[InitialPose]] = field(default_factory=lambda: defaultdict(list))
+    errors: dict[str, list[RsuErrors]] = field(default_factory=lambda: defaultdict(list))
     delivery: dict[str, _DeliveryCounter] = field(
         default_factory=lambda: defaultdict(_DeliveryCounter)
     )
@@ -234,6 +241,11 @@ def _sinks(
             convert.measurement_from_msg,
             add_measurement,
         ),
+        topics.RSU_LEARNED: (
+            "netpos_msgs/msg/RsuErrors",
+            convert.rsu_errors_from_msg,
+            lambda errors: recording.errors[errors.vue_id].append(errors),
+        ),
     }
     for vue in vues:
         truth, clock = recording.truth[vue], recording.clock_truth[vue]
@@ -294,8 +306,135 @@ def _with_bound(
     return replace(scored, figures=replace(scored.figures, bound_ratio=rmse / bound))
 
 
-def evaluate_bag(path: Path, *, skip: int = SKIP_EPOCHS, vue: str | None = None) -> Evaluation:
-    """Score every device of a bag that has ground truth, or only ``vue``.
+def notes_of(metadata: Mapping[str, str]) -> tuple[str, ...]:
+    """What the metadata of a bag says was done to its data on import."""
+    notes = [metadata[TRUTH_ALIGNMENT]] if TRUTH_ALIGNMENT in metadata else []
+    if SKIPPED in metadata:
+        notes.append(f"skipped on import: {metadata[SKIPPED]}")
+    return tuple(notes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Contents:
+    """What a bag holds of the devices ``names``."""
+
+    names: list[str]
+    networks: list[tuple[str, str]]
+    recording: _Recording
+    rsus: tuple[RsuInfo, ...]
+    topics: Mapping[str, tuple[str, int]]
+    buildings: Array
+    config: TrackerConfig | None
+    notes: tuple[str, ...]
+
+
+def _contents(path: Path, choose: Callable[[BagReader], list[str]]) -> _Contents:
+    """Read a bag once, of the devices that ``choose`` names."""
+    with BagReader(path) as bag:
+        names = choose(bag)
+        networks = _networks(bag, names)
+        recording = _read(bag, names, networks)
+        return _Contents(
+            names=names,
+            networks=networks,
+            recording=recording,
+            rsus=tuple(recording.rsus[name] for name in sorted(recording.rsus)),
+            topics={topic: (info.type_name, info.count) for topic, info in bag.topics.items()},
+            buildings=buildings_of(bag.metadata),
+            config=_config_of(bag),
+            notes=notes_of(bag.metadata),
+        )
+
+
+def _surveyed(bag: BagReader, path: Path, vue: str | None) -> list[str]:
+    """Devices that a tracker reported of; an error names what the bag lacks."""
+    filled = {topics.split(topic) for topic, info in bag.topics.items() if info.count}
+    found = {name for name, topic in filled if name and topic in topics.TRACKER_OUTPUTS}
+    if not found:
+        raise ValueError(
+            f"{path} has no estimates (no messages on /<vue>/odometry or track_status); "
+            f"make some with: netpos replay {path} --out NEW_BAG"
+        )
+    if vue is not None and vue not in found:
+        raise ValueError(f"{path} has no device {vue!r}; choose one of {', '.join(sorted(found))}")
+    return sorted(found) if vue is None else [vue]
+
+
+def assess_bag(
+    path: Path,
+    *,
+    skip: int = SKIP_EPOCHS,
+    vue: str | None = None,
+    truth: TruthOf | None = None,
+) -> Evaluation | Survey:
+    """``evaluate_bag`` where there is ground truth, else ``survey_bag``; raises what they do."""
+    if truth is not None:
+        return evaluate_bag(path, skip=skip, vue=vue, truth=truth)
+    with BagReader(path) as bag:
+        has_truth = any(
+            info.count and topics.split(topic)[1] == topics.GROUND_TRUTH
+            for topic, info in bag.topics.items()
+        )
+    return evaluate_bag(path, skip=skip, vue=vue) if has_truth else survey_bag(path, vue=vue)
+
+
+def survey_bag(path: Path, *, vue: str | None = None) -> Survey:
+    """What a bag says of every device that a tracker reported of, or only of ``vue``, without
+    ground truth.
+
+    Raises
+    ------
+    ValueError  not a readable bag, no tracker's output, or no such device
+    """
+    held = _contents(path, lambda bag: _surveyed(bag, path, vue))
+    recording, vues = held.recording, {}
+    for name in held.names:
+        record = VueRecord(
+            odometry=recording.estimate[name],
+            statuses=recording.status[name],
+            clock=recording.clock[name],
+            measurements=recording.measured[name],
+            errors=recording.errors[name],
+        )
+        learns = held.config is not None and held.config.learn_errors
+        vues[name] = survey_vue(record, recording.rsus, learns)
+    return Survey(
+        path=path,
+        vues=vues,
+        rsus=held.rsus,
+        buildings=held.buildings,
+        topics=held.topics,
+        notes=held.notes,
+    )
+
+
+TruthOf = Callable[[list[RsuInfo], list[RsuMeasurement], str], tuple[list[Odometry], str]]
+"""Ground truth from elsewhere: of RSUs, measurements and a device's name, poses and a sentence."""
+
+
+def _alone(bag: BagReader, path: Path, vue: str | None) -> list[str]:
+    """The one device with estimates, for a truth from elsewhere."""
+    filled = {topics.split(topic) for topic, info in bag.topics.items() if info.count}
+    found = sorted(name for name, topic in filled if name and topic == topics.ODOMETRY)
+    if vue is not None and vue in found:
+        return [vue]
+    if vue is not None or len(found) != 1:
+        raise ValueError(
+            f"{path} has estimates of {', '.join(found) or 'no device'}; say with --vue of which "
+            "one the truth is"
+        )
+    return found
+
+
+def evaluate_bag(
+    path: Path,
+    *,
+    skip: int = SKIP_EPOCHS,
+    vue: str | None = None,
+    truth: TruthOf | None = None,
+) -> Evaluation:
+    """Score every device of a bag that has ground truth, or only ``vue``; with ``truth`` one
+    device against that.
 
     The first ``skip`` estimates of each device do not count (fokin2020 leaves out 20).
 
@@ -303,37 +442,38 @@ def evaluate_bag(path: Path, *, skip: int = SKIP_EPOCHS, vue: str | None = None)
     ------
     ValueError  not a readable bag, no ground truth, no estimates, or no such device
     """
-    with BagReader(path) as bag:
-        names = _chosen(bag, path, vue)
-        of_networks = _networks(bag, names)
-        recording = _read(bag, names, of_networks)
-        counts = {topic: (info.type_name, info.count) for topic, info in bag.topics.items()}
-        buildings = buildings_of(bag.metadata)
-        config = _config_of(bag)
-    vues = {}
-    for name in names:
-        run = recording.run(name)
-        if not len(run.truth):
-            raise ValueError(f"{path}: no message on /{name}/ground_truth has finite values")
-        scored = _with_bound(score(run, skip=skip), recording, name, config)
-        _, beacons = counts.get(topics.of_vue(name, topics.BEACON), ("", None))
-        vues[name] = VueEvaluation(
-            run=run,
-            scored=scored,
-            verdicts=judge(scored.figures, scored.counted.horizontal_error),
-            delivery=recording.delivery[name].result(beacons),
-        )
+    held = _contents(path, lambda bag: (_chosen if truth is None else _alone)(bag, path, vue))
+    recording, notes = held.recording, held.notes
+    if truth is not None:
+        (name,) = held.names
+        recording.truth[name], sentence = truth(list(held.rsus), recording.measured[name], name)
+        notes = (sentence, *notes)
     networks: dict[str, dict[str, Scored]] = {}
-    for network, name in of_networks:
+    for network, name in held.networks:
         scored = score(recording.run(name, network), skip=skip)
         networks.setdefault(network, {})[name] = scored
-    rsus = tuple(recording.rsus[name] for name in sorted(recording.rsus))
     return Evaluation(
         path=path,
         skip=skip,
-        vues=vues,
+        vues={name: _evaluated(held, path, name, skip) for name in held.names},
         networks=networks,
-        rsus=rsus,
-        buildings=buildings,
-        topics=counts,
+        rsus=held.rsus,
+        buildings=held.buildings,
+        topics=held.topics,
+        notes=notes,
+    )
+
+
+def _evaluated(held: _Contents, path: Path, name: str, skip: int) -> VueEvaluation:
+    """One device against its truth."""
+    run = held.recording.run(name)
+    if not len(run.truth):
+        raise ValueError(f"{path}: no message on /{name}/ground_truth has finite values")
+    scored = _with_bound(score(run, skip=skip), held.recording, name, held.config)
+    _, beacons = held.topics.get(topics.of_vue(name, topics.BEACON), ("", None))
+    return VueEvaluation(
+        run=run,
+        scored=scored,
+        verdicts=judge(scored.figures, scored.counted.horizontal_error),
+        delivery=held.recording.delivery[name].result(beacons),
     )

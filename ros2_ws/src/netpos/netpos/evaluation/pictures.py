@@ -21,7 +21,8 @@ from scipy.stats import chi2
 from netpos.evaluation.evaluate import Evaluation, VueEvaluation
 from netpos.evaluation.metrics import NS, clock_error_series
 from netpos.evaluation.pairing import Trajectory, wrap_angle
-from netpos.messages.values import Array
+from netpos.evaluation.survey import Survey
+from netpos.messages.values import Array, TrackState
 
 FORMATS = (".png", ".svg", ".pdf")
 PNG_DPI = 110
@@ -104,7 +105,11 @@ def _view(evaluation: Evaluation, heard: set[str]) -> tuple[Array, Array]:
     points += [
         rsu.position[None, :2] for rsu in evaluation.rsus if not heard or rsu.rsu_id in heard
     ]
-    every = np.concatenate(points)
+    return _around(np.concatenate(points))
+
+
+def _around(every: Array) -> tuple[Array, Array]:
+    """Corners (2,) m of a picture of points (n, 2) m."""
     low, high = every.min(axis=0), every.max(axis=0)
     extent = high - low
     margin = max(0.08 * float(extent.max()), 2.0)
@@ -112,7 +117,7 @@ def _view(evaluation: Evaluation, heard: set[str]) -> tuple[Array, Array]:
     return low - margin - thin, high + margin + thin
 
 
-def _draw_buildings(axes: Axes, evaluation: Evaluation) -> list[Patch]:
+def _draw_buildings(axes: Axes, evaluation: Evaluation | Survey) -> list[Patch]:
     if not len(evaluation.buildings):
         return []
     low, high = evaluation.buildings[:, :2], evaluation.buildings[:, 2:]
@@ -133,7 +138,7 @@ def _draw_buildings(axes: Axes, evaluation: Evaluation) -> list[Patch]:
     return [Patch(facecolor=BUILDING_COLOUR, edgecolor="#B8B2A6", label="building")]
 
 
-def _draw_rsus(axes: Axes, evaluation: Evaluation, heard: set[str]) -> list[Line2D]:
+def _draw_rsus(axes: Axes, evaluation: Evaluation | Survey, heard: set[str]) -> list[Line2D]:
     low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
     edge = 0.01 * (high - low)
     seen = [
@@ -237,15 +242,8 @@ def draw_map(evaluation: Evaluation) -> Figure:
     """
     heard = _heard(evaluation)
     low, high = _view(evaluation, heard)
-    width, height = high - low
-    extent = float(max(width, height))
-    scale = min(8.5 / width, 7.5 / height)
-    figure = Figure(figsize=(width * scale + 1.0, height * scale + 1.0))
-    axes = figure.add_subplot()
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="east [m]", ylabel="north [m]")
-    axes.set_aspect("equal")
-    axes.grid(color="#DDDDDD", lw=0.5, zorder=0)
-    axes.set_axisbelow(True)
+    extent = float((high - low).max())
+    figure, axes = _plan(low, high)
     handles: list[Line2D | Patch] = []
     outside = 0
     for index, (name, vue) in enumerate(evaluation.vues.items()):
@@ -256,6 +254,25 @@ def draw_map(evaluation: Evaluation) -> Figure:
     handles += _draw_buildings(axes, evaluation)
     if outside:
         handles.append(Line2D([], [], ls="", label=f"{outside} estimates\noutside the view"))
+    _explain(axes, handles, _title(evaluation))
+    return figure
+
+
+def _plan(low: Array, high: Array) -> tuple[Figure, Axes]:
+    """An empty plan view between two corners (2,) m."""
+    width, height = high - low
+    scale = min(8.5 / width, 7.5 / height)
+    figure = Figure(figsize=(width * scale + 1.0, height * scale + 1.0))
+    axes = figure.add_subplot()
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="east [m]", ylabel="north [m]")
+    axes.set_aspect("equal")
+    axes.grid(color="#DDDDDD", lw=0.5, zorder=0)
+    axes.set_axisbelow(True)
+    return figure, axes
+
+
+def _explain(axes: Axes, handles: list[Line2D | Patch], title: str) -> None:
+    """Legend, each label once, and title."""
     unique = {str(handle.get_label()): handle for handle in handles}
     axes.legend(
         handles=list(unique.values()),
@@ -264,7 +281,38 @@ def draw_map(evaluation: Evaluation) -> Figure:
         frameon=False,
         fontsize=9,
     )
-    axes.set_title(_title(evaluation), loc="left", fontsize=10)
+    axes.set_title(title, loc="left", fontsize=10)
+
+
+def draw_survey(survey: Survey) -> Figure:
+    """Plan view of a recording without ground truth: buildings, RSUs and estimated tracks, with
+    dots where the track was not TRACKING."""
+    tracks = {name: vue.record.odometry for name, vue in survey.vues.items()}
+    points = [
+        np.array([pose.position[:2] for pose in track]) for track in tracks.values() if track
+    ]
+    points += [rsu.position[None, :2] for rsu in survey.rsus]
+    if not points:
+        raise ValueError(f"{survey.path} has neither RSUs nor estimates: there is nothing to draw")
+    figure, axes = _plan(*_around(np.concatenate(points)))
+    handles: list[Line2D | Patch] = []
+    for index, (name, vue) in enumerate(survey.vues.items()):
+        colour = TRACK_COLOURS[index % len(TRACK_COLOURS)]
+        xy = np.array([pose.position[:2] for pose in vue.record.odometry]).reshape(-1, 2)
+        handles += axes.plot(*xy.T, color=colour, lw=1.4, label=name)
+        states = {s.stamp_ns: s.state for s in vue.record.statuses}
+        poor = [
+            pose.position[:2]
+            for pose in vue.record.odometry
+            if states.get(pose.stamp_ns, TrackState.TRACKING) is not TrackState.TRACKING
+        ]
+        if poor:
+            label = f"{name}, not TRACKING"
+            handles += axes.plot(*np.array(poor).T, "o", ms=3, mfc="none", mec="k", label=label)
+    heard = {s for v in survey.vues.values() for st in v.record.statuses for s in st.sources}
+    handles += _draw_rsus(axes, survey, heard)
+    handles += _draw_buildings(axes, survey)
+    _explain(axes, handles, f"{survey.path.name} (no ground truth)")
     return figure
 
 

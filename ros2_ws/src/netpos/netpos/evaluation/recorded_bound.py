@@ -10,11 +10,12 @@ import numpy as np
 from netpos.evaluation.bounds import bound_rmse, run_bound
 from netpos.evaluation.pairing import Stamps, Trajectory
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.filters.state import N_CORE
 from netpos.messages.values import Array, InitialPose, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import epoch_rows_of
 from netpos.tracking.models import motions_of, pose_state
-from netpos.tracking.rsus import Rsu
+from netpos.tracking.rsus import BiasStates, Rsu
 
 
 def recorded_bound_m(
@@ -42,15 +43,19 @@ def recorded_bound_m(
     if len(epochs) < 2:
         return None
     stamps = np.array(sorted(epochs), dtype=np.int64)
-    blocks = [epoch_rows_of(epochs[int(s)], known, None, -1).rows for s in stamps]
+    biases = BiasStates()  # of plain RSUs only what differences share
+    blocks = [epoch_rows_of(epochs[int(s)], known, biases, -1).rows for s in stamps]
+    prior = np.zeros((N_CORE + len(biases.sd),) * 2)
+    prior[:N_CORE, :N_CORE] = _prior(config, pose)
     bounds = run_bound(
         stamps,
         np.cumsum([0, *map(len, blocks)]),
         np.vstack(blocks),
         truth.stamp_ns,
         np.column_stack([truth.position[:, :2], truth.velocity[:, :2]]),
-        _prior(config, pose),
+        prior + np.diag(np.square([*[0.0] * N_CORE, *biases.sd])),
         motions_of(config),
+        bias=biases.arrays(),
         height_m=config.device_height_m,
     )
     scored = bounds[np.isin(stamps, scored_ns)]

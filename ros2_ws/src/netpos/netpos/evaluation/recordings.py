@@ -61,8 +61,8 @@ class Recording:
 
 
 def recording_row(recording: Recording, folder: Path) -> Json:
-    """Replay into ``folder`` with the bag's parameters and with default ones, run the yardsticks,
-    and score all alike.
+    """Replay into ``folder`` with the bag's parameters, with default ones, with what is declared
+    alone and with learned errors; run the yardsticks, and score all alike.
 
     ``rmse_m`` and the other figures of accuracy of a baseline are of the tracker's epochs that
     count; ``own`` holds those of all its epochs but the first 20.
@@ -76,6 +76,14 @@ def recording_row(recording: Recording, folder: Path) -> Json:
     defaults = _replayed(
         recording.bag, folder / f"{recording.name}_defaults", default_parameters(recording.bag)
     )
+    learning = _learning(recording.bag)
+    other = None
+    if learning is not None:
+        name = "declared" if learning else "learned"
+        changed = {"learn_errors": not learning}
+        other = _replayed(recording.bag, folder / f"{recording.name}_{name}", changed)
+    pair = [None if run is None else figures_of(run.scored.figures) for run in (other, ours)]
+    declared, learned = pair if learning else pair[::-1]
     seen = observations_of_bag(
         recording.bag, range_sd_m=recording.range_sd_m, kinds=recording.kinds
     )
@@ -86,7 +94,16 @@ def recording_row(recording: Recording, folder: Path) -> Json:
         **baseline_figures(seen, recording.space, ours.run.truth, counted),
         "ours": figures_of(ours.scored.figures),
         "defaults": figures_of(defaults.scored.figures),
+        "declared": declared,
+        "learned": learned,
     }
+
+
+def _learning(bag: Path) -> bool | None:
+    """Whether the tracker of a bag learns the errors of RSUs; None: its motion model cannot."""
+    with BagReader(bag) as source:
+        config = TrackerConfig.from_mapping(bag_settings(source.metadata).parameters)
+    return None if config.motion_model == "strapdown" else config.learn_errors
 
 
 def default_parameters(bag: Path) -> Json:

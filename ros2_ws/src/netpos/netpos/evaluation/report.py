@@ -15,10 +15,11 @@ from plotly.offline import get_plotlyjs
 from plotly.subplots import make_subplots
 
 from netpos import __version__
-from netpos.evaluation.evaluate import Evaluation, VueEvaluation, evaluate_bag
+from netpos.evaluation import survey_plots
+from netpos.evaluation.evaluate import Evaluation, VueEvaluation, assess_bag
 from netpos.evaluation.metrics import NS, SKIP_EPOCHS, clock_error_series
 from netpos.evaluation.pairing import wrap_angle
-from netpos.evaluation.pictures import BUILDING_COLOUR, RSU_COLOUR, TRACK_COLOURS, ellipse_axes
+from netpos.evaluation.pictures import TRACK_COLOURS, ellipse_axes
 from netpos.evaluation.summary import figure_rows, verdict_rows
 from netpos.messages.values import Array
 
@@ -27,14 +28,16 @@ ELLIPSES_PER_TRACK = 60
 _PAGE = jinja2.Template(
     """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>netpos report</title>
+<meta name="viewport" content="width=device-width, initial-scale=1">
 <style>
 body{font:15px/1.45 system-ui,sans-serif;margin:2rem auto;max-width:76rem;
 padding:0 1rem;color:#222}
 table{border-collapse:collapse;margin:.6rem 2rem 1.2rem 0;font-size:14px}
 caption{text-align:left;font-weight:600;padding:.3rem 0}
-td,th{border-bottom:1px solid #ddd;padding:.15rem .7rem;text-align:right}
-td:first-child,th:first-child{text-align:left}
+td,th{white-space:nowrap;border-bottom:1px solid #ddd;padding:.15rem .7rem;text-align:right}
+td:first-child,th:first-child{text-align:left;white-space:normal}
 .tables{display:flex;flex-wrap:wrap;align-items:flex-start}
+.tables>div{overflow-x:auto;max-width:100%}
 .ok{color:#117733}.bad{color:#aa2222}
 </style><script>{{ script }}</script></head><body>
 <h1>netpos report</h1>
@@ -42,11 +45,13 @@ td:first-child,th:first-child{text-align:left}
 nor those before it is first TRACKING. Position errors are horizontal unless named otherwise.</p>
 {% for reason in left_out %}<p class="bad">Left out: {{ reason|e }}</p>{% endfor %}
 {% for s in sections %}<h2>{{ s.name|e }}</h2>
-<div class="tables">{% for t in s.tables %}<table><caption>{{ t.caption }}</caption>
+{% for note in s.notes %}<p class="bad">{{ note|e }}</p>{% endfor %}
+<div class="tables">{% for t in s.tables %}
+<div tabindex="0"><table><caption>{{ t.caption }}</caption>
 <tr>{% for c in t.head %}<th>{{ c|e }}</th>{% endfor %}</tr>
 {% for r in t.rows %}<tr>{% for c in r %}
 <td class="{{ 'ok' if '✓' in c else 'bad' if '✗' in c }}">{{ c|e }}</td>{% endfor %}</tr>
-{% endfor %}</table>{% endfor %}</div>
+{% endfor %}</table></div>{% endfor %}</div>
 {% for p in s.plots %}{{ p }}{% endfor %}{% endfor %}
 </body></html>
 """
@@ -95,11 +100,6 @@ def _line(name: str, x: Array, y: Array, colour: str, **options: Any) -> go.Scat
 
 def _map(evaluation: Evaluation) -> go.Figure:
     figure = go.Figure()
-    for x_min, y_min, x_max, y_max in evaluation.buildings:
-        figure.add_shape(
-            type="rect", x0=x_min, y0=y_min, x1=x_max, y1=y_max,
-            fillcolor=BUILDING_COLOUR, line_width=0, layer="below",
-        )  # fmt: skip
     for index, (name, vue) in enumerate(evaluation.vues.items()):
         colour = TRACK_COLOURS[index % len(TRACK_COLOURS)]
         truth, estimate = vue.run.truth.position, vue.scored.pairs.estimate.position
@@ -111,21 +111,8 @@ def _map(evaluation: Evaluation) -> go.Figure:
         figure.add_trace(
             _line(f"{name} 95 % ellipse", east, north, colour, line={"width": 0.7}, opacity=0.7)
         )
-    sites = np.array([rsu.position for rsu in evaluation.rsus]).reshape(-1, 3)
-    figure.add_trace(
-        go.Scatter(
-            x=sites[:, 0],
-            y=sites[:, 1],
-            text=[rsu.rsu_id for rsu in evaluation.rsus],
-            name="RSU",
-            mode="markers",
-            marker={"symbol": "triangle-up", "size": 11, "color": RSU_COLOUR},
-        )
-    )
-    figure.update_xaxes(title="east [m]", constrain="domain")
-    figure.update_yaxes(title="north [m]", scaleanchor="x", scaleratio=1)
-    figure.update_layout(height=640, template="plotly_white", margin={"t": 30, "b": 40})
-    return figure
+    figure.add_trace(survey_plots.rsu_markers(evaluation.rsus))
+    return survey_plots.as_map(figure, evaluation.buildings)
 
 
 def _errors(evaluation: Evaluation) -> go.Figure:
@@ -159,8 +146,7 @@ def _errors(evaluation: Evaluation) -> go.Figure:
     for row, label in enumerate(labels, start=1):
         figure.update_yaxes(title=label, row=row, col=1)
     figure.update_xaxes(title="time since the start of the ground truth [s]", row=5, col=1)
-    figure.update_layout(height=1000, template="plotly_white", margin={"t": 30, "b": 40})
-    return figure
+    return survey_plots.below(figure, 1000)
 
 
 def _section(evaluation: Evaluation) -> dict[str, object]:
@@ -168,11 +154,12 @@ def _section(evaluation: Evaluation) -> dict[str, object]:
     accuracy = {"caption": "Figures", "head": ["figure", "unit", *evaluation.columns()]}
     verdicts = {"caption": "Requirements", "head": ["set", "requirement", "required", *names]}
     plots = [
-        figure.to_html(full_html=False, include_plotlyjs=False)
+        figure.to_html(full_html=False, include_plotlyjs=False, config={"responsive": True})
         for figure in (_map(evaluation), _errors(evaluation))
     ]
     return {
         "name": evaluation.path.name,
+        "notes": evaluation.notes,
         "tables": [
             accuracy | {"rows": figure_rows(evaluation)},
             verdicts | {"rows": verdict_rows(evaluation)},
@@ -195,7 +182,11 @@ def write_report(bags: Sequence[Path], out: Path, *, skip: int = SKIP_EPOCHS) ->
     left_out: list[str] = []
     for bag in bags:
         try:
-            sections.append(_section(evaluate_bag(bag, skip=skip)))
+            found = assess_bag(bag, skip=skip)
+            if isinstance(found, Evaluation):
+                sections.append(_section(found))
+            else:
+                sections.append(survey_plots.section(found))
         except ValueError as error:
             left_out.append(str(error))
     if not sections:

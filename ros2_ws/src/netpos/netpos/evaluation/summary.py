@@ -5,9 +5,22 @@ from __future__ import annotations
 from netpos.evaluation.evaluate import Evaluation
 from netpos.evaluation.metrics import Figures
 from netpos.evaluation.requirements import Row
+from netpos.evaluation.survey import Survey, SurveyedVue
 
 NOTHING = "–"
 
+# label, unit, field of VueSurvey, format
+_SURVEY_ROWS = (
+    ("duration", "s", "span_s", ".1f"),
+    ("measurements", "", "measurements", "d"),
+    ("estimates", "", "estimates", "d"),
+    ("gaps above 1 s", "", "gaps", "d"),
+    ("longest gap", "s", "longest_gap_s", ".2f"),
+    ("way", "m", "way_m", ".1f"),
+    ("measurements accepted", "", "accepted", "d"),
+    ("position sd while TRACKING, median", "m", "position_sd_m", ".2f"),
+    ("protection level, median", "m", "protection_level_m", ".2f"),
+)
 # label, unit, field of Figures, format
 _ROWS = (
     ("estimates scored", "", "n", "d"),
@@ -76,6 +89,54 @@ def figure_rows(evaluation: Evaluation) -> list[list[str]]:
         for label, unit, name in _INITIAL
     ]
     return rows
+
+
+def survey_rows(survey: Survey) -> list[list[str]]:
+    """Rows of label, unit and one value per device of a recording without ground truth."""
+    vues = [vue.figures for vue in survey.vues.values()]
+    rows = [
+        [label, unit, *(_text(getattr(vue, name), style) for vue in vues)]
+        for label, unit, name, style in _SURVEY_ROWS
+    ]
+    states = sorted({state for vue in vues for state in vue.states})
+    rows += [
+        [f"time {state}", "%", *(_text(vue.states.get(state, 0.0), ".1%") for vue in vues)]
+        for state in states
+    ]
+    reasons = sorted({reason for vue in vues for reason in vue.rejected})
+    rows += [
+        [f"rejected: {reason}", "", *(_text(vue.rejected.get(reason, 0), "d") for vue in vues)]
+        for reason in reasons
+    ]
+    rows.append(
+        ["NIS, mean", "", *(_text(vue.nis.mean if vue.nis else None, ".2f") for vue in vues)]
+    )
+    rows.append(["NIS, expected", "", *(_text(vue.nis_dof or None, ".2f") for vue in vues)])
+    return rows
+
+
+RESIDUAL_HEAD = (
+    "RSU", "of", "n", "bias", "scatter", "stated", "unit", "lasts s", "> 4 sd %", "learned",
+)  # fmt: skip
+
+
+def residual_rows(vue: SurveyedVue) -> list[list[str]]:
+    """Rows under ``RESIDUAL_HEAD``: what each RSU measured against the track."""
+    return [
+        [
+            row.rsu_id,
+            row.quantity,
+            str(row.count),
+            f"{row.bias:+.3g}",
+            f"{row.scatter:.3g}",
+            f"{row.stated:.3g}",
+            row.unit,
+            _text(row.correlation_s, ".1f"),
+            _text(row.far, ".1%"),
+            row.learned,
+        ]
+        for row in vue.figures.residuals
+    ]
 
 
 def _verdict(row: Row) -> str:

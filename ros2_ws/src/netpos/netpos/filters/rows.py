@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from operator import attrgetter
 from typing import NamedTuple
@@ -74,6 +74,7 @@ class Coupling:
     bias: Mapping[Kind, int]  # state index of the RSU's own bias
     common: Mapping[Kind, int]  # state index of the bias its network shares
     inflation: Mapping[Kind, float]  # variance factor of correlated noise
+    gate: Mapping[Kind, float] = field(default_factory=dict)  # variance factor of single values
 
 
 UNCOUPLED = Coupling({}, {}, {})
@@ -87,6 +88,8 @@ class ScalarPlan(NamedTuple):
     """Gives value and variance of each, one after the other; None: no rows."""
     sources: npt.NDArray[np.int64]
     """(k, 3): kind, and where in ``rsu_place`` its ORIGIN and the first of its AXES are."""
+    referenced: tuple[int, ...]
+    """Which of them compare the RSU with a second one."""
 
 
 @lru_cache(256)
@@ -108,6 +111,7 @@ def scalar_plan(fields: int, cone: bool) -> ScalarPlan:
         tuple(Kind(sensor.kind) for sensor, _ in chosen),
         attrgetter(*names) if names else None,
         np.array(sources, dtype=np.int64).reshape(-1, 3),
+        tuple(k for k, (_, reading) in enumerate(chosen) if reading.has_reference),
     )
 
 
@@ -179,15 +183,30 @@ def rsu_place(info: RsuInfo, axes: Array) -> Array:
 
 
 def put_measurement(
-    rows: Array, at: int, m: RsuMeasurement, cone: bool, place: Array, group: int, heading: int
+    rows: Array,
+    at: int,
+    m: RsuMeasurement,
+    sites: tuple[bool, Array, Array | None],
+    group: int,
+    heading: int,
 ) -> int:
     """Write the rows of one RSU measurement, without biases, from ``rows[at]`` on; the index after
-    the last one. A position fix of its antenna becomes two decorrelated LINEAR rows."""
-    fields = int(m.fields)
-    _, read, sources = scalar_plan(fields, cone)
-    if read is not None:
-        values = np.array(read(m), np.float64)
-        at = put_scalars(rows, at, sources, values, place, m.lever_arm, group, heading)
+    the last one. A position fix of its antenna becomes two decorrelated LINEAR rows.
+
+    sites : whether the RSU's angles are those of linear arrays, its ``rsu_place``, and that of the
+        second RSU of a difference
+    """
+    fields, (cone, place, reference) = int(m.fields), sites
+    plan = scalar_plan(fields, cone)
+    if plan.read is not None:
+        values = np.array(plan.read(m), np.float64)
+        first = at
+        at = put_scalars(rows, at, plan.sources, values, place, m.lever_arm, group, heading)
+        for k in plan.referenced:
+            if reference is None:
+                raise ValueError(f"the difference of {m.rsu_id} needs the place of a second RSU")
+            between = reference[_MASTER : _MASTER + 3] - place[_MASTER : _MASTER + 3]
+            rows[first + k, AXES : AXES + 3] = between
     if fields & _POSITION:
         fix = linear_rows(m.position[:2], m.position_cov[:2, :2], np.eye(2, N_CORE), group)
         fix[:, HEADING:BLOCKED] = heading, *m.lever_arm
@@ -201,6 +220,7 @@ def couple(rows: Array, kinds: tuple[Kind, ...], coupling: Coupling) -> None:
     ``kinds`` they are."""
     for row, kind in zip(rows, kinds, strict=False):
         row[VARIANCE] *= coupling.inflation.get(kind, 1.0)
+        row[GATE_VARIANCE] *= coupling.gate.get(kind, 1.0)
         row[BIAS] = coupling.bias.get(kind, -1)
         row[COMMON] = coupling.common.get(kind, -1)
 
@@ -212,15 +232,16 @@ def rsu_rows(
     group: int,
     coupling: Coupling = UNCOUPLED,
     heading: int = -1,
+    reference: Array | None = None,
 ) -> Array:
     """Rows (m, ROW_WIDTH) of one RSU measurement.
 
-    axes : (9,) of ``rsu_axes``
+    axes : (9,) of ``rsu_axes``; reference : ``rsu_place`` of the second RSU of a difference
     heading : state index of the device's heading, by which its lever arm turns; -1: none
     """
     rows = np.empty((ROWS_MAX, ROW_WIDTH))
-    cone, place = info.angle_convention is _CONE, rsu_place(info, axes)
-    end = put_measurement(rows, 0, m, cone, place, group, heading)
+    sites = info.angle_convention is _CONE, rsu_place(info, axes), reference
+    end = put_measurement(rows, 0, m, sites, group, heading)
     couple(rows, scalar_kinds(int(m.fields), info.angle_convention), coupling)
     return rows[:end]
 

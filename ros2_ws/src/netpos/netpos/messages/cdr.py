@@ -206,10 +206,10 @@ class CdrCodec:
         parts = self._measurement.parts(cdr)
         if parts is None:
             return None
-        (sec, nanosec), (frame_id, rsu_id, vue_id), scalars = parts
+        (sec, nanosec), (frame_id, rsu_id, vue_id, reference_rsu_id), scalars = parts
         value = RsuMeasurement.__new__(RsuMeasurement)  # the defaults would cost most
         value.stamp_ns, value.rsu_id, value.vue_id = sec * NS + nanosec, rsu_id, vue_id
-        value.frame_id = frame_id
+        value.frame_id, value.reference_rsu_id = frame_id, reference_rsu_id
         (
             value.sequence,
             value.expected,
@@ -226,6 +226,8 @@ class CdrCodec:
             value.range_var,
             value.phase_difference_rad,
             value.phase_difference_var,
+            value.tdoa_s,
+            value.tdoa_var,
             *lever_and_position,
         ) = scalars
         x, y, z, *position, position_cov = lever_and_position
@@ -310,4 +312,5 @@ class CdrCodec:
             [mode.weight for mode in value.modes],
             [mode.x_m for mode in value.modes],
             [mode.y_m for mode in value.modes],
+            value.reason,
         )

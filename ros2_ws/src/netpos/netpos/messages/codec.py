@@ -22,6 +22,7 @@ from netpos.messages.values import (
     Beacon,
     ClockState,
     Field,
+    RsuErrors,
     RsuInfo,
     RsuMeasurement,
     Step,
@@ -30,6 +31,17 @@ from netpos.messages.values import (
     TrackState,
     TrackStatus,
 )
+
+
+def _time_difference(msg: Any) -> dict[str, Any]:
+    """What a RsuMeasurement says of a TDOA; nothing where it was recorded before there was one."""
+    if not hasattr(msg, "tdoa"):
+        return {}
+    return {
+        "tdoa_s": float(msg.tdoa),
+        "tdoa_var": float(msg.tdoa_var),
+        "reference_rsu_id": msg.reference_rsu_id,
+    }
 
 
 class Codec(CommonCodec):
@@ -104,6 +116,7 @@ class Codec(CommonCodec):
             header=self.header(m.stamp_ns, MAP_FRAME),
             rsu_id=m.rsu_id,
             vue_id=m.vue_id,
+            reference_rsu_id=m.reference_rsu_id,
             sequence=m.sequence,
             expected=m.expected,
             fields=int(m.fields),
@@ -119,6 +132,8 @@ class Codec(CommonCodec):
             range_var=float(m.range_var),
             phase_difference=float(m.phase_difference_rad),
             phase_difference_var=float(m.phase_difference_var),
+            tdoa=float(m.tdoa_s),
+            tdoa_var=float(m.tdoa_var),
             lever_arm=self._to_vector(m.lever_arm),
             position=self._to_point(m.position),
             position_covariance=flat(m.position_cov),
@@ -147,6 +162,7 @@ class Codec(CommonCodec):
             range_var=float(msg.range_var),
             phase_difference_rad=float(msg.phase_difference),
             phase_difference_var=float(msg.phase_difference_var),
+            **_time_difference(msg),
             lever_arm=lever_arm(msg),
             position=xyz(msg.position),
             position_cov=square(msg.position_covariance, 3),
@@ -195,6 +211,7 @@ class Codec(CommonCodec):
             mode_weights=np.array([mode.weight for mode in status.modes], dtype=np.float64),
             mode_x=np.array([mode.x_m for mode in status.modes], dtype=np.float64),
             mode_y=np.array([mode.y_m for mode in status.modes], dtype=np.float64),
+            reason=status.reason,
         )
 
     @staticmethod
@@ -215,6 +232,43 @@ class Codec(CommonCodec):
             protection_level_m=float(msg.protection_level),
             steps=_step_calibration(msg),
             modes=_modes(msg),
+            reason=getattr(msg, "reason", ""),  # recordings may be older than that
+        )
+
+    def rsu_errors_to_msg(self, errors: RsuErrors) -> Any:
+        """netpos_msgs/RsuErrors."""
+
+        def column(values: tuple[float, ...]) -> Any:
+            return np.array(values, dtype=np.float64)
+
+        return self._resolve("netpos_msgs/msg/RsuErrors")(
+            header=self.header(errors.stamp_ns, base_link(errors.vue_id)),
+            rsu_id=errors.rsu_id,
+            quantities=list(errors.quantities),
+            scatter=column(errors.scatter),
+            bias=column(errors.bias),
+            bias_sd=column(errors.bias_sd),
+            bias_spread=column(errors.bias_spread),
+            correlation_time=column(errors.correlation_time_s),
+        )
+
+    @staticmethod
+    def rsu_errors_from_msg(msg: Any) -> RsuErrors:
+        """RsuErrors value of a netpos_msgs/RsuErrors."""
+
+        def column(values: Any) -> tuple[float, ...]:
+            return tuple(float(value) for value in values)
+
+        return RsuErrors(
+            stamp_ns=stamp_ns(msg.header.stamp),
+            rsu_id=str(msg.rsu_id),
+            vue_id=vue_of_frame(msg.header.frame_id),
+            quantities=tuple(msg.quantities),
+            scatter=column(msg.scatter),
+            bias=column(msg.bias),
+            bias_sd=column(msg.bias_sd),
+            bias_spread=column(msg.bias_spread),
+            correlation_time_s=column(msg.correlation_time),
         )
 
     def step_to_msg(self, step: Step) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 CLOCK = "/clock"
 RSU_INFO = "/rsu/info"
 RSU_MEASUREMENTS = "/rsu/measurements"
+RSU_LEARNED = "/rsu/learned"
 DIAGNOSTICS = "/diagnostics"
 TF = "/tf"
 
@@ -67,6 +68,6 @@ def split_network(topic: str) -> tuple[str, str, str]:
 def is_tracker_output(topic: str) -> bool:
     """Whether a topic is published by a tracker or by the fusion of tracks (and left out when a
     bag is re-estimated)."""
-    if topic in (DIAGNOSTICS, TF) or topic.startswith(f"/{NETWORKS}/"):
+    if topic in (DIAGNOSTICS, RSU_LEARNED, TF) or topic.startswith(f"/{NETWORKS}/"):
         return True
     return split(topic)[1] in TRACKER_OUTPUTS

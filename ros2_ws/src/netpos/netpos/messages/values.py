@@ -25,6 +25,7 @@ class Field(IntFlag):
     RANGE = 8
     PHASE = 16
     POSITION = 32
+    TDOA = 64
 
 
 class AngleConvention(IntEnum):
@@ -98,6 +99,10 @@ class RsuMeasurement:
     range_var: float = 0.0
     phase_difference_rad: float = 0.0
     phase_difference_var: float = 0.0
+    tdoa_s: float = 0.0
+    tdoa_var: float = 0.0
+    reference_rsu_id: str = ""
+    """The RSU that ``tdoa_s`` counts from; with another one it is another measurement."""
     lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     frame_id: str = "map"
     position: Array = field(default_factory=lambda: np.zeros(3))
@@ -219,6 +224,27 @@ class TrackStatus:
     steps: StepCalibration = StepCalibration()
     modes: tuple[TrackMode, ...] = ()
     """While it is AMBIGUOUS: the modes that matter, the most probable first."""
+    reason: str = ""
+    """Why it is not TRACKING, for people."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RsuErrors:
+    """What is learned of the errors of one RSU from one device, quantity by quantity.
+
+    scatter : sd of single values over the one stated; bias, bias_sd, bias_spread : m or rad, how
+    much too large the values are now, the sd of that, and the sd of the bias over time
+    """
+
+    stamp_ns: int
+    rsu_id: str
+    vue_id: str
+    quantities: tuple[str, ...]
+    scatter: tuple[float, ...]
+    bias: tuple[float, ...]
+    bias_sd: tuple[float, ...]
+    bias_spread: tuple[float, ...]
+    correlation_time_s: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

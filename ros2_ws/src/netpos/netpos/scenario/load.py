@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 from pydantic import ValidationError
 
+from netpos.common.parameters import FaultsError
 from netpos.scenario.schema import Scenario
 
 _SHARED = Path("share/netpos_bringup/scenarios")
@@ -18,7 +19,7 @@ _SOURCE = Path(__file__).resolve().parents[3] / "netpos_bringup" / "scenarios"
 _YAML_1_2_FLOAT = re.compile(r"^[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$")
 
 
-class ScenarioError(ValueError):
+class ScenarioError(FaultsError):
     """A scenario that cannot be used; the text names file, line, key and remedy."""
 
 
@@ -77,6 +78,13 @@ def load_scenario(
     except ValidationError as error:
         raise ScenarioError(_describe(path, node, error)) from error
     return scenario
+
+
+def place_of(name_or_path: str, *keys: str) -> str:
+    """File, line and key of a value of a readable scenario: "a.yaml: line 3: tracker.x"."""
+    path = _find(name_or_path)
+    found, line = _locate(_compose(path, path.read_text(encoding="utf-8")), keys)
+    return f"{path}: line {line}: {found}"
 
 
 def _find(name_or_path: str) -> Path:

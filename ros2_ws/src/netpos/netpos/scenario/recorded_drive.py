@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import yaml
 
 from netpos.bags.importers.car_imu_rtk import (
-    LEVER_ARM_M,
+    MOUNT,
     NS,
     CarDrive,
+    Mount,
     imu_samples,
     load_car_drive,
     truth_of,
 )
-from netpos.bags.importers.common import write_recording
+from netpos.bags.recording import write_bag
 from netpos.messages.values import RsuInfo
 from netpos.radio.measure import Observations
 from netpos.scenario.along_path import measurements_of, observe_along, stations_along
@@ -57,7 +57,13 @@ def station_drive(drive: CarDrive, *, fewest: int, nearest: int, seed: int) -> S
 
 
 def import_car_drive(
-    path: Path, bag: Path, *, fewest: int = 1, nearest: int = 2, seed: int = 1
+    path: Path,
+    bag: Path,
+    *,
+    fewest: int = 1,
+    nearest: int = 2,
+    seed: int = 1,
+    mount: Mount = MOUNT,
 ) -> dict[str, int]:
     """Write the drive as a bag: /rsu/info, /rsu/measurements, the IMU and the truth.
 
@@ -71,18 +77,18 @@ def import_car_drive(
     FileExistsError  ``bag`` exists
     ValueError  numbers of stations out of range
     """
-    drive = load_car_drive(path)
+    drive = load_car_drive(path, mount)
     made = station_drive(drive, fewest=fewest, nearest=nearest, seed=seed)
     height_m = float(made.antenna[0, 2])
     source = f"car-imu-rtk {Path(path).name}, simulated stations {fewest}-{nearest}, seed {seed}"
-    return write_recording(
+    return write_bag(
         bag,
-        made.stations,
-        measurements_of(made.seen, made.stations, made.stamps_ns, VUE, LEVER_ARM_M),
-        truth_of(drive, VUE),
-        {
-            "source": source,
-            "tracker": yaml.safe_dump({**drive.tracker, "device_height_m": height_m}),
-        },
-        imu_samples(drive, VUE),
+        rsus=made.stations,
+        measurements=measurements_of(
+            made.seen, made.stations, made.stamps_ns, VUE, drive.lever_arm_m
+        ),
+        truth=truth_of(drive, VUE),
+        imu=imu_samples(drive, VUE),
+        tracker={**drive.tracker, "device_height_m": height_m},
+        metadata={"source": source},
     )

@@ -29,7 +29,7 @@ from netpos.messages.values import (
     RsuMeasurement,
 )
 from netpos.radio.clocks import simulate_clock
-from netpos.radio.measure import QUANTITIES, Observations, Sight, Sites, observe
+from netpos.radio.measure import QUANTITIES, TOA, Observations, Sight, Sites, observe
 from netpos.radio.noise import generator
 from netpos.scenario.build import (
     clock_tones_of,
@@ -152,7 +152,9 @@ class Simulation:
             vue.sight,
             self._errors,
         )
-        return [self._measurement(beacon, part, seen, j) for j in range(int(seen.heard_by[0]))]
+        found = [self._measurement(beacon, part, seen, j) for j in range(int(seen.heard_by[0]))]
+        told = [m for m in found if m.fields]
+        return [replace(m, expected=len(told)) for m in told]
 
     def warm_up(self) -> None:
         """Compile the measurement kernel, so that the first beacon does not wait for it."""
@@ -206,7 +208,15 @@ class Simulation:
         for value, variance, column in self._carried:
             scalars[value] = float(seen.values[0, j, column])
             scalars[variance] = float(seen.variances[0, j, column])
-        rsu_id = self.rsus[int(part.rsus[seen.rsu[0, j]])].rsu_id
+        rsu_id, nearest = (self.rsus[int(part.rsus[seen.rsu[0, i]])].rsu_id for i in (j, 0))
+        fields = self.fields
+        if fields & Field.TDOA and j == 0:  # the others count from the nearest
+            fields &= ~Field.TDOA
+            scalars["tdoa_s"] = scalars["tdoa_var"] = 0.0
+        elif fields & Field.TDOA:
+            scalars["tdoa_s"] -= float(seen.values[0, 0, TOA])
+            scalars["tdoa_var"] += float(seen.variances[0, 0, TOA])
+            scalars["reference_rsu_id"] = nearest
         fix, fix_cov = np.zeros(3), np.zeros((3, 3))
         if self.fields & Field.POSITION:
             fix, fix_cov = part.fix(beacon, rsu_id, self.scenario.seed)
@@ -216,7 +226,7 @@ class Simulation:
             vue_id=part.names[beacon.vue_id],
             sequence=beacon.sequence,
             expected=int(seen.heard_by[0]),
-            fields=self.fields,
+            fields=fields,
             rssi_dbm=float(seen.rssi_dbm[0, j]),
             position=fix,
             position_cov=fix_cov,

@@ -151,6 +151,9 @@ class TrackerConfig:
     require_initial_pose: bool = described(
         False, "wait for initialpose instead of the first measurements"
     )
+    initial_pose_wait_s: float = real(
+        5.0, 0.0, 1e6, "with require_initial_pose: after this the track starts itself"
+    )
     initial_position_sd_max_m: float = real(
         5.0, 1e-3, 1e4, "a first fix is taken once its position sd is below this"
     )
@@ -210,6 +213,10 @@ class TrackerConfig:
     )
     step_error_time_s: float = real(
         3600.0, 1.0, 1e6, "correlation time of both (first-order Markov)"
+    )
+    learn_errors: bool = described(
+        False,
+        "learn scatter, bias and correlation of each RSU's errors; declared ones are a prior",
     )
     isolate_rsus: bool = described(True, "refuse an RSU that at least two others contradict")
     manoeuvre_speed_sd_mps: float = real(
@@ -271,6 +278,11 @@ class TrackerConfig:
             raise ValueError(
                 "manoeuvre_speed_sd_mps needs backend compiled and a single motion model, got"
                 f" {self.manoeuvre_speed_sd_mps}; set it to 0"
+            )
+        if self.learn_errors and (several or self.motion_model == "strapdown"):
+            raise ValueError(
+                "learn_errors needs backend compiled and a planar motion model other than"
+                f" interacting, got {self.backend!r} and {self.motion_model!r}; set it to false"
             )
         if self.motion_model == "interacting" and self.filter not in ("ekf", "iekf"):
             raise ValueError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from netpos.filters.measurement import BIAS, COMMON, KIND, ROW_WIDTH, VARIANCE, 
 from netpos.filters.rows import ROWS_MAX, couple, linear_rows, put_measurement, speed_row
 from netpos.filters.state import N_CORE, VELOCITY, X
 from netpos.messages.values import Array, Field, GroundSpeed, RsuMeasurement, Velocity
-from netpos.tracking.rsus import BiasStates, Rsu
+from netpos.tracking.rsus import REFERENCED, BiasStates, Rsu
 
 Source = RsuMeasurement | Velocity | GroundSpeed
 _TOA = int(Field.TOA)
@@ -41,6 +41,23 @@ class EpochRows:
         return variance
 
 
+def reference_place(m: RsuMeasurement, rsus: Mapping[str, Rsu]) -> Array | None:
+    """``rsu_place`` of the RSU that a difference counts from; None where there is none."""
+    return rsus[m.reference_rsu_id].place if int(m.fields) & REFERENCED else None
+
+
+def shared_references(items: Sequence[Source]) -> Collection[str]:
+    """RSUs that several differences of one epoch count from, whose error these share."""
+    if len(items) < 2:
+        return ()
+    names = [
+        item.reference_rsu_id
+        for item in items
+        if isinstance(item, RsuMeasurement) and int(item.fields) & REFERENCED
+    ]
+    return {name for name in names if names.count(name) > 1}
+
+
 def epoch_rows_of(
     items: Sequence[Source],
     rsus: Mapping[str, Rsu],
@@ -55,13 +72,22 @@ def epoch_rows_of(
     inflation : variance factor of velocities with correlated errors, by source
     """
     rows, end = np.empty((ROWS_MAX * len(items), ROW_WIDTH)), 0
+    shared = shared_references(items)
     for group, item in enumerate(items):
         first = end
         if isinstance(item, RsuMeasurement):
             rsu = rsus[item.rsu_id]
-            end = put_measurement(rows, first, item, rsu.cone, rsu.place, group, heading)
-            if biases is not None and not rsu.plain:
-                couple(rows[first:end], rsu.kinds(item), biases.coupling(rsu, item))
+            sites = rsu.cone, rsu.place, reference_place(item, rsus)
+            end = put_measurement(rows, first, item, sites, group, heading)
+            if biases is None:
+                continue
+            shares = item.reference_rsu_id in shared
+            if biases.learned is not None:
+                stated = rows[first:end, VARIANCE]
+                coupling = biases.learned_coupling(rsu, item, stated, biases.learned, shares)
+                couple(rows[first:end], rsu.kinds(item), coupling)
+            elif shares or not rsu.plain:
+                couple(rows[first:end], rsu.kinds(item), biases.coupling(rsu, item, shares))
             continue
         if isinstance(item, Velocity):
             block = linear_rows(item.velocity, item.cov, _VELOCITY_H, group)

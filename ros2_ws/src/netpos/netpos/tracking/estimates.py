@@ -47,6 +47,10 @@ class Estimate(Protocol):
     def set_process_noise(self, accel_density: float) -> None:
         """Set the density of the white acceleration [m/s^2/sqrt(Hz)] from ``stamp_ns`` on."""
 
+    def change_prior(self, index: int, before: float, after: float) -> None:
+        """Take the bias state ``index``, whose prior had the sd ``before``, for one of sd
+        ``after``; nothing happens to several components."""
+
     def predict(self, stamp_ns: int, bias: Array) -> None:
         """Move to ``stamp_ns``."""
 
@@ -181,6 +185,12 @@ class KalmanEstimate(OneModel):
             self.mean, self._cov_or_sqrt = mean, engine.to_cov_or_sqrt(cov, self._options)
         self._make_room(self._rows)
 
+    def change_prior(self, index: int, before: float, after: float) -> None:
+        if self._components is None:
+            cov = self.cov.copy()
+            change_prior(self.mean, cov, index, before, after)
+            self._cov_or_sqrt = engine.to_cov_or_sqrt(cov, self._options)
+
     def predict(self, stamp_ns: int, bias: Array) -> None:
         dt = (stamp_ns - self.stamp_ns) * 1e-9
         self.stamp_ns = stamp_ns
@@ -237,6 +247,20 @@ class KalmanEstimate(OneModel):
         return twin
 
 
+def change_prior(mean: Array, cov: Array, index: int, before: float, after: float) -> None:
+    """Take a state whose prior had mean 0 and sd ``before`` for one of sd ``after``, in place: a
+    measurement of 0 with the information gained, or noise of the variance gained."""
+    gained = after * after - before * before
+    if gained >= 0.0:
+        cov[index, index] += gained
+        return
+    variance = after * after * before * before / -gained
+    Ph = cov[:, index].copy()
+    S = Ph[index] + variance
+    mean -= Ph * (mean[index] / S)
+    cov -= np.outer(Ph, Ph) / S
+
+
 def modes_of(mixture: Mixture, risk: float) -> tuple[TrackMode, ...]:
     """Modes of a mixture that carry more than ``risk``, the most probable first; none where it is
     only one."""
@@ -259,6 +283,9 @@ class GatedEstimate(UnimodalEstimate):
     cov: Array
     _options: FilterOptions
     _prior: tuple[Array, Array]
+
+    def change_prior(self, index: int, before: float, after: float) -> None:
+        raise NotImplementedError("errors are learned with backend compiled only")
 
     def _move(self, stamp_ns: int, bias: Array) -> None:
         raise NotImplementedError

@@ -47,6 +47,7 @@ _REFINED = 12
 _ATTEMPT_NS = 100_000_000
 # A second solution this much worse in cost (chi-square 0.99, 2 dof) does not count as a rival.
 _RIVAL_COST = 9.21
+_CONTRADICTS = 9.0  # mean squared residual over variance
 _NEAREST_M = 1.0
 _HEADINGS = 16
 _HEADING_SD_MAX = 0.5
@@ -113,12 +114,15 @@ class Initialiser:
         self._config = config
         self._window: deque[tuple[int, Array, tuple[Rsu, ...]]] = deque()
         self._next_attempt_ns = 0
+        self.missing = ""
+        """What a first fix lacks, for people; empty before the first attempt."""
 
     def copy(self) -> Initialiser:
         """An independent copy."""
         twin = Initialiser(self._config)
         twin._window = self._window.copy()
         twin._next_attempt_ns = self._next_attempt_ns
+        twin.missing = self.missing
         return twin
 
     def add(self, stamp_ns: int, rows: Array, bias_var: Array, rsus: tuple[Rsu, ...]) -> None:
@@ -149,16 +153,35 @@ class Initialiser:
         if fits and not self._consistent(fits[0], len(rows)):
             fits = self._without_one(rows, ages) or fits
         if not fits:
+            self.missing = f"no place in front of the RSUs fits {self._heard(rows)}"
             return None
         cost, mean, cov = fits[0]
         misfit = max(1.0, cost / max(len(rows), 1))
-        position_sd = math.sqrt(float(np.linalg.eigvalsh(cov[:2, :2])[-1]) * misfit)
-        if position_sd > self._config.initial_position_sd_max_m:
+        sd_m = math.sqrt(float(np.linalg.eigvalsh(cov[:2, :2])[-1]))
+        limit_m = self._config.initial_position_sd_max_m
+        if sd_m > limit_m and misfit < _CONTRADICTS:
+            self.missing = (
+                f"{self._heard(rows)} leave a position sd of {sd_m:.1f} m (needed: below "
+                f"{limit_m:g}); another RSU or quantity is needed"
+            )
+            return None
+        if sd_m * math.sqrt(misfit) > limit_m:
+            self.missing = (
+                f"{self._heard(rows)} contradict each other by {math.sqrt(misfit):.3g} sd; are"
+                " they in m, rad and s, and the RSUs where RsuInfo says?"
+            )
             return None
         waited_s = (newest - self._window[0][0]) * 1e-9
         if waited_s < 0.8 * self._config.initial_window_s and _has_rival(fits):
+            self.missing = f"more than one place fits {self._heard(rows)}; waiting for more"
             return None
         return mean, cov * misfit
+
+    def _heard(self, rows: Array) -> str:
+        """What was measured, by whom."""
+        kinds = sorted({BY_KIND[int(kind)].name for kind in rows[:, KIND]})
+        rsus = sorted({rsu.info.rsu_id for entry in self._window for rsu in entry[2]})
+        return f"{', '.join(kinds)} of {', '.join(rsus) or 'no RSU'}"
 
     def _consistent(self, fit: tuple[float, Array, Array], rows: int) -> bool:
         """Whether the cost of a fit is one that true measurements have."""
@@ -303,6 +326,8 @@ def _starts(rows: Array, centre: Array) -> list[Array]:
             angle = row[VALUE] if kind is Kind.AZIMUTH else math.asin(np.clip(row[VALUE], -1, 1))
             ray = A.T @ np.array([math.cos(angle), math.sin(angle), 0.0])
             starts += [origin + r * ray[:2] for r in _RAY_M]
+        elif kind is Kind.TDOA:
+            starts += _on_hyperbola(row)
         elif BY_KIND[kind].is_range and not BY_KIND[kind].has_clock:
             starts += [origin + row[VALUE] * np.array([math.cos(a), math.sin(a)]) for a in _CIRCLE]
         elif BY_KIND[kind].is_range:
@@ -312,6 +337,21 @@ def _starts(rows: Array, centre: Array) -> list[Array]:
         H = fix[:, ORIGIN : ORIGIN + 2]
         starts.append(np.linalg.lstsq(H, fix[:, VALUE], rcond=None)[0])
     return starts
+
+
+def _on_hyperbola(row: Array) -> list[Array]:
+    """Horizontal positions from which a time difference of arrival would read as it does: in polar
+    coordinates around the RSU, r = (D^2 - v^2) / (2 (e b - v)) in the direction e, with the
+    reference at b, D away, and the value v."""
+    between, value = row[AXES : AXES + 2], float(row[VALUE])
+    excess = float(between @ between) - value * value
+    found = []
+    for angle in _CIRCLE:
+        direction = np.array([math.cos(angle), math.sin(angle)])
+        slope = 2.0 * (float(direction @ between) - value)
+        if abs(slope) > 1e-9 and 0.0 < excess / slope < _RAY_M[-1]:
+            found.append(row[ORIGIN : ORIGIN + 2] + excess / slope * direction)
+    return found
 
 
 def _clock_at(state: Array, rows: Array, height_m: float) -> float:

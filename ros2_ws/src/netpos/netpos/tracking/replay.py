@@ -77,7 +77,8 @@ def replay_bag(
         with whole_bag(bag_out, metadata=metadata) as out:
             for name, info in source.topics.items():
                 if not topics.is_tracker_output(name):
-                    out.add_topic(name, info.type_name, info.qos)
+                    text = info.definition or None  # that of the bag, which may be older than ours
+                    out.add_topic(name, info.type_name, info.qos, text=text)
             for done, batch in enumerate(_through(tracker, source, out)):
                 epochs += len(batch)
                 estimates += sum(output.odometry is not None for output in batch)
@@ -177,9 +178,12 @@ def _write_smoothed(out: BagWriter, vue_id: str, odometry: Iterable[Odometry]) -
 
 
 def write_output(out: BagWriter, output: TrackOutput) -> None:
-    """Write what the live node would publish, logged at its stamp."""
+    """Write what the live node would publish, logged at its stamp; nothing of a device that has
+    sent no stamp yet."""
     make = cdr_codec()
     status = output.status
+    if not status.stamp_ns:
+        return
     stamp, vue_id, network = status.stamp_ns, status.vue_id, output.network
 
     def write(topic: str, type_name: str, cdr: bytes) -> None:
@@ -195,6 +199,8 @@ def write_output(out: BagWriter, output: TrackOutput) -> None:
         write(topic, "netpos_msgs/msg/ClockState", make.clock_state(output.clock))
     topic = topics.of_vue(vue_id, topics.TRACK_STATUS, network)
     write(topic, "netpos_msgs/msg/TrackStatus", make.track_status(status))
+    for errors in output.errors:
+        out.write(topics.RSU_LEARNED, codec().rsu_errors_to_msg(errors), stamp)
     for odometry in output.smoothed:
         topic = topics.of_vue(vue_id, topics.ODOMETRY_SMOOTHED, network)
         write(topic, _ODOMETRY, make.odometry(odometry))

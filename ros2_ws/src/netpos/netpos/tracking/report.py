@@ -9,8 +9,10 @@ from netpos.messages.values import (
     ClockState,
     NetworkTrack,
     Odometry,
+    RsuErrors,
     StepCalibration,
     TrackMode,
+    TrackState,
     TrackStatus,
 )
 from netpos.tracking.config import TrackerConfig
@@ -24,7 +26,8 @@ class TrackOutput:
     """What a track says at one epoch; odometry is None until the first fix, clock until the first
     TOA. ``revised``: said before of the same epoch, without what came late. ``smoothed``: earlier
     epochs that are now ``fixed_lag_s`` old. ``network``: whose track it is, "" for that of all;
-    ``track``: the same for others to fuse with their own."""
+    ``track``: the same for others to fuse with their own. ``errors``: what is learned of the
+    RSUs, where it has changed."""
 
     odometry: Odometry | None
     clock: ClockState | None
@@ -33,6 +36,7 @@ class TrackOutput:
     smoothed: tuple[Odometry, ...] = ()
     network: str = ""
     track: NetworkTrack | None = None
+    errors: tuple[RsuErrors, ...] = ()
 
 
 @dataclass(slots=True)
@@ -57,10 +61,13 @@ def total(refused: Mapping[str, int], rejected: Mapping[str, int]) -> dict[str, 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EstimateStatus:
     """What a status says of an estimate: heard_ns, stamp of the last accepted measurement, None
-    before the first fix; sd along the worst axis and protection level [m], -1: none; modes, where
-    the device may be while that is not decided; calibration of step velocities."""
+    before the first fix, and what is missing for one; sd along the worst axis and protection level
+    [m], -1: none; modes, where the device may be while that is not decided; calibration of step
+    velocities; epochs in a row that were refused."""
 
     heard_ns: int | None = None
+    missing: str = ""
+    refused_in_row: int = 0
     position_sd_m: float = 0.0
     level_m: float = -1.0
     modes: tuple[TrackMode, ...] = ()
@@ -97,4 +104,39 @@ def track_status(
         protection_level_m=estimate.level_m,
         steps=estimate.steps or _NO_STEPS,
         modes=modes,
+        reason=_reason(config, state, epoch.stamp_ns, estimate),
     )
+
+
+def waiting_output(
+    config: TrackerConfig,
+    vue_id: str,
+    stamp_ns: int,
+    accepted: int,
+    rejected: dict[str, int],
+    missing: str,
+) -> TrackOutput:
+    """What is told of a device without an estimate, for want of ``missing``."""
+    open_ = EstimateStatus(missing=missing)
+    status = track_status(config, vue_id, EpochResult(stamp_ns), accepted, dict(rejected), open_)
+    return TrackOutput(None, None, status, network=config.network)
+
+
+def _reason(
+    config: TrackerConfig, state: TrackState, stamp_ns: int, estimate: EstimateStatus
+) -> str:
+    """Why a track is in a state that is not TRACKING."""
+    match state:
+        case TrackState.WAITING:
+            return estimate.missing
+        case TrackState.INITIALISING:
+            limit_m = config.initial_position_sd_max_m
+            return f"position sd {estimate.position_sd_m:.1f} m, above {limit_m:g} m"
+        case TrackState.COASTING:
+            unheard_s = (stamp_ns - (estimate.heard_ns or stamp_ns)) * 1e-9
+            refused = f"; {estimate.refused_in_row} epochs in a row refused by the gate"
+            return f"nothing taken for {unheard_s:.1f} s{refused * bool(estimate.refused_in_row)}"
+        case TrackState.AMBIGUOUS:
+            return f"at one of {len(estimate.modes)} places"
+        case _:
+            return ""

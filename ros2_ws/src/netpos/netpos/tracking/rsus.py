@@ -3,22 +3,31 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
-from netpos.filters.measurement import Kind
+from netpos.filters.measurement import BIAS, GATE_VARIANCE, GROUP, Kind
 from netpos.filters.rows import UNCOUPLED, Coupling, rsu_axes, rsu_place, scalar_kinds
-from netpos.filters.sensors.table import BY_KIND, SENSORS
-from netpos.filters.state import N_CORE
+from netpos.filters.sensors.table import BY_KIND, SENSORS, readings
+from netpos.filters.state import N_CORE, X
+from netpos.filters.unexplained import unexplained
 from netpos.messages.values import (
     AngleConvention,
     Array,
+    RsuErrors,
     RsuInfo,
     RsuMeasurement,
     StepCalibration,
 )
+from netpos.tracking.learning import CORRELATION_S, LearnedErrors, Name
 
+_RSU = "rsu/"
+REFERENCED = sum(int(r.field) for _, r in readings() if r.has_reference)
+"""Fields that compare the RSU with a second one."""
+_RENEWED_S = 1e-6  # correlation time of what is new at every epoch
 _SLOW = {name for s in SENSORS for name in (s.bias_sd, s.common_bias_sd) if name is not None}
 
 
@@ -44,9 +53,14 @@ class Rsu:
         return cls(info, axes, rsu_place(info, axes), cone, not any(slow))
 
     def bias_sd(self, kind: Kind) -> float:
-        """Standard deviation of the RSU's own bias in rows of a kind; 0 where it has none."""
-        name = BY_KIND[kind].bias_sd
-        return 0.0 if name is None else float(getattr(self.info, name))
+        """Standard deviation of the RSU's own bias in rows of a kind; 0 where it has none. A
+        difference has those of two RSUs alike."""
+        sensor = BY_KIND[kind]
+        if sensor.bias_sd is None:
+            return 0.0
+        reading = sensor.reading
+        factor = math.sqrt(2.0) if reading is not None and reading.has_reference else 1.0
+        return factor * float(getattr(self.info, sensor.bias_sd))
 
     def common_bias_sd(self, kind: Kind) -> float:
         """Standard deviation of the bias that its network shares in rows of a kind; 0: none."""
@@ -80,6 +94,21 @@ class StepErrors:
     tau_s: float = 0.0
 
 
+def _name(m: RsuMeasurement, kind: Kind) -> tuple[str, str]:
+    """Whose errors those of a measurement's row of a kind are: of an RSU, or of a pair."""
+    reading = BY_KIND[kind].reading
+    pair = reading is not None and reading.has_reference
+    return _RSU + (f"{m.rsu_id}-{m.reference_rsu_id}" if pair else m.rsu_id), kind.name
+
+
+class PriorChange(NamedTuple):
+    """The sd of the prior of a bias state is not what it was."""
+
+    state: int
+    before: float
+    after: float
+
+
 @dataclass(slots=True)
 class BiasStates:
     """State entries for the slow sensor errors of one track, added when an RSU, or a source of
@@ -87,23 +116,40 @@ class BiasStates:
 
     first: int = N_CORE
     steps: StepErrors = StepErrors()
+    learned: LearnedErrors | None = None
     sd: list[float] = field(default_factory=list)
     tau_s: list[float] = field(default_factory=list)
     _slots: dict[tuple[str, str], int] = field(default_factory=dict)
-    _last_ns: dict[tuple[str, Kind], int] = field(default_factory=dict)
+    _last_ns: dict[tuple[str, str], int] = field(default_factory=dict)
+    version: int = 0
+    """Changes with ``sd`` and ``tau_s``."""
 
     def copy(self) -> BiasStates:
         """An independent copy; the lists and the slots are replaced, never changed."""
         last_ns = self._last_ns.copy()
-        return BiasStates(self.first, self.steps, self.sd, self.tau_s, self._slots, last_ns)
+        learned = None if self.learned is None else self.learned.copy()
+        return BiasStates(
+            self.first,
+            self.steps,
+            learned,
+            self.sd,
+            self.tau_s,
+            self._slots,
+            last_ns,
+            self.version,
+        )
 
     def arrays(self) -> Array:
         """(2, k): standard deviation and time constant of each."""
         return np.array([self.sd, self.tau_s]).reshape(2, -1)
 
-    def coupling(self, rsu: Rsu, m: RsuMeasurement) -> Coupling:
-        """Coupling of the rows of ``m``; new biases are added to ``sd`` and ``tau_s``."""
-        if rsu.plain:
+    def coupling(self, rsu: Rsu, m: RsuMeasurement, shares: bool = False) -> Coupling:
+        """Coupling of the rows of ``m`` as the RSU declares it; new biases are added to ``sd`` and
+        ``tau_s``.
+
+        shares : another difference of this epoch counts from the same RSU
+        """
+        if rsu.plain and not shares:
             return UNCOUPLED
         info = rsu.info
         bias: dict[Kind, int] = {}
@@ -111,15 +157,130 @@ class BiasStates:
         inflation: dict[Kind, float] = {}
         for kind in rsu.kinds(m):
             if rsu.bias_sd(kind) > 0.0:
-                name = ("rsu/" + info.rsu_id, kind.name)
+                name = _name(m, kind)
                 bias[kind] = self._slot(name, rsu.bias_sd(kind), info.bias_correlation_time_s)
             if rsu.common_bias_sd(kind) > 0.0:
-                name = ("network/" + info.network, str(BY_KIND[kind].common_bias_sd))
-                tau = info.common_bias_correlation_time_s
-                common[kind] = self._slot(name, rsu.common_bias_sd(kind), tau)
+                common[kind] = self._common_slot(rsu, kind)
             if info.noise_correlation_time_s > 0.0:
-                inflation[kind] = self._inflation(info, kind, m.stamp_ns)
-        return Coupling(bias, common, inflation)
+                inflation[kind] = self._inflation(m, info.noise_correlation_time_s, kind)
+        if not shares:
+            return Coupling(bias, common, inflation)
+        return self._with_reference(rsu, m, Coupling(bias, common, inflation))
+
+    def _with_reference(self, rsu: Rsu, m: RsuMeasurement, own: Coupling) -> Coupling:
+        """The coupling with half of the variance of a difference in a state that those of one
+        epoch with the same reference share, and that is new at every epoch."""
+        common, inflation, gate = dict(own.common), dict(own.inflation), dict(own.gate)
+        for kind in rsu.kinds(m):
+            reading = BY_KIND[kind].reading
+            if reading is None or not reading.has_reference:
+                continue
+            sd = reading.scale * math.sqrt(getattr(m, reading.variance) / 2.0)
+            name = ("reference/" + m.reference_rsu_id, kind.name)
+            k = self._slot(name, sd, _RENEWED_S) - self.first
+            if self.sd[k] != sd:
+                self.sd = [*self.sd[:k], sd, *self.sd[k + 1 :]]
+                self.version += 1
+            common[kind] = self.first + k
+            inflation[kind] = 0.5 * inflation.get(kind, 1.0)
+            gate[kind] = 0.5 * gate.get(kind, 1.0)
+        return Coupling(own.bias, common, inflation, gate)
+
+    def learned_coupling(
+        self,
+        rsu: Rsu,
+        m: RsuMeasurement,
+        variance: Array,
+        learned: LearnedErrors,
+        shares: bool = False,
+    ) -> Coupling:
+        """Coupling of the rows of ``m``, of ``variance`` (rows,) as stated, by what is learned of
+        the RSU; new biases are added to ``sd`` and ``tau_s``. ``shares`` as for ``coupling``."""
+        info = rsu.info
+        bias: dict[Kind, int] = {}
+        common: dict[Kind, int] = {}
+        inflation: dict[Kind, float] = {}
+        gate: dict[Kind, float] = {}
+        for kind, var in zip(rsu.kinds(m), variance.tolist(), strict=False):
+            if BY_KIND[kind].bias_sd is None:
+                continue
+            name = _name(m, kind)
+            declared = rsu.bias_sd(kind), info.bias_correlation_time_s
+            model = learned.model(name, math.sqrt(var), *declared, m.stamp_ns)
+            tau_s = info.noise_correlation_time_s or CORRELATION_S
+            correlated = self._inflation(m, tau_s, kind)
+            bias[kind] = self._slot(name, model.bias_sd, model.time_s(0.0))
+            inflation[kind] = model.scale * correlated
+            gate[kind] = model.gate_scale
+            if rsu.common_bias_sd(kind) > 0.0:
+                common[kind] = self._common_slot(rsu, kind)
+        learned_so = Coupling(bias, common, inflation, gate)
+        return self._with_reference(rsu, m, learned_so) if shares else learned_so
+
+    def learn(
+        self,
+        stamp_ns: int,
+        fitted: tuple[Array, Array],
+        posterior: tuple[Array, Array],
+        height_m: float,
+    ) -> tuple[list[Name], list[PriorChange]]:
+        """Learn from what the ``posterior``, mean (n,) and covariance (n, n), leaves of the rows
+        ``fitted``, (m, ROW_WIDTH) and which groups were accepted (groups,). Returns what was
+        concluded of whom, and the bias states whose sd changed."""
+        learned = self.learned
+        if learned is None:
+            return [], []
+        (rows, accepted), (mean, cov) = fitted, posterior
+        names = {i: name for name, i in self._slots.items()}
+        left = unexplained(mean, cov, rows, height_m).tolist()
+        for row, said in zip(rows, left, strict=True):
+            name = names.get(int(row[BIAS]))
+            if name not in learned.models or not accepted[int(row[GROUP])]:
+                continue
+            stated = float(row[GATE_VARIANCE]) / learned.models[name].gate_scale
+            learned.hear(name, said, stated)
+        speed = math.hypot(mean[X.VX], mean[X.VY])
+        learned.move(stamp_ns, speed)
+        concluded = learned.conclude(stamp_ns)
+        self.sd, self.tau_s = self.sd.copy(), self.tau_s.copy()
+        changes = []
+        for name, model in learned.models.items():
+            index = self._slots[name]
+            k = index - self.first
+            self.tau_s[k] = model.time_s(speed)
+            if name in concluded:
+                changes.append(PriorChange(index, self.sd[k], model.bias_sd))
+                self.sd[k] = model.bias_sd
+        return concluded, changes
+
+    def errors(
+        self, names: Iterable[Name], mean: Array, cov: Array, stamp_ns: int, vue_id: str
+    ) -> tuple[RsuErrors, ...]:
+        """What is learned under ``names``, by RSU; the biases are states of ``mean`` (n,) with
+        ``cov`` (n, n)."""
+        if self.learned is None:
+            return ()
+        quantities: dict[str, list[str]] = {}
+        for rsu_id, quantity in sorted(names):
+            quantities.setdefault(rsu_id, []).append(quantity)
+        found = []
+        for rsu_id, of_it in quantities.items():
+            models = [self.learned.models[rsu_id, quantity] for quantity in of_it]
+            states = [self._slots[rsu_id, quantity] for quantity in of_it]
+            found.append(
+                RsuErrors(
+                    stamp_ns=stamp_ns,
+                    rsu_id=rsu_id.removeprefix(_RSU),
+                    vue_id=vue_id,
+                    quantities=tuple(of_it),
+                    scatter=tuple(math.sqrt(model.gate_scale) for model in models),
+                    bias=tuple(float(mean[i]) for i in states),
+                    bias_sd=tuple(math.sqrt(cov[i, i]) for i in states),
+                    bias_spread=tuple(model.bias_sd for model in models),
+                    correlation_time_s=tuple(model.time_s(0.0) for model in models),
+                )
+            )
+        return tuple(found)
 
     def of_steps(self, source: str) -> tuple[int, int]:
         """State indices of the length factor and the heading offset of a source of step
@@ -151,22 +312,29 @@ class BiasStates:
 
     def accepted(self, rsu: Rsu, m: RsuMeasurement) -> None:
         """Note that ``m`` was fused: correlated noise is counted from here."""
-        if rsu.plain:
+        if rsu.plain and self.learned is None:
             return
         for kind in rsu.kinds(m):
-            self._last_ns[rsu.info.rsu_id, kind] = m.stamp_ns
+            self._last_ns[_name(m, kind)] = m.stamp_ns
 
     def _slot(self, name: tuple[str, str], sd: float, tau_s: float) -> int:
         if name not in self._slots:
             self._slots = {**self._slots, name: self.first + len(self.sd)}
             self.sd = [*self.sd, sd]
             self.tau_s = [*self.tau_s, tau_s]
+            self.version += 1
         return self._slots[name]
 
-    def _inflation(self, info: RsuInfo, kind: Kind, stamp_ns: int) -> float:
+    def _common_slot(self, rsu: Rsu, kind: Kind) -> int:
+        """Index of the bias that the network of an RSU shares."""
+        name = ("network/" + rsu.info.network, str(BY_KIND[kind].common_bias_sd))
+        tau_s = rsu.info.common_bias_correlation_time_s
+        return self._slot(name, rsu.common_bias_sd(kind), tau_s)
+
+    def _inflation(self, m: RsuMeasurement, tau_s: float, kind: Kind) -> float:
         """White noise of the same spectral density at 0: variance times correlation time over
         sampling interval."""
-        last = self._last_ns.get((info.rsu_id, kind))
-        if last is None or stamp_ns <= last:
+        last = self._last_ns.get(_name(m, kind))
+        if last is None or m.stamp_ns <= last:
             return 1.0
-        return max(1.0, info.noise_correlation_time_s * 1e9 / (stamp_ns - last))
+        return max(1.0, tau_s * 1e9 / (m.stamp_ns - last))

@@ -327,6 +327,9 @@ class PhaseAmbiguityBank(OneModel):
             self._decided = False
         self._seen = None
 
+    def change_prior(self, index: int, before: float, after: float) -> None:
+        """Nothing: sectors keep the priors they began with."""
+
     def copy(self) -> PhaseAmbiguityBank:
         twin = copy.copy(self)
         twin._bank, twin._parent_index = _copy_of(self._bank), self._parent_index.copy()

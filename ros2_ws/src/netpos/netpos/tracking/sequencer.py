@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from netpos.messages.values import GroundSpeed, InitialPose, RsuMeasurement, Velocity
+from netpos.tracking.clocks import Clocks, Verdict
 
 Item = RsuMeasurement | Velocity | GroundSpeed | InitialPose
 
@@ -22,6 +23,15 @@ RSU = "rsu"
 IMU = "imu"
 POSE = "initial_pose"  # before RSU in the order of application
 _LIVE_NS = 1_000_000_000
+_WAITS = "waits"
+_REASONS: dict[Verdict, str | None] = {
+    Verdict.TAKE: None,
+    Verdict.WAIT: _WAITS,
+    Verdict.AHEAD: "clock_ahead",
+    Verdict.FUTURE: "future_stamp",
+    Verdict.LATE: "late",
+    Verdict.SET_BACK: "late",
+}
 _SET_BACK_AFTER = 10  # stamps in a row from before the history: the device's time was set back
 
 
@@ -29,7 +39,8 @@ def channel_and_source(item: Item) -> tuple[str, str]:
     """Channel an item arrived on and who sent it; their order is the order of application within
     an epoch."""
     if isinstance(item, RsuMeasurement):
-        return RSU, item.rsu_id
+        pair = item.reference_rsu_id
+        return RSU, f"{item.rsu_id}-{pair}" if pair else item.rsu_id
     if isinstance(item, InitialPose):
         return POSE, ""
     return item.source, item.source
@@ -86,11 +97,13 @@ class Sequencer:
         future_ns: int = 1 << 62,
         live_ns: int = _LIVE_NS,
         tick_ns: int = 0,
+        clocks: Clocks | None = None,
     ) -> None:
         """``needs_pose``: nothing is complete before an initial pose, so that it is waited for.
 
         ``history_ns``: how much older than the newest applied epoch an item may be. ``future_ns``:
-        a stamp this far ahead of all others counts once a second one confirms it. ``live_ns``: a
+        an only source this far ahead counts once its next stamp confirms it. ``clocks``: those of
+        the device as known before a new start. ``live_ns``: a
         channel this far, or ``max_delay_ns``, behind the newest stamp is not waited for.
         ``tick_ns``: once an RSU was heard, an epoch, without items if need be, at every multiple
         of it that the IMU reaches; 0: none.
@@ -98,7 +111,8 @@ class Sequencer:
         self._max_delay_ns = max_delay_ns
         self._needs_pose = needs_pose
         self._history_ns = history_ns
-        self._future_ns = future_ns
+        self.clocks = clocks or Clocks(future_ns)
+        """Whose clock is right; outlasts a new start."""
         # Between measurements of one a second, and their way here, ticks wait for them.
         self._live_ns = max(live_ns, max_delay_ns) + (max_delay_ns if tick_ns > 0 else 0)
         self._tick_ns = tick_ns
@@ -110,7 +124,8 @@ class Sequencer:
         """Newest stamp heard; 0 before the first."""
         self._released_ns = -1
         self._last_of: dict[tuple[str, str], int] = {}
-        self._suspect_ns: int | None = None
+        self._waiting: list[Item] = []  # ahead of all others, until a second voice
+        self._refused: list[tuple[Item, str]] = []
         self._late_in_row = 0
         self.set_back = False
         """The device's time was set back: start anew."""
@@ -119,22 +134,30 @@ class Sequencer:
         measurements of its stamp."""
 
     def add(self, item: Item) -> str | None:
-        """Take an item; returns the reason when it is refused (``late``, ``future_stamp`` or
-        ``duplicate``)."""
-        stamp, self.idle = item.stamp_ns, False
-        if isinstance(item, InitialPose) and stamp <= self._released_ns:
-            stamp = max(self._released_ns, 1)
-        elif self._released_ns - self._history_ns <= stamp <= self.newest_ns + self._future_ns:
-            self._suspect_ns, self._late_in_row, self.set_back = None, 0, False
-        else:
-            reason = self._time_fault(stamp)
-            if reason is not None:
-                return reason
+        """Take an item; returns the reason when it is refused (``late``, ``future_stamp``,
+        ``clock_ahead`` or ``duplicate``). One that waits for a second voice may be refused later
+        (``take_refused``)."""
+        self.idle = False
+        if isinstance(item, InitialPose):
+            late = item.stamp_ns <= self._released_ns
+            return self._admit(item, max(self._released_ns, 1) if late else item.stamp_ns)
+        fault = self._time_fault(item)
+        if fault == _WAITS:
+            self._waiting.append(item)
+            return None
+        if self._waiting:
+            self._settle()
+        return fault or self._admit(item, item.stamp_ns)
+
+    def _admit(self, item: Item, stamp: int) -> str | None:
+        """Put an item into its epoch."""
         key = channel_and_source(item)
         in_past = stamp <= self._released_ns and not isinstance(item, InitialPose)
         if in_past and self._history_ns > 0:
             self.mark(key[0], stamp)  # first heard of late, it is waited for from now on
             return self._add_late(stamp, key, item)
+        if in_past and stamp < self._released_ns:
+            return "late"
         epoch = self._pending.get(stamp)
         if self._last_of.get(key) == stamp or (epoch is not None and key in epoch.items):
             return "duplicate"
@@ -143,12 +166,14 @@ class Sequencer:
         epoch.put(key, item)
         self.mark(key[0], stamp)
         alone = len(self._pending) == 1 and stamp == self.newest_ns and self._max_delay_ns > 0
-        self.idle = alone and not epoch.rsu_complete()
+        self.idle = alone and not epoch.rsu_complete() and not self._waiting
         return None
 
     def mark(self, channel: str, stamp_ns: int) -> None:
         """Note that a channel has reached a stamp."""
         self.idle = False
+        if channel == IMU:
+            self.clocks.advance(stamp_ns)
         if channel == IMU and self._tick_ns > 0 and RSU in self._watermark:
             self._tick(self._watermark.get(channel, stamp_ns), stamp_ns)
         if stamp_ns > self._watermark.get(channel, -1):
@@ -174,18 +199,32 @@ class Sequencer:
         """Note that a late item made a new epoch in the past."""
         self._applied[epoch.stamp_ns] = epoch
 
-    def _time_fault(self, stamp: int) -> str | None:
-        if not self._watermark:
-            return None
-        if stamp > self.newest_ns + self._future_ns:
-            suspect, self._suspect_ns = self._suspect_ns, stamp
-            if suspect is None or abs(stamp - suspect) > self._future_ns:
-                return "future_stamp"
-        self._suspect_ns = None
-        too_old = stamp < self._released_ns - self._history_ns
-        self._late_in_row = self._late_in_row + 1 if too_old else 0
-        self.set_back = self._late_in_row >= _SET_BACK_AFTER
-        return "late" if too_old else None
+    def _time_fault(self, item: Item) -> str | None:
+        """What is wrong with the stamp of an item; ``_WAITS`` while that is not known."""
+        stamp = item.stamp_ns
+        oldest = self._released_ns - self._history_ns if self._released_ns >= 0 else 0
+        is_rsu = isinstance(item, RsuMeasurement)
+        verdict = self.clocks.hear(channel_and_source(item)[1], stamp, oldest, is_rsu=is_rsu)
+        self._late_in_row = self._late_in_row + 1 if verdict is Verdict.LATE else 0
+        self.set_back = verdict is Verdict.SET_BACK or self._late_in_row >= _SET_BACK_AFTER
+        return _REASONS[verdict]
+
+    def take_refused(self) -> list[tuple[Item, str]]:
+        """Items that waited for a second voice and were contradicted, and the reason."""
+        refused, self._refused = self._refused, []
+        return refused
+
+    def _settle(self) -> None:
+        """Take the items that waited and are agreed with by now, refuse those contradicted."""
+        waiting, self._waiting = self._waiting, []
+        for item in waiting:
+            verdict = self.clocks.settled(channel_and_source(item)[1], item.stamp_ns)
+            if verdict is Verdict.WAIT:
+                self._waiting.append(item)
+                continue
+            reason = _REASONS[verdict] or self._admit(item, item.stamp_ns)
+            if reason is not None:
+                self._refused.append((item, reason))
 
     def _add_late(self, stamp: int, key: tuple[str, str], item: Item) -> str | None:
         epoch = self._applied.get(stamp)
@@ -211,6 +250,11 @@ class Sequencer:
         A pose that nothing has followed stays: it waits for the first measurement, however long
         that takes, so that both are one epoch.
         """
+        waiting, self._waiting = self._waiting, []
+        for item in waiting:  # nobody has contradicted them
+            reason = self._admit(item, item.stamp_ns)
+            if reason is not None:
+                self._refused.append((item, reason))
         newest = self.newest_ns
         return [
             self._take(stamp)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from operator import attrgetter
 
 import numpy as np
@@ -15,6 +15,7 @@ from netpos.tracking.initialise import Initialiser
 from netpos.tracking.networks.secondary import OwnNoise
 from netpos.tracking.nlos_rate import NlosRate
 from netpos.tracking.phase_start import PhaseStart
+from netpos.tracking.pose_wait import PoseWait
 from netpos.tracking.protection import NisWindow
 from netpos.tracking.rsus import BiasStates
 
@@ -32,10 +33,12 @@ class TrackSnapshot:
     estimate: Estimate | None = None
     own: OwnNoise | None = None
     bias: Array = field(default_factory=lambda: np.zeros((2, 0)))
-    pose: tuple[Array, Array] | None = None
+    pose: tuple[int, Array, Array] | None = None
+    """Stamp, mean and covariance of an initial pose that waits for its heading."""
     nis_window: NisWindow = field(default_factory=NisWindow)
     yaw: float = 0.0
     has_clock: bool = False
+    pose_wait: PoseWait = field(default_factory=PoseWait)
     rejected_in_row: int = 0
     undetected_m: float = 0.0
     last_accepted_ns: int = 0
@@ -51,6 +54,7 @@ class TrackSnapshot:
         if self.estimate is None:
             twin.initialiser = self.initialiser.copy()
             twin.phase_start = self.phase_start.copy()
+            twin.pose_wait = replace(self.pose_wait)
         else:
             twin.estimate = self.estimate.copy()
         twin.nis_window = self.nis_window.copy()

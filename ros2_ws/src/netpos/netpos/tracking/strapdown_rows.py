@@ -12,7 +12,7 @@ from netpos.filters.rows import UNCOUPLED, rsu_rows
 from netpos.filters.sensors.table import readings
 from netpos.filters.space import direction_rows, linearise_in_space, place_rows
 from netpos.messages.values import Array, Field, GroundSpeed, RsuMeasurement
-from netpos.tracking.epoch_rows import EpochRows
+from netpos.tracking.epoch_rows import EpochRows, reference_place, shared_references
 from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sequencer import Item
 
@@ -38,6 +38,7 @@ def epoch_rows_3d(
     """Rows of the items, one group each; biases heard for the first time are added to ``biases``
     (None: rows without)."""
     blocks = []
+    shared = shared_references(items)
     for group, item in enumerate(items):
         if isinstance(item, GroundSpeed):
             value, variance = np.array([item.speed_mps]), np.array([item.speed_var])
@@ -47,8 +48,14 @@ def epoch_rows_3d(
         if item.fields & _SCALARS:
             rsu = rsus[item.rsu_id]
             scalars = replace(item, fields=item.fields & _SCALARS)
-            coupling = UNCOUPLED if biases is None else biases.coupling(rsu, scalars)
-            blocks.append(rsu_rows(scalars, rsu.info, rsu.axes, group, coupling))
+            coupling = (
+                UNCOUPLED
+                if biases is None
+                else biases.coupling(rsu, scalars, item.reference_rsu_id in shared)
+            )
+            reference = reference_place(scalars, rsus)
+            block = rsu_rows(scalars, rsu.info, rsu.axes, group, coupling, reference=reference)
+            blocks.append(block)
         if item.fields & Field.POSITION:
             blocks.append(place_rows(item.position, item.position_cov, item.lever_arm, group))
     return EpochRows(np.vstack(blocks), tuple(items))

@@ -76,10 +76,12 @@ class StrapdownStart:
     config: TrackerConfig
     _fixes: deque[_Fix] = field(default_factory=deque)
     _tried_ns: int = 0
+    missing: str = "no epoch gives a position yet: angles and times of two RSUs, or four times"
+    """What a start lacks, for people."""
 
     def copy(self) -> StrapdownStart:
         """An independent copy."""
-        return StrapdownStart(self.config, self._fixes.copy(), self._tried_ns)
+        return StrapdownStart(self.config, self._fixes.copy(), self._tried_ns, self.missing)
 
     def add_rows(self, stamp_ns: int, rows: Array, lever: Array) -> None:
         """Take the fix of one epoch of RSU rows, where they give one; without the station that
@@ -98,14 +100,20 @@ class StrapdownStart:
         """Stamp, navigation state (NAV,) and covariance (ERR, ERR) at the newest fix; None while
         they are not known well enough."""
         if len(self._fixes) < 3:
+            if self._fixes:
+                self.missing = f"{len(self._fixes)} of 3 positions heard"
             return None
         fixes = list(self._fixes)
         begin, end = fixes[0].stamp_ns, fixes[-1].stamp_ns
-        if end - begin < _SPAN_MIN_NS or end - self._tried_ns < _ATTEMPT_NS:
+        if end - begin < _SPAN_MIN_NS:
+            self.missing = f"positions over {_SPAN_MIN_NS / _NS:g} s are needed"
+            return None
+        if end - self._tried_ns < _ATTEMPT_NS:
             return None
         self._tried_ns = end
         stamps, rates = imu.between(begin, end)
         if len(stamps) < 2 or stamps[0] - begin > _NS / 10 or end - stamps[-1] > _NS / 10:
+            self.missing = "no IMU samples, or with holes, while positions were heard"
             return None
         at = (np.array([fix.stamp_ns for fix in fixes]) - begin) / _NS
         way = way_of((stamps - begin) / _NS, rates, at)
@@ -114,10 +122,17 @@ class StrapdownStart:
         cov[:, :2, :2] += self._drift_var(at[-1] - at, position)[:, None, None] * np.eye(2)
         course = fit_course(way, position[:, :2], cov[:, :2, :2])
         if course is None or course.misfit > _MISFIT_MAX:
+            self.missing = "the way by the IMU and the positions do not fit each other"
             return None
         heading_sd = math.sqrt(course.cov[2, 2])
         position_sd = math.sqrt(max(course.cov[0, 0], course.cov[1, 1]))
-        if heading_sd > _HEADING_SD_MAX or position_sd > self.config.initial_position_sd_max_m:
+        limit_m = self.config.initial_position_sd_max_m
+        if heading_sd > _HEADING_SD_MAX or position_sd > limit_m:
+            self.missing = (
+                f"heading sd {math.degrees(heading_sd):.0f} deg (needed: below "
+                f"{math.degrees(_HEADING_SD_MAX):.0f}), position sd {position_sd:.1f} m (needed: "
+                f"below {limit_m:g}); the device must move"
+            )
             return None
         weight = 1.0 / cov[:, 2, 2]
         height = float(position[:, 2] @ weight / weight.sum())

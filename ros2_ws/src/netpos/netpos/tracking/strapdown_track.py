@@ -22,7 +22,7 @@ from netpos.filters.space import place_rows
 from netpos.filters.space_conditioning import reweight_3d
 from netpos.filters.state import ERR_BIASES, ERR_CLOCK_DRIFT, NAV_CLOCK_DRIFT, POSITION
 from netpos.inertial.strapdown import ERR, NAV
-from netpos.messages.values import Array, InitialPose, Odometry, RsuMeasurement
+from netpos.messages.values import Array, InitialPose, Odometry, RsuMeasurement, TrackStatus
 from netpos.tracking import output
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import EpochRows, mostly_accepted
@@ -32,8 +32,16 @@ from netpos.tracking.history import History, merge
 from netpos.tracking.models import gate_thresholds, robust_options_of
 from netpos.tracking.nlos_rate import NlosRate
 from netpos.tracking.observations import FittedEpoch
+from netpos.tracking.pose_wait import PoseWait
 from netpos.tracking.protection import NisWindow, protection_level
-from netpos.tracking.report import EpochResult, EstimateStatus, TrackOutput, total, track_status
+from netpos.tracking.report import (
+    EpochResult,
+    EstimateStatus,
+    TrackOutput,
+    total,
+    track_status,
+    waiting_output,
+)
 from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sequencer import Epoch, Item
 from netpos.tracking.strapdown_engine import compile_kernels
@@ -66,7 +74,7 @@ class _State:
     nlos_rate: NlosRate
     biases: BiasStates = field(default_factory=lambda: BiasStates(ERR_BIASES))
     estimate: _Estimate | None = None
-    posed: bool = False
+    pose_wait: PoseWait = field(default_factory=PoseWait)
     has_clock: bool = False
     nis_window: NisWindow = field(default_factory=NisWindow)
     rejected_in_row: int = 0
@@ -82,6 +90,7 @@ class _State:
             twin.estimate = self.estimate.copy()
         twin.biases = self.biases.copy()
         twin.nlos_rate = self.nlos_rate.copy()
+        twin.pose_wait = copy.copy(self.pose_wait)
         twin.nis_window = self.nis_window.copy()
         twin.rejected = self.rejected.copy()
         return twin
@@ -145,6 +154,21 @@ class StrapdownTrack:
         """Measurements refused at the door or rejected by the track, by reason."""
         return Counter(total(self.refused, self._state.rejected))
 
+    @property
+    def has_estimate(self) -> bool:
+        """Whether there was a first fix."""
+        return self._state.estimate is not None
+
+    def status_at(self, stamp_ns: int) -> TrackStatus:
+        """Status at a later instant, had nothing been heard until then; nothing changes."""
+        return self._between(stamp_ns).status
+
+    def waiting(self, stamp_ns: int, missing: str) -> TrackOutput:
+        """What is told while there is no estimate, for want of ``missing``."""
+        return waiting_output(
+            self._config, self._vue_id, stamp_ns, self._state.accepted, self.rejected, missing
+        )
+
     def reset(self) -> None:
         """Forget the estimate and start anew; the counts go on."""
         self._history.clear()
@@ -155,6 +179,7 @@ class StrapdownTrack:
         old = self._state
         self._state = self._fresh()
         self._state.accepted, self._state.rejected = old.accepted, old.rejected
+        self._state.pose_wait.posed = old.pose_wait.posed
 
     def step(self, epoch: Epoch) -> TrackOutput:
         """Apply one epoch and report; one without items is only reported of."""
@@ -290,13 +315,13 @@ class StrapdownTrack:
 
     def _start_from_pose(self, stamp_ns: int, pose: InitialPose) -> None:
         self._forget()
-        self._state.posed = True
+        self._state.pose_wait.posed = True
         cov = pose.cov + np.diag([0.0, 0.0, _POSE_VAR_MIN if pose.cov[2, 2] == 0.0 else 0.0])
         self._state.start.add_fix(stamp_ns, pose.position.copy(), cov, np.zeros(3))
 
     def _try_start(self, stamp_ns: int, epoch_rows: EpochRows) -> tuple[str, ...]:
         state = self._state
-        if self._config.require_initial_pose and not state.posed and not state.accepted:
+        if state.pose_wait.at(self._config, stamp_ns, tracked=state.accepted > 0):
             state.rejected["no_initial_pose"] += len(epoch_rows.items)
             return ()
         rsus = [item for item in epoch_rows.items if isinstance(item, RsuMeasurement)]
@@ -315,6 +340,11 @@ class StrapdownTrack:
         if self.recorder is not None:
             self.recorder.begin(stamp_ns, state.estimate.nav, state.estimate.cov)
         return self._note_accepted(stamp_ns, epoch_rows, np.ones(len(epoch_rows.items)))
+
+    def _missing(self) -> str:
+        """What is missing for a start."""
+        state = self._state
+        return state.pose_wait.missing(self._config, self._vue_id, state.start.missing)
 
     def _set_clock(self, estimate: _Estimate, rows: Array) -> None:
         """Read the clock's offset off one time of arrival: the place is in the start already."""
@@ -393,6 +423,12 @@ class StrapdownTrack:
             epoch,
             state.accepted,
             total(self.refused, state.rejected),
-            EstimateStatus(heard_ns=heard_ns, position_sd_m=position_sd, level_m=level),
+            EstimateStatus(
+                heard_ns=heard_ns,
+                missing=self._missing(),
+                position_sd_m=position_sd,
+                level_m=level,
+                refused_in_row=state.rejected_in_row,
+            ),
         )
         return TrackOutput(odometry, clock, status)

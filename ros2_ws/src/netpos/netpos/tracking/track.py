@@ -10,8 +10,16 @@ from dataclasses import replace
 import numpy as np
 
 from netpos.filters.measurement import VARIANCE
-from netpos.filters.state import N_CORE
-from netpos.messages.values import Array, InitialPose, Odometry, RsuMeasurement, Velocity
+from netpos.filters.state import N_CORE, POSITION, VELOCITY
+from netpos.messages.values import (
+    Array,
+    InitialPose,
+    Odometry,
+    RsuErrors,
+    RsuMeasurement,
+    TrackStatus,
+    Velocity,
+)
 from netpos.tracking import estimates, output
 from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
 from netpos.tracking.config import TrackerConfig
@@ -34,15 +42,24 @@ from netpos.tracking.health import RsuHealth
 from netpos.tracking.history import History, merge
 from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser, with_heading
+from netpos.tracking.learning import LearnedErrors
 from netpos.tracking.models import heading_index, initial_extra_sd, options_of, pose_state
 from netpos.tracking.networks.secondary import Secondary
 from netpos.tracking.nlos_rate import NlosRate
 from netpos.tracking.observations import FittedEpoch
 from netpos.tracking.phase_start import PhaseStart, corrections, with_sectors
 from netpos.tracking.protection import FusedEpoch
-from netpos.tracking.report import EpochResult, EstimateStatus, TrackOutput, total, track_status
+from netpos.tracking.report import (
+    EpochResult,
+    EstimateStatus,
+    TrackOutput,
+    total,
+    track_status,
+    waiting_output,
+)
 from netpos.tracking.rsus import BiasStates, Rsu
 from netpos.tracking.sequencer import Epoch, Item
+from netpos.tracking.shared_errors import SharedErrors
 from netpos.tracking.smoothing import FixedLag, Posterior, Smoother
 from netpos.tracking.snapshot import TrackSnapshot
 
@@ -60,11 +77,13 @@ class Track:
         config: TrackerConfig,
         rsus: Mapping[str, Rsu],
         health: RsuHealth | None = None,
+        shared: SharedErrors | None = None,
     ) -> None:
         self._vue_id = vue_id
         self._config = config
         self._rsus = rsus
         self._health = health or RsuHealth()
+        self._shared, self._lives = shared, 0
         self._options = options_of(config)
         self._gate = self._options.gate_nis
         self._extra_sd = initial_extra_sd(config)
@@ -78,11 +97,19 @@ class Track:
         self.imu = ImuBuffer()
         self.refused: Counter[str] = Counter()
         """Measurements refused at the door, by reason."""
+        self._errors: tuple[RsuErrors, ...] = ()
         self._state = self._fresh()
 
     def _fresh(self) -> TrackSnapshot:
+        self._lives += 1
         return TrackSnapshot(
-            BiasStates(N_CORE + self._extra_sd.size, self._config.step_errors),
+            BiasStates(
+                N_CORE + self._extra_sd.size,
+                self._config.step_errors,
+                LearnedErrors(self._shared, (self._vue_id, self._lives))
+                if self._config.learn_errors
+                else None,
+            ),
             Initialiser(self._config),
             NlosRate.of(self._config),
             PhaseStart(self._config),
@@ -93,6 +120,26 @@ class Track:
     def rejected(self) -> Counter[str]:
         """Measurements refused at the door or rejected by the track, by reason."""
         return Counter(total(self.refused, self._state.rejected))
+
+    @property
+    def has_estimate(self) -> bool:
+        """Whether there was a first fix."""
+        return self._state.estimate is not None
+
+    def status_at(self, stamp_ns: int) -> TrackStatus:
+        """Status at a later instant, had nothing been heard until then; nothing changes."""
+        kept = self._state
+        self._state = kept.copy()
+        try:
+            return self._report(EpochResult(stamp_ns)).status
+        finally:
+            self._state = kept
+
+    def waiting(self, stamp_ns: int, missing: str) -> TrackOutput:
+        """What is told while there is no estimate, for want of ``missing``."""
+        return waiting_output(
+            self._config, self._vue_id, stamp_ns, self._state.accepted, self.rejected, missing
+        )
 
     def reset(self) -> None:
         """Forget the estimate and start anew; the counts of accepted and rejected measurements go
@@ -106,10 +153,12 @@ class Track:
         self._state = self._fresh()
         self._state.accepted, self._state.rejected = old.accepted, old.rejected
         self._state.segment = old.segment + 1
+        self._state.pose_wait.posed = old.pose_wait.posed
 
     def step(self, epoch: Epoch) -> TrackOutput:
         """Apply one epoch and report."""
         self._history.remember(epoch, self._state)
+        self._errors = ()
         items: list[Source] = []
         for item in epoch.sorted():
             if isinstance(item, InitialPose):
@@ -157,12 +206,16 @@ class Track:
         self._state = state or self._state
         made = [merge(epochs, stamp_ns, item) for stamp_ns, item in late]
         self._health.rewind(self._vue_id, epochs[0].stamp_ns)
+        if self._shared is not None:
+            self._shared.rewind(self._vue_id, epochs[0].stamp_ns)
         smoothed: list[Odometry] = []
+        errors: tuple[RsuErrors, ...] = ()
         for epoch in epochs:
             result = self.step(epoch)
             smoothed += result.smoothed
+            errors = result.errors or errors
         new = [epoch for epoch in made if epoch is not None]
-        return new, replace(result, revised=True, smoothed=tuple(smoothed))
+        return new, replace(result, revised=True, smoothed=tuple(smoothed), errors=errors)
 
     def _apply(self, stamp_ns: int, items: list[Source]) -> EpochResult:
         epoch_rows = self._epoch_rows(items)
@@ -186,23 +239,25 @@ class Track:
         inflation = velocity_inflation(
             items, self._state.velocity_ns, self._config.velocity_correlation_s
         )
+        version = biases.version
         epoch_rows = epoch_rows_of(items, self._rsus, biases, self._heading, inflation)
-        if len(biases.sd) > self._state.bias.shape[1]:
+        if biases.version != version:
             self._state.bias = biases.arrays()
         return epoch_rows
 
     def _start_from_pose(self, stamp_ns: int, pose: InitialPose) -> None:
         self._forget()
+        self._state.pose_wait.posed = True
         mean, cov = pose_state(self._config, pose.position[:2], pose.cov[:2, :2])
         if self._heading >= 0:
-            self._state.pose = (mean, cov)  # the first antennas tell the heading
+            self._state.pose = stamp_ns, mean, cov  # the first antennas tell the heading
             return
         self._state.estimate = estimates.start(self._config, stamp_ns, mean, cov)
         self._state.last_accepted_ns = stamp_ns
 
     def _try_first_fix(self, stamp_ns: int, epoch_rows: EpochRows) -> tuple[str, ...]:
         state = self._state
-        if self._config.require_initial_pose and not state.accepted and state.pose is None:
+        if state.pose_wait.at(self._config, stamp_ns, tracked=state.accepted > 0):
             state.rejected["no_initial_pose"] += len(epoch_rows.items)
             return ()
         heard = tuple(
@@ -212,7 +267,7 @@ class Track:
         if state.phase_start.heard(epoch_rows):
             state.estimate = state.phase_start.add(stamp_ns, epoch_rows.rows, bias_var)
             return self._note_accepted(stamp_ns, epoch_rows) if state.estimate is not None else ()
-        solution = state.pose
+        solution = self._pose_at(stamp_ns)
         if solution is None:
             state.initialiser.add(stamp_ns, epoch_rows.rows, bias_var, heard)
             solution = state.initialiser.solve()
@@ -224,10 +279,32 @@ class Track:
             solution = with_heading(*solution, rows, self._config.device_height_m)
             if solution is None:
                 state.rejected["heading_open"] += len(epoch_rows.items)
+                state.initialiser.missing = (
+                    "the heading of the body is open: measure two of its antennas, apart by their"
+                    " lever arms"
+                )
                 return ()
         state.estimate = estimates.start(self._config, stamp_ns, *solution)
         state.has_clock = epoch_rows.has_time
         return self._note_accepted(stamp_ns, epoch_rows)
+
+    def _pose_at(self, stamp_ns: int) -> tuple[Array, Array] | None:
+        """The initial pose that waits for its heading, for a device that has moved since; None
+        where it is older than the longest gap."""
+        if self._state.pose is None:
+            return None
+        given_ns, mean, cov = self._state.pose
+        age_s = (stamp_ns - given_ns) * 1e-9
+        if age_s > self._config.max_gap_s:
+            return None
+        moved = cov.copy()
+        moved[POSITION, POSITION] += age_s**2 * cov[VELOCITY, VELOCITY]
+        return mean, moved
+
+    def _missing(self) -> str:
+        """What is missing for a first fix."""
+        state = self._state
+        return state.pose_wait.missing(self._config, self._vue_id, state.initialiser.missing)
 
     def _update(self, stamp_ns: int, epoch_rows: EpochRows) -> EpochResult:
         state = self._state
@@ -256,12 +333,30 @@ class Track:
             state.rejected["diverged"] += 1
             self._forget()
             return EpochResult(stamp_ns)
+        self._learn(stamp_ns, epoch_rows.rows, flags)
         refused = accepted.count(0.0)
         if refused:
             state.rejected["gate"] += refused
         sources = self._note_accepted(stamp_ns, epoch_rows, accepted) if dof > 0 else ()
         self._count_rejected(not refused or mostly_accepted(epoch_rows, accepted))
         return EpochResult(stamp_ns, nis, dof, sources)
+
+    def _learn(self, stamp_ns: int, rows: Array, accepted: Array) -> None:
+        """Learn the errors of the RSUs from an epoch."""
+        state = self._state
+        estimate = state.estimate
+        if state.biases.learned is None or estimate is None or estimate.modes:
+            return
+        height_m = self._config.device_height_m
+        posterior = (estimate.mean, estimate.cov)
+        concluded, changes = state.biases.learn(stamp_ns, (rows, accepted), posterior, height_m)
+        for change in changes:
+            estimate.change_prior(*change)
+        state.bias = state.biases.arrays()
+        if concluded:
+            self._errors = state.biases.errors(
+                concluded, estimate.mean, estimate.cov, stamp_ns, self._vue_id
+            )
 
     def _count_rejected(self, accepted: bool) -> None:
         """Count the epochs in a row that did not fit; too many, and the track is lost."""
@@ -368,7 +463,8 @@ class Track:
         state, config = self._state, self._config
         estimate, rejected = state.estimate, total(self.refused, state.rejected)
         if estimate is None:
-            status = track_status(config, self._vue_id, epoch, state.accepted, rejected)
+            open_ = EstimateStatus(missing=self._missing())
+            status = track_status(config, self._vue_id, epoch, state.accepted, rejected, open_)
             return TrackOutput(None, None, status, network=config.network)
         mean, cov = estimate.mean, estimate.cov
         odometry, clock, state.yaw, sd_m, radius_m = output.describe(
@@ -387,6 +483,7 @@ class Track:
             level_m=self._level(epoch.stamp_ns, estimate, radius_m),
             modes=estimate.modes,
             steps=state.biases.step_calibration(mean, cov) if self._calibrates_steps else None,
+            refused_in_row=state.rejected_in_row,
         )
         status = track_status(config, self._vue_id, epoch, state.accepted, rejected, known)
         track = None
@@ -398,6 +495,7 @@ class Track:
             status,
             network=config.network,
             track=track,
+            errors=self._errors,
         )
 
     def _level(self, stamp_ns: int, estimate: Estimate, radius_m: float) -> float:

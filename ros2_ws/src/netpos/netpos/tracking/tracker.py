@@ -3,30 +3,40 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from netpos.messages.topics import is_vue_id
 from netpos.messages.values import (
     Field,
     GroundSpeed,
     ImuSample,
     InitialPose,
     Odometry,
+    RsuErrors,
     RsuInfo,
     RsuMeasurement,
+    TrackState,
+    TrackStatus,
     Velocity,
 )
-from netpos.tracking import validation
+from netpos.tracking import diagnosis, validation
+from netpos.tracking.clocks import Clocks, Stranger
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.diagnosis import Finding
 from netpos.tracking.health import HealthConfig, RsuHealth, RsuReport
+from netpos.tracking.refusals import Refusals
 from netpos.tracking.report import TrackOutput
-from netpos.tracking.rsus import Rsu
+from netpos.tracking.rsus import REFERENCED, Rsu
 from netpos.tracking.sequencer import IMU, Epoch, Item, Sequencer
+from netpos.tracking.shared_errors import SharedErrors
 from netpos.tracking.smoothing import check_smoothable
 from netpos.tracking.track import Track
 
 _PHASE = int(Field.PHASE)  # a plain integer: arithmetic of flags costs ten times as much
+_OLD_POSE_NS = 1_000_000_000
+_TELL_EVERY = 10  # refused items of a device without an estimate
 
 if TYPE_CHECKING:
     from netpos.tracking.strapdown_track import StrapdownTrack
@@ -52,9 +62,15 @@ class Tracker:
         self._rsus: dict[str, Rsu] = {}
         self._tracks: dict[str, Track | StrapdownTrack] = {}
         self._sequencers: dict[str, Sequencer] = {}
+        self._clocks: dict[str, Clocks] = {}  # of devices whose time was set back
         settle_s = max(2.0, self._config.history_s + 1.0)
         self._health = RsuHealth(HealthConfig(settle_s=settle_s))
+        self._shared = SharedErrors(settle_s) if self._config.learn_errors else None
         self._touched: set[str] = set()
+        self._untold: dict[str, int] = {}  # stamps of refusals to be told
+        self._errors: dict[str, RsuErrors] = {}  # the newest by RSU
+        self.refusals = Refusals()
+        """What was refused at the door, by device and RSU."""
         self.enabled = True
 
     @property
@@ -71,7 +87,9 @@ class Tracker:
         """Make an RSU known or replace it. Raises ``ValueError`` for an unsound description."""
         fault = validation.rsu_fault(info)
         if fault is not None:
+            self.refusals.refuse_description(info.rsu_id, fault)
             raise ValueError(f"RSU refused: {fault}")
+        self.refusals.take_description(info.rsu_id)
         self._rsus[info.rsu_id] = Rsu.of(info)
 
     def add(self, item: Item | ImuSample) -> str | None:
@@ -86,14 +104,30 @@ class Tracker:
         if reason is None:
             sequencer = self._sequencers.get(item.vue_id) or self._sequencer(item.vue_id)
             reason = sequencer.add(item)
+            for refused, why in sequencer.take_refused():
+                self._refuse(refused, why)
+            if reason is None and self.refusals.any:
+                self.refusals.take(item)
             if sequencer.set_back:
                 self.reset(item.vue_id)
             elif sequencer.idle:
                 return None
         self._touched.add(item.vue_id)
         if reason is not None:
-            self.track(item.vue_id).refused[reason] += 1
+            self._refuse(item, reason)
         return reason
+
+    def _refuse(self, item: Item | ImuSample, reason: str) -> None:
+        """Count what is refused, and tell of it where nothing else is told of the device."""
+        track = self.track(item.vue_id)
+        counted = f"imu_{reason}" if isinstance(item, ImuSample) else reason
+        track.refused[counted] += 1
+        sequencer = self._sequencers.get(item.vue_id)
+        newest_ns = sequencer.newest_ns if sequencer is not None else 0
+        self.refusals.refuse(item, reason, newest_ns)
+        due = track.refused.total() % _TELL_EVERY == 1 and not track.has_estimate
+        if due and is_vue_id(item.vue_id):
+            self._untold[item.vue_id] = newest_ns or max(item.stamp_ns, 0)
 
     def concerns(self, measurement: RsuMeasurement) -> bool:
         """Whether a measurement is for this tracker: one of a network leaves those of RSUs it
@@ -111,11 +145,11 @@ class Tracker:
         track = self.track(sample.vue_id)
         if reason is None:
             reason = track.imu.add(sample)
+        self._touched.add(sample.vue_id)
         if reason is None:
             self._sequencer(sample.vue_id).mark(IMU, sample.stamp_ns)
-            self._touched.add(sample.vue_id)
         else:
-            track.refused[f"imu_{reason}"] += 1
+            self._refuse(sample, reason)
         return reason
 
     def process(self) -> list[TrackOutput]:
@@ -134,13 +168,54 @@ class Tracker:
         back."""
         if vue_id is None:
             self._health.reset()
+            if self._shared is not None:
+                self._shared.clear()
         for name in [vue_id] if vue_id is not None else list(self._tracks):
-            self._sequencers.pop(name, None)
+            dropped = self._sequencers.pop(name, None)
+            if dropped is not None and dropped.set_back:
+                self._clocks[name] = dropped.clocks
             self.track(name).reset()
 
     def rejected(self) -> dict[str, Counter[str]]:
         """Refused and rejected measurements by device and reason."""
         return {vue: track.rejected for vue, track in self._tracks.items()}
+
+    def strangers(self) -> dict[str, dict[str, Stranger]]:
+        """By device: sources whose clocks are not those of the others."""
+        found = {vue: s.clocks.strangers() for vue, s in self._sequencers.items()}
+        return {vue: strangers for vue, strangers in found.items() if strangers}
+
+    def findings(
+        self,
+        statuses: Mapping[str, TrackStatus],
+        silent_s: Mapping[str, float],
+        unheard_s: float = 0.0,
+        warnings: Sequence[str] = (),
+    ) -> list[Finding]:
+        """What an operator is told: the newest status by device, seconds for which nothing was
+        told of a device, and of any (``unheard_s``); what is wrong with the input as a whole."""
+        refused, descriptions = self.refusals, self.refusals.descriptions()
+        strangers = {rsu: s for found in self.strangers().values() for rsu, s in found.items()}
+        doors = refused.devices()
+        devices = [
+            diagnosis.of_device(status, doors.get(vue), silent_s.get(vue, 0.0))
+            for vue, status in statuses.items()
+        ]
+        reports = self.rsu_reports(unheard_s)
+        return [
+            *devices,
+            diagnosis.of_network(self.rsu_count, descriptions, warnings),
+            *diagnosis.of_rsus(reports, refused.rsus(), descriptions, strangers, self._errors),
+        ]
+
+    def coasting(self, vue_id: str, stamp_ns: int) -> TrackOutput | None:
+        """Status of a device as of a later instant, until which nothing was heard of it; None
+        unless it is COASTING then."""
+        track = self._tracks.get(vue_id)
+        status = track.status_at(stamp_ns) if track is not None and track.has_estimate else None
+        if status is None or status.state is not TrackState.COASTING:
+            return None
+        return TrackOutput(None, None, status, network=self._config.network)
 
     def smoothed(self) -> dict[str, list[Odometry]]:
         """Odometry of every epoch given all measurements, by device; of a tracker that keeps
@@ -158,24 +233,40 @@ class Tracker:
         outputs: list[TrackOutput] = []
         for vue in vue_ids:
             sequencer = self._sequencers.get(vue)
-            if sequencer is None:
-                continue
-            late = sequencer.take_late()
-            epochs = take(sequencer)
-            if not (late or epochs):
-                continue
-            track = self._tracks[vue]
-            if late:
-                new, revised = track.revise(late)
-                for epoch in new:
-                    sequencer.applied(epoch)
-                if not epochs:
-                    outputs.append(revised)
-            for epoch in epochs:
-                said = track.step(epoch)
-                # Before a first fix there is nothing to tell of between epochs.
-                if epoch.items or said.odometry:
-                    outputs.append(said)
+            told = self._step(sequencer, self._tracks[vue], take) if sequencer is not None else []
+            outputs += told
+            for output in told:
+                for errors in output.errors:
+                    self._errors[errors.rsu_id] = errors
+            refused_ns = self._untold.pop(vue, None) if self._untold else None
+            if refused_ns is not None and not told:
+                words = self.refusals.of_device(vue).words()
+                outputs.append(self.track(vue).waiting(refused_ns, words))
+        return outputs
+
+    def _step(
+        self,
+        sequencer: Sequencer,
+        track: Track | StrapdownTrack,
+        take: Callable[[Sequencer], list[Epoch]],
+    ) -> list[TrackOutput]:
+        """Apply the epochs of one device that ``take`` takes, and what came late."""
+        outputs: list[TrackOutput] = []
+        late = sequencer.take_late()
+        epochs = take(sequencer)
+        if late:
+            new, revised = track.revise(late)
+            for epoch in new:
+                sequencer.applied(epoch)
+            if not epochs:
+                outputs.append(revised)
+        for epoch in epochs:
+            said = track.step(epoch)
+            # Before a first fix there is nothing to tell of between epochs, nor of a pose that was
+            # given before this tracker came.
+            old_pose = epoch.only_a_pose() and sequencer.newest_ns > epoch.stamp_ns + _OLD_POSE_NS
+            if (epoch.items and not old_pose) or (said.odometry and not epoch.items):
+                outputs.append(said)
         return outputs
 
     def _fault(self, item: Item) -> str | None:
@@ -189,6 +280,11 @@ class Tracker:
                 rsu = self._rsus.get(item.rsu_id)
                 if rsu is None:
                     return "unknown_rsu"
+                if int(item.fields) & REFERENCED:
+                    other = self._rsus.get(item.reference_rsu_id)
+                    fault = validation.difference_fault(item, rsu, other)
+                    if fault is not None:
+                        return fault
                 return rsu.phase_fault() if int(item.fields) & _PHASE else None
             case Velocity():
                 return validation.velocity_fault(item)
@@ -208,6 +304,7 @@ class Tracker:
                 int(self._config.history_s * 1e9),
                 int(self._config.max_future_s * 1e9),
                 tick_ns=round(1e9 / rate_hz) if rate_hz > 0.0 else 0,
+                clocks=self._clocks.pop(vue_id, None),
             )
         return self._sequencers[vue_id]
 
@@ -218,7 +315,7 @@ class Tracker:
                 vue_id, self._config, self._rsus, self._health, record=self._keep_posteriors
             )
         elif vue_id not in self._tracks:
-            track = Track(vue_id, self._config, self._rsus, self._health)
+            track = Track(vue_id, self._config, self._rsus, self._health, self._shared)
             track.posteriors = [] if self._keep_posteriors else None
             self._tracks[vue_id] = track
         return self._tracks[vue_id]

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netpos.filters.factor import eigenvalues
+from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.filters.rows import rsu_axes
 from netpos.filters.sensors.model import Reading, Refusal
 from netpos.filters.sensors.table import readings
@@ -25,6 +26,7 @@ from netpos.messages.values import (
     RsuMeasurement,
     Velocity,
 )
+from netpos.tracking.rsus import REFERENCED, Rsu
 
 # Plain integers: arithmetic of flags costs ten times as much
 _READINGS = {int(reading.field): reading for _, reading in reversed(readings())}
@@ -37,6 +39,7 @@ _TILT_MAX = 0.05  # of the baseline: the first fix takes two antennas for level
 _BASELINE_MAX = 50.0  # wavelengths: each takes two hypotheses
 # Variances (m, rad, m/s) beyond which double precision cannot fuse with metres.
 _VAR_MIN, _VAR_MAX = 1e-6**2, 1e6**2
+_FAR_SD = 10.0  # of a time difference, beyond the distance of its RSUs
 _ASYMMETRY_MAX = 1e-6  # relative
 _CONDITION_MIN = 1e-12  # smallest over largest eigenvalue; below it a Cholesky factor is rounding
 
@@ -77,6 +80,8 @@ def measurement_fault(m: RsuMeasurement) -> str | None:
             return "variance"
     if m.lever_arm != _NO_LEVER and not all(abs(arm) < _LEVER_ARM_MAX_M for arm in m.lever_arm):
         return "lever_arm"
+    if fields & REFERENCED and m.reference_rsu_id in ("", m.rsu_id):
+        return "no_reference"
     for value_of, refusal in checks.values:
         if refusal.is_bad(value_of(m)):
             return refusal.reason
@@ -108,6 +113,16 @@ def explanation(m: RsuMeasurement, reason: str) -> str:
 
 def _var_limits(reading: Reading, variance: float) -> bool:
     return _variance_in_range(reading.scale * reading.scale * variance)
+
+
+def difference_fault(m: RsuMeasurement, rsu: Rsu, reference: Rsu | None) -> str | None:
+    """Reason to refuse a time difference between two RSUs."""
+    if reference is None:
+        return "unknown_reference"
+    between = float(np.linalg.norm(reference.info.position - rsu.info.position))
+    spread = _FAR_SD * math.sqrt(m.tdoa_var) * SPEED_OF_LIGHT_MPS
+    reach = between + rsu.info.baseline_m + reference.info.baseline_m + spread
+    return "tdoa_too_large" if abs(m.tdoa_s) * SPEED_OF_LIGHT_MPS > reach else None
 
 
 def velocity_fault(v: Velocity) -> str | None:

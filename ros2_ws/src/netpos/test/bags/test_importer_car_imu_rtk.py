@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from netpos.bags import BagError, BagReader, codec
-from netpos.bags.importers.car_imu_rtk import CLOCK_OFFSET_S, load_car_drive, truth_of
+from netpos.bags.importers.car_imu_rtk import MOUNT as CAR
+from netpos.bags.importers.car_imu_rtk import load_car_drive, truth_of
 from netpos.bags.importers.common import recordings
 from netpos.scenario.recorded_drive import import_car_drive, station_drive
 from scipy.spatial.transform import Rotation
@@ -50,7 +51,7 @@ def write(folder: Path, *, imu: str | None = None, pos: str | None = None) -> Pa
 def test_a_recording_read_back(tmp_path: Path) -> None:
     drive = load_car_drive(write(tmp_path / "run"))
     assert len(drive.imu_ns) == SECONDS * 100 + 1  # all but the cut line
-    assert drive.imu_ns[0] == START_S * 10**9 + round((0.25 + CLOCK_OFFSET_S) * 1e9)
+    assert drive.imu_ns[0] == START_S * 10**9 + round((0.25 + CAR.clock_offset_s) * 1e9)
     assert drive.imu_ns[-1] - drive.imu_ns[0] == SECONDS * 10**9
     np.testing.assert_allclose(drive.rates, [[0, 0, 0.1, 0.5, 0.2, 9.80665]] * len(drive.rates),
                                atol=1e-6)  # fmt: skip

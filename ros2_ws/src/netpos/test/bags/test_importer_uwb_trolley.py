@@ -13,7 +13,8 @@ import pytest
 from imported_bag import values
 from netpos.bags import BagError, BagReader
 from netpos.bags.importers import import_uwb_trolley
-from netpos.bags.importers.uwb_trolley import ERRORS, TAGS_M
+from netpos.bags.importers.common import UWB_DATA_SHEET
+from netpos.bags.importers.uwb_trolley import TAGS_M
 from netpos.messages.values import Field, Odometry
 from netpos.tracking import TrackerConfig
 from netpos.tracking.settings import bag_settings
@@ -22,6 +23,7 @@ DATA = Path(os.environ.get("NETPOS_DATA", Path(__file__).parents[6] / "shared" /
 DISTANCES = [round(2.0 + 0.1 * link, 1) for link in range(24)]
 FIRST = "2022-08-15 9:42:24.766," + ",".join(map(str, DISTANCES))
 SECOND = "2022-08-15 9:42:24.775," + ",".join(map(str, DISTANCES[:21])) + ",,,"
+SHORT = FIRST.replace("24.766", "24.770").replace(",2.3,", ",")
 UWB = f"{FIRST}\n{SECOND}\n"
 # north at 1 m/s; heading 170 deg, then 190 deg, then 210 deg
 TRUTH_TIMES = ("9:42:24.700", "9:42:24.700", "9:42:24.720", "9:42:24.800", "9:42:24.900")
@@ -69,7 +71,7 @@ def test_links_and_ranges_by_hand(tmp_path: Path) -> None:
     assert {m.expected for m in second.values()} == {21}
     assert not {"a7_t0", "a7_t1", "a7_t2"} & second.keys()
     assert first["a3_t2"].fields == Field.RANGE
-    assert first["a3_t2"].range_var == ERRORS.range_sd_m**2
+    assert first["a3_t2"].range_var == UWB_DATA_SHEET.range_sd_m**2
     np.testing.assert_array_equal(first["a3_t2"].lever_arm, [0.2034, 0.1451, -0.0008])
 
 
@@ -102,10 +104,10 @@ def test_tracker_parameters_are_in_the_bag(tmp_path: Path) -> None:
         (UWB.replace(",2.3,", ",x,"), MOTION, "line 1: distance a1-t0 'x' is not a number"),
         (UWB.replace(",2.3,", ",nan,"), MOTION, "line 1: distance a1-t0 is nan, not finite"),
         (UWB.replace(",2.3,", ",-2.3,"), MOTION, "a1-t0 -2.3 m is not positive"),
-        (UWB.replace(",2.3,", ","), MOTION, "line 1: 24 fields, 25 expected"),
+        (f"{FIRST}\n{SHORT}\n{SECOND}\n", MOTION, "line 2: 24 fields, 25 expected"),
         (UWB.replace("24.775", "24.766"), MOTION, "line 2: time does not increase"),
         (UWB.replace("9:42:24.775", "noon"), MOTION, "line 2: time '2022-08-15 noon' is not like"),
-        (UWB, MOTION.replace("9:42:24.9", "9:42:23.9"), "line 6: time decreases"),
+        (UWB, MOTION.replace("9:42:24.9", "9:42:23.9") + "\n", "line 6: time decreases"),
         (UWB, MOTION.replace(",0.1,", ",inf,"), "line 5: y is inf"),
         (UWB, "\n".join(MOTION.split("\n")[:3]), "shorter than 0.1 s"),
         ("", MOTION, "holds no data"),

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from imported_bag import values
-from netpos.bags import BagError
+from netpos.bags import BagError, BagReader
 from netpos.bags.importers import import_ble_aoa, import_uwb_anchors
 from netpos.bags.importers.common import truth_of_poses
 from netpos.messages.values import Array, Field, Odometry
@@ -53,6 +53,45 @@ def uwb_folder(path: Path, anchor: str = ANCHOR, track: str = TRACK) -> Path:
     (path / "A3.csv").write_text(anchor)
     (path / "trajectory.csv").write_text(track)
     return path
+
+
+@pytest.mark.parametrize(
+    ("beacons", "truth"),
+    [
+        (BEACONS + "1400,8401,-6", TRUTH),  # the last line was cut
+        (BEACONS + "1400,8401,-60,10,0,-75,38,65", TRUTH),  # within its last field
+        ("0,0,-75,38,6503\n" + BEACONS, TRUTH),  # the first was
+        (BEACONS, TRUTH + "19"),
+    ],
+)
+def test_a_cut_first_or_last_line_is_skipped_and_counted(
+    tmp_path: Path, beacons: str, truth: str
+) -> None:
+    counts = import_ble_aoa(ble_folder(tmp_path / "ble", beacons, truth), tmp_path / "bag")
+    whole = {"/rsu/info": 4, "/rsu/measurements": 3, "/vue_1/ground_truth": 9}
+    assert counts == {**whole, "cut lines skipped": 1}
+
+
+def test_ble_as_published(tmp_path: Path) -> None:
+    for kind, name, text in (("beacons", "beacons", BEACONS), ("gt", "gt", TRUTH)):
+        for run in (1, 2):
+            folder = tmp_path / "mobility" / kind / "use-case 1"
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / f"{name}_mobility_use-case1_run{run}.txt").write_text(text)
+    counts = import_ble_aoa(tmp_path / "mobility", tmp_path / "bag", run="uc1_run2")
+    assert counts == {"/rsu/info": 4, "/rsu/measurements": 3, "/vue_1/ground_truth": 9}
+    with BagReader(tmp_path / "bag") as bag:
+        assert bag.metadata["source"] == "ble-aoa uc1_run2"
+    with pytest.raises(BagError, match="holds the runs uc1_run1, uc1_run2; choose one"):
+        import_ble_aoa(tmp_path, tmp_path / "other")
+
+
+def test_a_power_that_is_not_finite_is_not_measured(tmp_path: Path) -> None:
+    folder = uwb_folder(tmp_path / "uwb", ANCHOR.replace("-79.25", "-inf"))
+    counts = import_uwb_anchors(folder, tmp_path / "bag")
+    assert counts["RSSI not finite, taken as not measured"] == 1
+    _, measured, _ = values(tmp_path / "bag")
+    assert [m.rssi_dbm for m in measured] == [-79.5, 0.0]
 
 
 def test_ble_by_hand(tmp_path: Path) -> None:
@@ -133,7 +172,7 @@ def test_a_heading_that_passes_180_degrees_does_not_spin() -> None:
         (BEACONS.replace("-45", "181"), TRUTH, "line 1: azimuth 181.0 deg is outside"),
         (BEACONS.replace("1300,8401", "1300,8402"), TRUTH, "line 3: tag 8402"),
         (BEACONS.replace("1300", "-1"), TRUTH, "line 3: time -1 is negative"),
-        (BEACONS.replace("6503", "6502"), TRUTH, "measures twice at stamp 1000000000"),
+        (BEACONS.replace("6503", "6502"), TRUTH, "measures vue_1 twice at stamp 1000000000"),
         ("", TRUTH, "holds no data"),
         (BEACONS, TRUTH.replace("1400", "1200"), r"truth_uc1_run1.csv, line 3: time does not"),
         (BEACONS, "1,NaN,1,1\n", "holds one corner"),

@@ -25,14 +25,14 @@ def netpos() -> Netpos:
     return call
 
 
-def record(path: Path, *, truth: bool = True) -> Path:
+def record(path: Path, *, truth: bool = True, estimates: bool = True) -> Path:
     """3 s eastwards at 1 m/s; every estimate 0.25 m too far north."""
     convert = codec()
     with BagWriter(path) as bag:
         for k in range(31):
             stamp = 1_000_000_000 + k * 100_000_000
             for name, north in (("ground_truth", 0.0), ("odometry", 0.25)):
-                if name == "ground_truth" and not truth:
+                if not (truth if name == "ground_truth" else estimates):
                     continue
                 pose = Odometry(
                     stamp_ns=stamp,
@@ -53,6 +53,11 @@ def bag(tmp_path: Path) -> Path:
 @pytest.fixture
 def blind_bag(tmp_path: Path) -> Path:
     return record(tmp_path / "blind", truth=False)
+
+
+@pytest.fixture
+def raw_bag(tmp_path: Path) -> Path:
+    return record(tmp_path / "raw", estimates=False)
 
 
 @pytest.fixture

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,6 +15,7 @@ from pathlib import Path
 import pytest
 from netpos.bags import BagReader
 from netpos.cli.runs import parse_setting
+from netpos.scenario.load import scenario_files
 from typer.testing import Result
 
 Netpos = Callable[..., Result]
@@ -24,11 +28,12 @@ DESIGN_KEYS = {
 }  # fmt: skip
 
 
-def assert_refused(result: Result, *words: str) -> None:
-    """Status 2 and one sentence on stderr that says these words; no traceback."""
+def assert_refused(result: Result, *words: str, several: bool = False) -> None:
+    """Status 2 and one sentence on stderr that says these words, or ``several``, a line each; no
+    traceback."""
     assert result.exit_code == 2, result.output
-    assert result.stderr.startswith("netpos: ")
-    assert result.stderr.count("\n") == 1
+    assert all(line.startswith("netpos: ") for line in result.stderr.splitlines())
+    assert (result.stderr.count("\n") > 1) is several
     assert "Traceback" not in result.output
     for word in words:
         assert word in result.stderr
@@ -73,8 +78,33 @@ def test_a_cut_off_bag_names_its_remedy(netpos: Netpos, cut_bag: Path) -> None:
     assert_refused(netpos("evaluate", cut_bag), f"netpos recover {cut_bag}")
 
 
-def test_a_bag_without_ground_truth(netpos: Netpos, blind_bag: Path) -> None:
-    assert_refused(netpos("evaluate", blind_bag), "blind is a bag without ground truth")
+def test_a_bag_without_ground_truth_tells_of_itself(
+    netpos: Netpos, blind_bag: Path, tmp_path: Path
+) -> None:
+    drawn, figures = tmp_path / "map.png", tmp_path / "figures.json"
+    result = netpos("evaluate", blind_bag, "--map", drawn, "--json", figures)
+    assert result.exit_code == 0, result.output
+    assert "No ground truth" in result.stdout
+    assert "protection level" in result.stdout
+    assert max(map(len, result.stdout.splitlines())) <= 80
+    assert drawn.read_bytes().startswith(b"\x89PNG")
+    said = json.loads(figures.read_text())
+    assert said["ground_truth"] is False
+    assert said["vues"]["vue_1"]["estimates"] > 0
+
+
+@pytest.mark.parametrize("option", ["--errors", "--bounds"])
+def test_a_picture_of_errors_needs_ground_truth(
+    netpos: Netpos, blind_bag: Path, tmp_path: Path, option: str
+) -> None:
+    result = netpos("evaluate", blind_bag, option, tmp_path / "x.png")
+    assert_refused(result, "needs ground truth")
+
+
+def test_a_picture_never_goes_into_a_recording(netpos: Netpos, bag: Path) -> None:
+    result = netpos("evaluate", bag, "--map", bag / "map.png")
+    assert_refused(result, "would lie in a recording")
+    assert not (bag / "map.png").exists()
 
 
 def test_a_folder_that_is_no_bag(netpos: Netpos, tmp_path: Path) -> None:
@@ -102,6 +132,25 @@ def test_scenarios_lists_those_that_load(netpos: Netpos) -> None:
     assert "metis_madrid" in result.stdout
 
 
+def test_wrong_parameters_of_a_tracker_are_told_before_anything_is_simulated(
+    netpos: Netpos, tmp_path: Path
+) -> None:
+    text = scenario_files()["fast_pass"].read_text()
+    assert "tracker:\n" in text
+    wrong = "tracker:\n  hold: 1.0\n  gate_probability: 1.5\n"
+    file = tmp_path / "wrong.yaml"
+    file.write_text(text.replace("tracker:\n", wrong))
+    line = text[: text.index("tracker:")].count("\n") + 2
+    result = netpos("run", file, "--offline", "--bag", tmp_path / "b")
+    assert result.exit_code == 2
+    first, second = result.stderr.splitlines()
+    where = f"netpos: {file}: line"
+    unknown = "unknown tracker parameter 'hold'; did you mean hold_s?"
+    assert first == f"{where} {line}: tracker.hold: {unknown}"
+    assert second.startswith(f"{where} {line + 1}: tracker.gate_probability: gate_prob")
+    assert not (tmp_path / "b").exists()
+
+
 def test_an_unknown_scenario(netpos: Netpos, tmp_path: Path) -> None:
     result = netpos("run", "atlantis", "--offline", "--bag", tmp_path / "b")
     assert_refused(result, "atlantis", "metis_madrid")
@@ -122,7 +171,7 @@ def test_a_malformed_scenario(
     file = tmp_path / "broken.yaml"
     file.write_text(text)
     result = netpos("run", file, "--offline", "--bag", tmp_path / "b")
-    assert_refused(result, "broken.yaml", *words)
+    assert_refused(result, "broken.yaml", *words, several="sped" in words)
 
 
 @pytest.mark.parametrize("mode", [(), ("--offline",)])
@@ -271,20 +320,31 @@ def test_report_is_one_file_that_needs_no_network(
 
 
 def test_report_says_which_bags_it_leaves_out(
+    netpos: Netpos, bag: Path, raw_bag: Path, tmp_path: Path
+) -> None:
+    result = netpos("report", tmp_path, "--out", tmp_path / "r.html")
+    assert result.exit_code == 0, result.output
+    assert "raw has no estimates" in result.stderr
+    assert "1 of 2 bags" in result.stdout
+    assert "raw has no estimates" in (tmp_path / "r.html").read_text()
+
+
+def test_report_of_a_bag_without_ground_truth(
     netpos: Netpos, bag: Path, blind_bag: Path, tmp_path: Path
 ) -> None:
     result = netpos("report", tmp_path, "--out", tmp_path / "r.html")
     assert result.exit_code == 0, result.output
-    assert "blind is a bag without ground truth" in result.stderr
-    assert "1 of 2 bags" in result.stdout
-    assert "blind is a bag without ground truth" in (tmp_path / "r.html").read_text()
+    assert "2 of 2 bags" in result.stdout
+    page = (tmp_path / "r.html").read_text()
+    assert "blind (no ground truth)" in page
+    assert "measured minus where the track is" in page
 
 
 def test_report_of_a_bag_that_cannot_be_scored(
-    netpos: Netpos, blind_bag: Path, tmp_path: Path
+    netpos: Netpos, raw_bag: Path, tmp_path: Path
 ) -> None:
-    result = netpos("report", blind_bag, "--out", tmp_path / "r.html")
-    assert_refused(result, "blind is a bag without ground truth")
+    result = netpos("report", raw_bag, "--out", tmp_path / "r.html")
+    assert_refused(result, "raw has no estimates")
 
 
 def test_report_of_nothing(netpos: Netpos, tmp_path: Path) -> None:
@@ -311,3 +371,79 @@ def test_help_loads_nothing_heavy() -> None:
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+def own_recording(folder: Path) -> tuple[str, ...]:
+    """Arguments that import a small recording of three anchors: at (0, 0), (8, 0) and (0, 8)."""
+    (folder / "rsus.yaml").write_text("rsus: {a: [0, 0, 0], b: [8, 0, 0], c: [0, 8, 0]}\n")
+    lines, poses = ["t,a,b,c"], []
+    for i in range(300):
+        t, x, y = 10 + i / 10, 3 + math.sin(i / 40), 3 + math.cos(i / 40)
+        ranges = (math.hypot(x, y), math.hypot(x - 8, y), math.hypot(x, y - 8))
+        lines.append(",".join(f"{value:.4f}" for value in (t, *ranges)))
+        poses.append(f"{t} {x} {y} 0 0 0 0 1")
+    (folder / "own.csv").write_text("\n".join([*lines, "99,1"]))
+    (folder / "walk.tum").write_text("\n".join(poses) + "\n")
+    return (
+        *("import", "csv", str(folder / "own.csv"), str(folder / "bag")),
+        *("--map", "time=t,range:a=a,range:b=b,range:c=c", "--sd", "range=0.05"),
+        *("--rsus", str(folder / "rsus.yaml"), "--truth", str(folder / "walk.tum")),
+    )
+
+
+def test_an_own_recording_is_imported_tracked_and_scored(netpos: Netpos, tmp_path: Path) -> None:
+    imported = netpos(*own_recording(tmp_path), "--truth-align", "shift", "--device-height", "0")
+    assert imported.exit_code == 0, imported.output
+    assert "cut first or last lines: 1" in imported.stdout
+    assert netpos("replay", tmp_path / "bag", "--out", tmp_path / "out").exit_code == 0
+    scored = netpos("evaluate", tmp_path / "out", "--json", tmp_path / "out.json")
+    assert scored.exit_code == 0, scored.output
+    text = " ".join(scored.stdout.split())
+    assert "truth aligned to the measurements: turned 0.00 deg" in text
+    assert "skipped on import: cut first or last lines 1" in text
+    figures = json.loads((tmp_path / "out.json").read_text())
+    assert figures["vues"]["vue_1"]["rmse_m"] < 0.1
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (("--truth-align", "rigidly"), "give none, shift or rigid"),
+        (("--truth-time-offset", "soon"), "give seconds or auto"),
+        (("--lever-arm", "1,2"), "takes three numbers"),
+        (("--delimiter", "dot"), "give one of comma"),
+        (("--set", "device_hight_m=1"), "device_height_m"),
+    ],
+)
+def test_an_own_recording_with_a_bad_option(
+    netpos: Netpos, tmp_path: Path, extra: tuple[str, ...], message: str
+) -> None:
+    assert_refused(netpos(*own_recording(tmp_path), *extra), message)
+    assert not (tmp_path / "bag").exists()
+
+
+def test_the_documented_program_writes_a_bag_that_is_tracked(
+    netpos: Netpos, tmp_path: Path
+) -> None:
+    page = Path(__file__).parents[5] / "docs" / "own_recording.md"
+    (program,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    assert len(program.splitlines()) <= 35
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    result = netpos("replay", tmp_path / "my_walk", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "600 epochs" in result.stdout
+
+
+def test_compare_says_which_is_better(netpos: Netpos, bag: Path, tmp_path: Path) -> None:
+    shutil.copytree(bag, tmp_path / "other")
+    figures = tmp_path / "d.json"
+    result = netpos("compare", bag, tmp_path / "other", "--skip", 0, "--json", figures)
+    assert result.exit_code == 0, result.output
+    assert "vue_1: other and walk are not told apart: +0.000 m" in result.stdout
+    assert max(map(len, result.stdout.splitlines())) <= 80
+    (difference,) = json.loads(figures.read_text())["differences"]
+    assert difference["difference_m"] == 0.0
+    assert_refused(netpos("compare", bag), "two bags or more")

@@ -65,7 +65,7 @@ def test_ctrl_c_is_one_word(netpos: Netpos, bag: Path, monkeypatch: Any) -> None
     def interrupted(*_: Any, **__: Any) -> SimpleNamespace:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("netpos.evaluation.evaluate_bag", interrupted)
+    monkeypatch.setattr("netpos.evaluation.assess_bag", interrupted)
     result = netpos("evaluate", bag)
     assert result.exit_code == 130
     assert result.stderr == "netpos: interrupted\n"

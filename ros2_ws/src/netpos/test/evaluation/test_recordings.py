@@ -105,8 +105,9 @@ def test_the_script_writes_one_row_per_recording(data: Path, tmp_path: Path) -> 
     (row,) = found["rows"]
     assert row["name"] == "uwb_LOS"
     assert row["reference"] == 0.5
-    assert set(row) == {"name", "reference", "snapshot", "plain_ekf", "ours", "defaults", "wall_s"}
-    for name in ("plain_ekf", "ours", "defaults"):
+    figures = {"snapshot", "plain_ekf", "ours", "declared", "learned", "defaults"}
+    assert set(row) == {"name", "reference", *figures, "wall_s"}
+    for name in figures - {"snapshot"}:
         assert 0.0 < row[name]["rmse_m"] < 0.3, name
         assert row[name]["nis_expected"] > 0.9
         low, high = row[name]["nees_bounds"]
@@ -115,7 +116,7 @@ def test_the_script_writes_one_row_per_recording(data: Path, tmp_path: Path) -> 
     assert row["snapshot"]["rmse_m"] == pytest.approx(0.45, abs=0.1)
     assert row["ours"]["n"] == row["plain_ekf"]["n"]
     assert "ble_uc3_run1" in found["absent"]
-    assert "uwb_tdoa" in found["absent"]
+    assert "uwb_tdoa (planar)" in found["absent"]
     assert "| uwb_LOS | 0.500 |" in run.stdout
     assert (out / "uwb_LOS" / "metadata.yaml").exists()
     again = subprocess.run([*script, *options], capture_output=True, text=True, check=False)

@@ -128,7 +128,7 @@ def test_rows_are_put_where_they_belong() -> None:
     m.lever_arm = (0.1, -0.2, 0.3)
     rows = np.full((12, ROW_WIDTH), np.nan)
     axes = rsu_axes(info)
-    end = put_measurement(rows, 3, m, False, rsu_place(info, axes), 2, 6)
+    end = put_measurement(rows, 3, m, (False, rsu_place(info, axes), None), 2, 6)
     assert end == 9
     assert np.isnan(rows[:3]).all()
     assert np.isnan(rows[end:]).all()

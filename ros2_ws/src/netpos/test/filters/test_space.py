@@ -18,7 +18,7 @@ from netpos.filters.measurement import (
     VALUE,
     Kind,
 )
-from netpos.filters.rows import rsu_axes, rsu_rows
+from netpos.filters.rows import rsu_axes, rsu_place, rsu_rows
 from netpos.filters.space import (
     bend_variance,
     direction_rows,
@@ -33,6 +33,9 @@ from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMe
 from scipy.spatial.transform import Rotation
 
 LEVER_ARM = (0.4, -0.3, 1.2)
+QUANTITIES = Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE | Field.PHASE | Field.TDOA
+OTHER = RsuInfo(rsu_id="b", position=np.array([-10.0, 25.0, 3.0]))
+REFERENCE = rsu_place(OTHER, rsu_axes(OTHER))
 
 
 def state(rng: np.random.Generator) -> Array:
@@ -59,7 +62,7 @@ def all_rows(rng: np.random.Generator) -> Array:
             stamp_ns=1,
             rsu_id="a",
             vue_id="v",
-            fields=Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE | Field.PHASE,
+            fields=QUANTITIES,
             azimuth_rad=3.0,
             azimuth_var=0.01,
             elevation_rad=0.3,
@@ -69,10 +72,11 @@ def all_rows(rng: np.random.Generator) -> Array:
             range_m=30.0,
             range_var=1.0,
             phase_difference_var=1.0,
+            tdoa_var=1e-18,
             lever_arm=LEVER_ARM,
         )
-        blocks.append(rsu_rows(m, info, rsu_axes(info), 0))
-    unwrapped = blocks[0][-1:].copy()
+        blocks.append(rsu_rows(m, info, rsu_axes(info), 0, reference=REFERENCE))
+    unwrapped = blocks[0][blocks[0][:, KIND] == Kind.PHASE].copy()
     unwrapped[:, KIND] = Kind.UNWRAPPED_PHASE
     blocks.append(unwrapped)
     A = rng.normal(size=(3, 3))
@@ -157,6 +161,7 @@ def test_values_are_those_of_the_geometry() -> None:
             Kind.COSINE_Z: u[2] / r,
             Kind.PHASE: row[10:13] @ d / r,
             Kind.UNWRAPPED_PHASE: row[10:13] @ d / r,
+            Kind.TDOA: r - math.dist(d, row[10:13]),
             Kind.PLACE: row[ORIGIN : ORIGIN + 3] @ antenna,
             Kind.BODY_VELOCITY: row[ORIGIN : ORIGIN + 3] @ body,
             Kind.BODY_RATE: row[ORIGIN : ORIGIN + 3] @ nav[GYRO_BIAS:],

@@ -289,6 +289,7 @@ def test_types_are_flattened_to_their_fields() -> None:
         "d[]",
         "d[]",
         "d[]",
+        "string",
     ]
     with pytest.raises(BagError, match="transforms cannot be laid out"):
         list(flat_items("tf2_msgs/msg/TFMessage"))

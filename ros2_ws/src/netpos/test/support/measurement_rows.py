@@ -63,5 +63,6 @@ def closed_form(row: Array, x: Array, height_m: float) -> float:
         Kind.COSINE_Z: lambda: uz / r,
         Kind.PHASE: lambda: ux / r,  # an array of one radian along the x axis
         Kind.UNWRAPPED_PHASE: lambda: ux / r,
+        Kind.TDOA: lambda: r - float(np.linalg.norm(d - row[AXES : AXES + 3])),  # reference: there
     }[Kind(int(row[KIND]))]()
     return float(value) + x[6] + x[8]

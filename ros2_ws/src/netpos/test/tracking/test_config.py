@@ -64,7 +64,12 @@ def test_mapping_takes_what_yaml_writes() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"hold": 1.0}, "unknown tracker parameter 'hold'; the parameters are filter, "),
+        ({"hold": 1.0}, r"unknown tracker parameter 'hold'; did you mean hold_s\?$"),
+        (
+            {"hold": 1.0, "filter": "ekf", "device_hight_m": 1.0},
+            r"^unknown .* 'hold'; .*\nunknown .* 'device_hight_m'; did you mean device_height_m",
+        ),
+        ({"xyzzy": 1.0}, "unknown tracker parameter 'xyzzy'$"),
         ({"hold_s": "soon"}, "hold_s must be of type float, got 'soon'"),
         ({"hold_s": None}, "hold_s must be of type float, got None"),
         ({"require_initial_pose": 2}, "require_initial_pose must be true or false, got 2"),

@@ -39,8 +39,8 @@ def biased(rsu_id: str = "a", **change: object) -> Rsu:
     return Rsu.of(info(rsu_id, **(values | change)))
 
 
-def measured(fields: Field = ALL, stamp_ns: int = 1) -> RsuMeasurement:
-    return RsuMeasurement(stamp_ns=stamp_ns, rsu_id="a", vue_id="v", fields=fields)
+def measured(fields: Field = ALL, stamp_ns: int = 1, rsu_id: str = "a") -> RsuMeasurement:
+    return RsuMeasurement(stamp_ns=stamp_ns, rsu_id=rsu_id, vue_id="v", fields=fields)
 
 
 def test_bias_sd_by_kind() -> None:
@@ -54,6 +54,7 @@ def test_bias_sd_by_kind() -> None:
         Kind.RANGE: 0.3,
         Kind.PHASE: 0.0,
         Kind.UNWRAPPED_PHASE: 0.0,
+        Kind.TDOA: pytest.approx(0.3 * math.sqrt(2.0)),  # of two RSUs
     }
 
 
@@ -99,7 +100,8 @@ def test_every_biased_quantity_has_its_own_state_once() -> None:
     assert states.sd == [0.01, 0.02, 0.3, 0.3]
     assert states.tau_s == [50.0] * 4
     assert states.coupling(biased(), measured()).bias == first.bias
-    other = states.coupling(biased("b", bias_correlation_time_s=9.0), measured(Field.RANGE))
+    b = biased("b", bias_correlation_time_s=9.0)
+    other = states.coupling(b, measured(Field.RANGE, rsu_id="b"))
     assert other.bias == {Kind.RANGE: 10}
     assert states.tau_s[4] == 9.0
     assert first.common == {}

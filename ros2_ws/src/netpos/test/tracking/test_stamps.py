@@ -43,30 +43,42 @@ def test_one_stamp_far_in_the_future_counts_for_nothing(world: Any) -> None:
     tracker = ran(world, epochs(world, 10), max_future_s=60.0)
     before = state(tracker)
     (far,) = world.measure(0.9 + 60.0 + 1e-9, truth(1.0), names=["a"])
-    assert tracker.add(far) == "future_stamp"
+    assert tracker.add(far) is None  # it waits for a second voice
     assert tracker.process() == []
     assert state(tracker) == before
     (output,) = fed(tracker, world.measure(1.0, truth(1.0)))
     assert output.status.used == 3
-    assert output.status.rejected == {"future_stamp": 1}
-    # what came in between is no confirmation, nor is another time as far away again
-    (far,) = world.measure(70.0, truth(1.0), names=["a"])
+    assert output.status.rejected == {"clock_ahead": 1}
+    (again,) = world.measure(70.0, truth(1.0), names=["a"])
+    assert tracker.add(again) is None
+    assert [tracker.add(m) for m in world.measure(1.1, truth(1.1), names=["b", "c"])] == [None] * 2
+    assert tracker.add(again) == "clock_ahead"  # two contradict it
+
+
+def test_an_only_rsu_confirms_its_own_future(world: Any) -> None:
+    batches = [world.measure(0.1 * k, truth(0.1 * k), names=["a"]) for k in range(10)]
+    tracker = ran(world, batches, max_future_s=60.0)
+    (far,), (other,), (near,) = (
+        world.measure(t, truth(1.0), names=["a"]) for t in (70.0, 200.0, 200.1)
+    )
     assert tracker.add(far) == "future_stamp"
-    (later,) = world.measure(200.0, truth(1.0), names=["a"])
-    assert tracker.add(later) == "future_stamp"
+    assert tracker.add(other) == "future_stamp"  # as far away again: no confirmation
+    assert tracker.add(near) is None
+    tracker = ran(world, batches, max_future_s=60.0)
+    (limit,) = world.measure(0.9 + 60.0, truth(1.0), names=["a"])
+    assert tracker.add(limit) is None  # at the limit no confirmation is needed
 
 
-def test_a_second_stamp_confirms_the_future(world: Any) -> None:
+def test_a_second_voice_confirms_the_future(world: Any) -> None:
     tracker = ran(world, epochs(world, 10), max_future_s=60.0)
     far = world.measure(100.0, truth(1.0))
-    assert tracker.add(far[0]) == "future_stamp"
+    assert tracker.add(far[0]) is None
+    assert tracker.process() == []
     assert tracker.add(far[1]) is None
     assert tracker.add(far[2]) is None
     (output,) = tracker.process()
     assert output.status.stamp_ns == far[0].stamp_ns
-    (near,) = world.measure(0.9 + 60.0, truth(1.0), names=["a"])
-    tracker = ran(world, epochs(world, 10), max_future_s=60.0)
-    assert tracker.add(near) is None  # at the limit no confirmation is needed
+    assert output.status.rejected == {}
 
 
 @pytest.mark.parametrize("history_s", [0.0, 1.0])

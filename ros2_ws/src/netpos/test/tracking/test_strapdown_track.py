@@ -231,10 +231,11 @@ def test_a_lost_track_starts_anew(simulation: Simulation, items: list[Item]) -> 
 
 
 def test_a_required_pose_is_waited_for(simulation: Simulation, items: list[Item]) -> None:
-    tracker = tracker_of(simulation, require_initial_pose=True)
+    tracker = tracker_of(simulation, require_initial_pose=True, initial_pose_wait_s=1e3)
     outputs = run(tracker, items[: len(items) // 2])
     assert all(o.odometry is None for o in outputs)
     assert outputs[-1].status.rejected["no_initial_pose"] > 0
+    assert outputs[-1].status.reason.startswith("waits for a pose on /")
     tracker = tracker_of(simulation, require_initial_pose=True)
     position = np.array([*simulation.beacons(VUE).position[0]])
     pose = InitialPose(stamp_ns=NS, vue_id=VUE, position=position, cov=np.diag([1.0, 1.0, 0.0]))

@@ -88,7 +88,7 @@ REFUSED = [
     ("variance", good(range_var=-0.1)),
     ("zero_stamp", good(stamp_ns=0)),
     ("no_fields", good(fields=Field(0))),
-    ("unknown_fields", good(fields=Field(64 | 8))),
+    ("unknown_fields", good(fields=Field(128 | 8))),
     ("no_baseline", good(fields=Field.PHASE, phase_difference_var=0.1)),
     (
         "phase_not_wrapped",
@@ -114,7 +114,10 @@ def test_refused_with_its_reason_and_counted(world: Any, reason: str, item: Any)
     assert tracker.add(item) == reason
     assert tracker.add(item) == reason
     assert tracker.rejected() == {"vue_1": {reason: 2}}
-    assert tracker.process() == []
+    (told,) = tracker.process()
+    assert told.odometry is None
+    assert (told.status.state, told.status.rejected) == (TrackState.WAITING, {reason: 2})
+    assert told.status.reason.startswith(f"all refused: {reason}: ")
     assert tracker.flush() == []
 
 
@@ -373,7 +376,7 @@ def test_whatever_comes_nothing_raises_and_no_nan_leaves(config: Any, items: lis
         tracker.add_rsu(station(rsu_id))
     refused = 0
     for item in items:
-        refused += tracker.add(item) is not None
+        refused += tracker.add(item) not in (None, "clock_ahead")
         for output in tracker.process():
             assert all(np.isfinite(part).all() for part in numbers(output))
     for output in tracker.flush():
@@ -382,6 +385,6 @@ def test_whatever_comes_nothing_raises_and_no_nan_leaves(config: Any, items: lis
         n
         for counts in tracker.rejected().values()
         for reason, n in counts.items()
-        if reason not in ("gate", "track_lost", "no_initial_pose", "diverged")
+        if reason not in ("gate", "track_lost", "no_initial_pose", "diverged", "clock_ahead")
     )
     assert at_the_door == refused

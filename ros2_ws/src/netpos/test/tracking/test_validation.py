@@ -76,8 +76,8 @@ def test_vue_id(vue_id: str) -> None:
 
 def test_fields() -> None:
     assert measurement_fault(replace(GOOD, fields=Field(0))) == "no_fields"
-    assert measurement_fault(replace(GOOD, fields=Field(64))) == "unknown_fields"
-    assert measurement_fault(replace(GOOD, fields=GOOD.fields | Field(64))) == "unknown_fields"
+    assert measurement_fault(replace(GOOD, fields=Field(128))) == "unknown_fields"
+    assert measurement_fault(replace(GOOD, fields=GOOD.fields | Field(128))) == "unknown_fields"
     assert measurement_fault(replace(GOOD, fields=Field(2**31))) == "unknown_fields"
 
 

@@ -1,9 +1,11 @@
 """Bluetooth 5.1 arrays on four walls measure azimuth and elevation of a tag (Zenodo 7759557).
 
-A folder holds runs ``beacons_RUN.csv`` + ``truth_RUN.csv`` such as ``uc1_run1``. Beacon lines:
-epoch ms, tag, RSSI dBm, azimuth deg, elevation deg, RSSI of the second polarisation dBm, channel,
-anchor. Truth lines: epoch ms of arrival, epoch ms of departure, x cm, y cm at the corners of the
-walk; where the person does not stop, the departure is ``NaN``.
+A folder holds runs ``beacons_RUN.csv`` + ``truth_RUN.csv`` such as ``uc1_run1``, or they lie as
+published: ``mobility/beacons/use-case 1/beacons_mobility_use-case1_run1.txt`` and
+``mobility/gt/use-case 1/gt_mobility_use-case1_run1.txt`` (any of the folders may be given).
+Beacon lines: epoch ms, tag, RSSI dBm, azimuth deg, elevation deg, RSSI of the second polarisation
+dBm, channel, anchor. Truth lines: epoch ms of arrival, epoch ms of departure, x cm, y cm at the
+corners of the walk; where the person does not stop, the departure is ``NaN``.
 
 Signs. The authors count azimuth clockwise seen from above (bearing in the room = facing -
 azimuth), an RSU counter-clockwise: the sign turns. Azimuth is the angle to the array's own axis
@@ -16,15 +18,17 @@ the mean; with the sign turned they are 29 to 41 deg off.
 from __future__ import annotations
 
 import math
+import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from netpos.bags.errors import BagError
-from netpos.bags.importers.common import Row, read_rows, write_recording, yaw_quaternion
+from netpos.bags.importers.common import Row, read_rows, yaw_quaternion
+from netpos.bags.recording import write_bag
 from netpos.messages.values import AngleConvention, Array, Field, Odometry, RsuInfo, RsuMeasurement
 
 MS = 1_000_000
@@ -80,12 +84,12 @@ def import_ble_aoa(
 
     Parameters
     ----------
-    path : the folder, or one beacons_RUN.csv with its truth_RUN.csv beside it
+    path : the folder, or one file of beacons
     run : which run of a folder, such as ``uc1_run1``; may be left out where there is only one
 
     Returns
     -------
-    messages per topic
+    messages per topic, and how many values were skipped
 
     Raises
     ------
@@ -94,12 +98,35 @@ def import_ble_aoa(
     """
     errors = errors or ArrayErrors()
     beacons = _beacon_file(Path(path), run)
+    skipped: Counter[str] = Counter()
+    measurements = _measurements(beacons, vue_id, errors, skipped)
+    truth = _truth(_truth_file(beacons), vue_id, skipped)
+    counts = write_bag(
+        bag,
+        rsus=[_info(rsu_id, errors) for rsu_id in ARRAYS],
+        measurements=measurements,
+        truth=truth,
+        tracker=TRACKER,
+        metadata={"source": f"ble-aoa {_run_of(beacons)}"},
+    )
+    return {**counts, **skipped}
+
+
+def _run_of(beacons: Path) -> str:
+    """``uc1_run1`` of ``beacons_uc1_run1.csv`` and of ``beacons_mobility_use-case1_run1.txt``."""
+    name = beacons.stem.removeprefix("beacons_").removeprefix("mobility_")
+    return re.sub(r"^use-case\s*", "uc", name)
+
+
+def _truth_file(beacons: Path) -> Path:
     name = beacons.stem.removeprefix("beacons_")
-    measurements = _measurements(beacons, vue_id, errors)
-    truth = _truth(beacons.with_name(f"truth_{name}.csv"), vue_id)
-    infos = [_info(rsu_id, errors) for rsu_id in ARRAYS]
-    metadata = {"source": f"ble-aoa {name}", "tracker": yaml.safe_dump(TRACKER)}
-    return write_recording(bag, infos, measurements, truth, metadata)
+    published = [
+        Path(*("gt" if part == "beacons" else part for part in beacons.parent.parts))
+        / f"gt_{name}{beacons.suffix}",
+        beacons.with_name(f"gt_{name}{beacons.suffix}"),
+    ]
+    plain = beacons.with_name(f"truth_{name}.csv")
+    return next((file for file in published if file.is_file()), plain)
 
 
 def _beacon_file(path: Path, run: str | None) -> Path:
@@ -109,15 +136,15 @@ def _beacon_file(path: Path, run: str | None) -> Path:
         if not path.name.startswith("beacons_"):
             raise BagError(f"{path} is not named beacons_RUN.csv; give the folder or such a file")
         return path
-    files = sorted(path.glob("beacons_*.csv"))
-    names = [file.stem.removeprefix("beacons_") for file in files]
+    found = [file for file in path.rglob("beacons_*") if file.suffix in {".csv", ".txt"}]
+    files = {_run_of(file): file for file in sorted(found)}
     if not files:
         raise BagError(f"{path} holds no beacons_RUN.csv; give the folder of the recording")
     if run is None and len(files) > 1:
-        raise BagError(f"{path} holds the runs {', '.join(names)}; choose one with --run")
-    if run is not None and run not in names:
-        raise BagError(f"{path} has no run {run!r}; it holds {', '.join(names)}")
-    return files[0] if run is None else files[names.index(run)]
+        raise BagError(f"{path} holds the runs {', '.join(files)}; choose one with --run")
+    if run is not None and run not in files:
+        raise BagError(f"{path} has no run {run!r}; it holds {', '.join(files)}")
+    return files[run] if run is not None else next(iter(files.values()))
 
 
 def _info(rsu_id: str, errors: ArrayErrors) -> RsuInfo:
@@ -134,31 +161,36 @@ def _info(rsu_id: str, errors: ArrayErrors) -> RsuInfo:
     )
 
 
-def _measurements(file: Path, vue_id: str, errors: ArrayErrors) -> list[RsuMeasurement]:
+def _measurements(
+    file: Path, vue_id: str, errors: ArrayErrors, skipped: Counter[str]
+) -> list[RsuMeasurement]:
     measurements: list[RsuMeasurement] = []
     tag = ""
-    for row in read_rows(file, 8, header=False):
-        tag = tag or row.values[1]
-        if row.values[1] != tag:
-            raise row.error(f"tag {row.values[1]}, but the run is of tag {tag}")
-        if row.values[7] not in ARRAYS:
-            raise row.error(f"anchor {row.values[7]!r} is none of {', '.join(ARRAYS)}")
-        azimuth = -_angle(row, 3, "azimuth", 89.0)
-        elevation = _angle(row, 4, "elevation", 89.0)
-        measurements.append(
-            RsuMeasurement(
-                stamp_ns=row.integer(0, "time") * MS,
-                rsu_id=row.values[7],
-                vue_id=vue_id,
-                fields=Field.AZIMUTH | Field.ELEVATION,
-                rssi_dbm=row.number(2, "RSSI"),
-                azimuth_rad=azimuth,
-                azimuth_var=(errors.azimuth_cosine_sd / math.cos(azimuth)) ** 2,
-                elevation_rad=elevation,
-                elevation_var=(errors.elevation_cosine_sd / math.cos(elevation)) ** 2,
-            )
-        )
+    for row in read_rows(file, 8, skipped, header=False):
+        with row:
+            if tag and row.values[1] != tag:
+                raise row.error(f"tag {row.values[1]}, but the run is of tag {tag}")
+            measurements.append(_measured(row, vue_id, errors))
+            tag = row.values[1]
     return measurements
+
+
+def _measured(row: Row, vue_id: str, errors: ArrayErrors) -> RsuMeasurement:
+    if row.values[7] not in ARRAYS:
+        raise row.error(f"anchor {row.values[7]!r} is none of {', '.join(ARRAYS)}")
+    azimuth = -_angle(row, 3, "azimuth", 89.0)
+    elevation = _angle(row, 4, "elevation", 89.0)
+    return RsuMeasurement(
+        stamp_ns=row.integer(0, "time") * MS,
+        rsu_id=row.values[7],
+        vue_id=vue_id,
+        fields=Field.AZIMUTH | Field.ELEVATION,
+        rssi_dbm=row.rssi_dbm(2),
+        azimuth_rad=azimuth,
+        azimuth_var=(errors.azimuth_cosine_sd / math.cos(azimuth)) ** 2,
+        elevation_rad=elevation,
+        elevation_var=(errors.elevation_cosine_sd / math.cos(elevation)) ** 2,
+    )
 
 
 def _angle(row: Row, column: int, name: str, limit_deg: float) -> float:
@@ -168,22 +200,22 @@ def _angle(row: Row, column: int, name: str, limit_deg: float) -> float:
     return math.radians(degrees)
 
 
-def _truth(file: Path, vue_id: str) -> list[Odometry]:
+def _truth(file: Path, vue_id: str, skipped: Counter[str]) -> list[Odometry]:
     stamps: list[int] = []
     corners: list[list[float]] = []
-    for row in read_rows(file, 4, header=False):
-        stamp_ns = row.integer(0, "time") * MS
-        if stamps and stamp_ns <= stamps[-1]:
-            raise row.error("time does not increase")
-        corner = [row.number(2, "x") / 100, row.number(3, "y") / 100]
-        stamps.append(stamp_ns)
-        corners.append(corner)
-        if row.values[1].strip().lower() != "nan":
-            departure_ns = row.integer(1, "departure") * MS
-            if departure_ns <= stamp_ns:
-                raise row.error("the departure is not after the arrival")
-            stamps.append(departure_ns)
-            corners.append(corner)
+    for row in read_rows(file, 4, skipped, header=False):
+        with row:
+            stamp_ns = row.integer(0, "time") * MS
+            if stamps and stamp_ns <= stamps[-1]:
+                raise row.error("time does not increase")
+            corner = [row.number(2, "x") / 100, row.number(3, "y") / 100]
+            here = [stamp_ns]
+            if row.values[1].strip().lower() != "nan":
+                here.append(row.integer(1, "departure") * MS)
+                if here[1] <= stamp_ns:
+                    raise row.error("the departure is not after the arrival")
+            stamps += here
+            corners += [corner] * len(here)
     if len(stamps) < 2:
         raise BagError(f"{file} holds one corner; a walk needs two")
     return walk(np.array(stamps), np.array(corners), vue_id)

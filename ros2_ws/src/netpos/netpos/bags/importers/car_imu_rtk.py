@@ -3,7 +3,8 @@
 The folder holds ``imu_RUN.csv`` (accelerometer g x 3, gyro deg/s x 3, tick ms), its time tag of
 RTKLIB, ``imu_RUN.csv.tag`` (start of the file in GPST at byte 64, then pairs of milliseconds since
 then and bytes written), and ``gnss_RUN_sf.pos`` (RTKLIB solution). The last line of the IMU file
-is cut where the recorder stopped. Map is east-north-up from the first fixed position.
+is cut where the recorder stopped. How the IMU is mounted and how late its clock is belongs to one
+car, ``MOUNT``; another car gives its own. Map is east-north-up from the first fixed position.
 """
 
 from __future__ import annotations
@@ -26,13 +27,7 @@ from netpos.messages.values import Array, ImuSample, Odometry
 Stamps = NDArray[np.int64]
 
 NS = 1_000_000_000
-# How the sensor is mounted in the car: Euler angles, forward-right-down (the recording's notes).
-_MOUNT = Rotation.from_euler("ZYX", [185.35, -6.79, 180.0], degrees=True)
 _FRD_TO_FLU = np.array([1.0, -1.0, -1.0])
-LEVER_ARM_M = (0.0, 0.05, 0.0)
-"""From the IMU to the antenna in base_link (forward-left-up)."""
-CLOCK_OFFSET_S = -0.125
-"""Added to the time of an IMU sample."""
 _HEADER, _RECORD = 76, 8  # bytes of the tag file: up to the first record, and of each
 _FIXED = 1.0
 _MOVING_MPS = 1.0
@@ -53,12 +48,43 @@ TRACKER: dict[str, float | str | bool] = {
 }
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mount:
+    """How the IMU sits in a car.
+
+    attitude_deg : roll, pitch, yaw of the sensor against forward-right-down
+    lever_arm_m : from the IMU to the antenna, forward-left-up
+    clock_offset_s : added to the time of an IMU sample
+    """
+
+    attitude_deg: tuple[float, float, float]
+    lever_arm_m: tuple[float, float, float]
+    clock_offset_s: float
+
+    def __post_init__(self) -> None:
+        values = (*self.attitude_deg, *self.lever_arm_m, self.clock_offset_s)
+        if not all(math.isfinite(value) for value in values):
+            raise ValueError(f"the mount needs finite numbers, got {values}")
+
+    @property
+    def rotation(self) -> Rotation:
+        """From the axes of the sensor to forward-right-down of the car: its inverse."""
+        return Rotation.from_euler("ZYX", self.attitude_deg[::-1], degrees=True)
+
+
+MOUNT = Mount(
+    attitude_deg=(180.0, -6.79, 185.35), lever_arm_m=(0.0, 0.05, 0.0), clock_offset_s=-0.125
+)
+"""That of the car of run 1934, from the notes of the recording."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CarDrive:
     """The drive in base_link and map.
 
     imu_ns (n,), rates (n, 6) angular velocity rad/s and specific force m/s^2; rtk_ns (k,) and
-    antenna (k, 3) m of the fixed solutions; latitude_rad and height_m of the map's origin
+    antenna (k, 3) m of the fixed solutions; latitude_rad and height_m of the map's origin;
+    lever_arm_m from the IMU to the antenna
     """
 
     imu_ns: Stamps
@@ -67,6 +93,7 @@ class CarDrive:
     antenna: Array
     latitude_rad: float
     height_m: float
+    lever_arm_m: tuple[float, float, float]
 
     @property
     def tracker(self) -> dict[str, float | str | bool]:
@@ -76,8 +103,8 @@ class CarDrive:
         return {**TRACKER, "gravity_mps2": gravity, "latitude_deg": latitude_deg}
 
 
-def load_car_drive(path: Path) -> CarDrive:
-    """Read a recording.
+def load_car_drive(path: Path, mount: Mount = MOUNT) -> CarDrive:
+    """Read a recording of a car with the IMU mounted so.
 
     Raises
     ------
@@ -89,10 +116,10 @@ def load_car_drive(path: Path) -> CarDrive:
         raise BagError(f"{path} must be a folder with one imu_RUN.csv, it has {len(files)}")
     imu = files[0]
     run = imu.stem.removeprefix("imu_")
-    ticks_ms, rates = _imu(imu)
+    ticks_ms, rates = _imu(imu, mount.rotation)
     start_ns, length_ms = _tag(imu.with_name(imu.name + ".tag"))
     share = (ticks_ms - ticks_ms[0]) / (ticks_ms[-1] - ticks_ms[0])
-    offset_ns = round(CLOCK_OFFSET_S * NS)
+    offset_ns = round(mount.clock_offset_s * NS)
     imu_ns = start_ns + offset_ns + np.rint(share * (length_ms * 1e6)).astype(np.int64)
     rtk_ns, geodetic = _positions(path / f"gnss_{run}_sf.pos")
     return CarDrive(
@@ -102,10 +129,11 @@ def load_car_drive(path: Path) -> CarDrive:
         antenna=_to_map(geodetic),
         latitude_rad=float(geodetic[0, 0]),
         height_m=float(geodetic[0, 2]),
+        lever_arm_m=mount.lever_arm_m,
     )
 
 
-def _imu(file: Path) -> tuple[Array, Array]:
+def _imu(file: Path, mount: Rotation) -> tuple[Array, Array]:
     """Ticks (n,) ms and rates (n, 6) in base_link."""
     rows = []
     for number, line in enumerate(_lines(file)[:-1], start=1):  # the last may be cut
@@ -119,7 +147,7 @@ def _imu(file: Path) -> tuple[Array, Array]:
     table = np.array(rows).reshape(-1, 7)
     if len(table) < 2 or (np.diff(table[:, 6]) <= 0).any():
         raise BagError(f"{file}: ticks must increase; is it the file of one run?")
-    turn = _MOUNT.inv()
+    turn = mount.inv()
     force = turn.apply(table[:, :3] * GRAVITY_MPS2) * _FRD_TO_FLU
     rate = turn.apply(np.radians(table[:, 3:6])) * _FRD_TO_FLU
     return table[:, 6], np.hstack([rate, force])
@@ -201,7 +229,7 @@ def truth_of(drive: CarDrive, vue_id: str) -> list[Odometry]:
     yaw = np.unwrap(np.arctan2(velocity[moving, 1], velocity[moving, 0]))
     yaw = np.interp(np.arange(len(time)), moving, yaw)
     turn = Rotation.from_euler("z", yaw[:, None])
-    position = drive.antenna - turn.apply(LEVER_ARM_M)
+    position = drive.antenna - turn.apply(drive.lever_arm_m)
     in_body = turn.inv().apply(velocity)
     return [
         Odometry(

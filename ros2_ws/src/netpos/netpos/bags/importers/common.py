@@ -1,32 +1,53 @@
-"""What the importers share: strict CSV lines, beacons out of stamps, one merged bag."""
+"""What the importers share: strict CSV lines, error models, truth of poses."""
 
 from __future__ import annotations
 
 import csv
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import groupby
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
 import numpy as np
 
-import netpos
 from netpos.bags.errors import BagError
-from netpos.bags.types import codec
-from netpos.bags.writer import whole_bag
-from netpos.messages.topics import GROUND_TRUTH, IMU, RSU_INFO, RSU_MEASUREMENTS, of_vue
-from netpos.messages.values import Array, ImuSample, Odometry, RsuInfo, RsuMeasurement
+from netpos.messages.values import Array, Odometry, RsuInfo
+
+CUT_LINES = "cut lines skipped"
+UNKNOWN_RSSI = "RSSI not finite, taken as not measured"
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One line of a recording, able to say where it stands."""
+    """One line of a recording, able to say where it stands.
+
+    As a context (``with row:``) it skips and counts the last line of a file that ends within it,
+    where what is left cannot be understood.
+    """
 
     file: Path
     line: int
     values: Sequence[str]
+    skipped: Counter[str]
+    may_be_cut: bool = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> bool:
+        cut = self.may_be_cut and isinstance(error, BagError)
+        if cut:
+            self.skipped[CUT_LINES] += 1
+        return cut
 
     def error(self, problem: str) -> BagError:
         """The problem with file and line number."""
@@ -48,6 +69,17 @@ class Row:
         if value <= 0:
             raise self.error(f"{name} {value} m is not positive")
         return value
+
+    def rssi_dbm(self, column: int) -> float:
+        """A power in dBm; 0 (not measured), counted, where it is not finite."""
+        try:
+            value = float(self.values[column])
+        except ValueError:
+            raise self.error(f"RSSI {self.values[column]!r} is not a number") from None
+        if math.isfinite(value):
+            return value
+        self.skipped[UNKNOWN_RSSI] += 1
+        return 0.0
 
     def integer(self, column: int, name: str) -> int:
         """A whole number that is not negative; BagError otherwise."""
@@ -86,30 +118,58 @@ class RangeErrors:
         )
 
 
-def read_rows(file: Path, columns: int, *, header: bool) -> Iterator[Row]:
-    """Lines of a CSV file with exactly ``columns`` fields; empty lines are skipped.
+# A DW1000 radio: ranges within 10 cm, and an antenna delay that nobody has calibrated. What else
+# an anchor has is learned while tracking.
+UWB_DATA_SHEET = RangeErrors(
+    range_sd_m=0.1,
+    noise_correlation_time_s=0.0,
+    range_bias_sd_m=0.0,
+    bias_correlation_time_s=0.0,
+    common_range_bias_sd_m=0.15,
+    common_bias_correlation_time_s=60.0,
+)
+
+
+def read_rows(file: Path, columns: int, skipped: Counter[str], *, header: bool) -> Iterator[Row]:
+    """Lines of a CSV file with exactly ``columns`` fields; empty lines are skipped. A first or
+    last one that was cut is skipped and counted in ``skipped``.
 
     Raises
     ------
     BagError  no such file, not text, no data, or a line with other than ``columns`` fields
     """
-    if not file.is_file():
-        raise BagError(f"{file} does not exist; give the folder of the recording")
     found = False
-    try:
-        with file.open(newline="", encoding="utf-8") as stream:
-            for line, values in enumerate(csv.reader(stream), start=1):
-                if not values or (header and line == 1):
-                    continue
-                row = Row(file, line, values)
-                if len(values) != columns:
-                    raise row.error(f"{len(values)} fields, {columns} expected")
-                found = True
-                yield row
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise BagError(f"{file} is not a CSV text file ({error})") from error
+    for line, text, last in _lines(file):
+        values = next(csv.reader([text]), [])
+        if not values or (header and line == 1):
+            continue
+        first = line == 1 + header
+        row = Row(file, line, values, skipped, may_be_cut=last and not text.endswith("\n"))
+        if len(values) < columns and (first or last):
+            skipped[CUT_LINES] += 1
+            continue
+        if len(values) != columns:
+            raise row.error(f"{len(values)} fields, {columns} expected")
+        found = True
+        yield row
     if not found:
         raise BagError(f"{file} holds no data")
+
+
+def _lines(file: Path) -> Iterator[tuple[int, str, bool]]:
+    """Number and text of each line of a file, and whether it is the last."""
+    if not file.is_file():
+        raise BagError(f"{file} does not exist; give the folder of the recording")
+    try:
+        with file.open(newline="\n", encoding="utf-8") as stream:
+            line, text = 0, next(stream, "")
+            while text:
+                following = next(stream, "")
+                line += 1
+                yield line, text, not following
+                text = following
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise BagError(f"{file} is not a CSV text file ({error})") from error
 
 
 def recordings(name: str) -> Path | None:
@@ -150,53 +210,3 @@ def _moving(stamp_ns: int, vue_id: str, pose: Array, rate: Array) -> Odometry:
         ),
         angular_velocity=np.array([0.0, 0.0, rate[3]]),
     )
-
-
-def number_beacons(measurements: Sequence[RsuMeasurement]) -> list[RsuMeasurement]:
-    """In stamp order, with one sequence number per stamp and ``expected`` its RSUs.
-
-    The recordings carry no beacon number: measurements of one stamp are taken as one beacon.
-    """
-    ordered = sorted(measurements, key=lambda m: (m.stamp_ns, m.rsu_id))
-    numbered: list[RsuMeasurement] = []
-    for sequence, (stamp_ns, group) in enumerate(groupby(ordered, key=lambda m: m.stamp_ns)):
-        beacon = list(group)
-        names = [m.rsu_id for m in beacon]
-        if len(set(names)) != len(names):
-            raise BagError(f"an RSU of {', '.join(names)} measures twice at stamp {stamp_ns} ns")
-        numbered.extend(replace(m, sequence=sequence, expected=len(beacon)) for m in beacon)
-    return numbered
-
-
-def write_recording(
-    bag: Path,
-    infos: Sequence[RsuInfo],
-    measurements: Sequence[RsuMeasurement],
-    truth: Sequence[Odometry],
-    metadata: Mapping[str, str],
-    imu: Sequence[ImuSample] = (),
-) -> dict[str, int]:
-    """Write one bag in stamp order, /rsu/info first; messages per topic.
-
-    Raises
-    ------
-    FileExistsError  ``bag`` exists
-    """
-    messages = codec()
-    measurements = number_beacons(measurements)
-    stamps = [m.stamp_ns for m in measurements] + [t.stamp_ns for t in truth]
-    stamps += [s.stamp_ns for s in imu[:1]]
-    start_ns = min(stamps)
-    merged = [(m.stamp_ns, RSU_MEASUREMENTS, messages.measurement_to_msg(m)) for m in measurements]
-    merged += [
-        (t.stamp_ns, of_vue(t.vue_id, GROUND_TRUTH), messages.odometry_to_msg(t)) for t in truth
-    ]
-    merged += [(s.stamp_ns, of_vue(s.vue_id, IMU), messages.imu_to_msg(s)) for s in imu]
-    merged.sort(key=lambda item: item[0])
-    with whole_bag(bag, metadata={**metadata, "netpos_version": netpos.__version__}) as writer:
-        for info in infos:
-            message = messages.rsu_info_to_msg(replace(info, stamp_ns=start_ns))
-            writer.write(RSU_INFO, message, start_ns)
-        for stamp_ns, topic, message in merged:
-            writer.write(topic, message, stamp_ns)
-        return writer.counts

@@ -9,20 +9,21 @@ quaternion's columns the second and third are w and z. The time zone is unknown:
 from __future__ import annotations
 
 import math
+from collections import Counter
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from netpos.bags.errors import BagError
 from netpos.bags.importers.common import (
+    UWB_DATA_SHEET,
     RangeErrors,
     Row,
     read_rows,
     truth_of_poses,
-    write_recording,
 )
+from netpos.bags.recording import write_bag
 from netpos.messages.values import Field, Odometry, RsuInfo, RsuMeasurement
 
 ANCHORS_M = (
@@ -50,38 +51,23 @@ TRACKER = {
     "turn_rate_density": 1.0,
     "initial_speed_sd_mps": 1.0,
     "coverage_radius_m": 10.0,
+    "learn_errors": True,
 }
 _TRUTH_INTERVAL_NS = 50_000_000  # stamps jitter by milliseconds: no velocity from shorter ones
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-# Of one link, anchor to tag; found without the truth, from a fit of poses and one constant per
-# link to the distances alone. The constants are mostly the anchors' (mean 0.17 m, scatter 0.06 m,
-# of the tags of one anchor 0.03 m): the common bias is that of the links of one anchor and lasts.
-# The residuals (sd 0.07 m) have an autocorrelation of 0.62 after one sample, 0.47 after 0.1 s and
-# then 0.45 exp(-t / 1.6 s). The slow part and the links' own scatter are the own bias; the fast
-# part, 0.052 m, has a spectral density at 0 of about 0.05 to 0.1 s times its variance.
-ERRORS = RangeErrors(
-    range_sd_m=0.055,
-    noise_correlation_time_s=0.1,
-    range_bias_sd_m=0.05,
-    bias_correlation_time_s=2.0,
-    common_range_bias_sd_m=0.2,
-    common_bias_correlation_time_s=300.0,
-)
-
-
 def import_uwb_trolley(
-    path: Path, bag: Path, *, vue_id: str = "vue_1", errors: RangeErrors = ERRORS
+    path: Path, bag: Path, *, vue_id: str = "vue_1", errors: RangeErrors = UWB_DATA_SHEET
 ) -> dict[str, int]:
     """Write the recording as a bag: /rsu/info, /rsu/measurements, /VUE/ground_truth (20 Hz).
 
     Every link is an RSU of its own, ``a0_t0`` at the place of anchor 0 with the place of tag 0 as
-    lever arm. It has a bias of its own beside that of its anchor, which is its ``network``.
+    lever arm. The links of one anchor are its ``network``: they share its bias.
 
     Returns
     -------
-    messages per topic
+    messages per topic, and how many values were skipped
 
     Raises
     ------
@@ -91,10 +77,18 @@ def import_uwb_trolley(
     path = Path(path)
     if not path.is_dir():
         raise BagError(f"{path} is not a folder; give the folder with UWB_*.csv")
-    measurements = _ranges(_only(path, "UWB_*.csv"), vue_id, errors)
-    truth = _truth(_only(path, "motion_capture_*.csv"), vue_id)
-    metadata = {"source": "uwb-trolley", "tracker": yaml.safe_dump(TRACKER)}
-    return write_recording(bag, _links(errors), measurements, truth, metadata)
+    skipped: Counter[str] = Counter()
+    measurements = _ranges(_only(path, "UWB_*.csv"), vue_id, errors, skipped)
+    truth = _truth(_only(path, "motion_capture_*.csv"), vue_id, skipped)
+    counts = write_bag(
+        bag,
+        rsus=_links(errors),
+        measurements=measurements,
+        truth=truth,
+        tracker=TRACKER,
+        metadata={"source": "uwb-trolley"},
+    )
+    return {**counts, **skipped}
 
 
 def _only(folder: Path, pattern: str) -> Path:
@@ -123,47 +117,56 @@ def _links(errors: RangeErrors) -> list[RsuInfo]:
     ]
 
 
-def _ranges(file: Path, vue_id: str, errors: RangeErrors) -> list[RsuMeasurement]:
+def _ranges(
+    file: Path, vue_id: str, errors: RangeErrors, skipped: Counter[str]
+) -> list[RsuMeasurement]:
     measurements: list[RsuMeasurement] = []
     last_ns = -1
-    for row in read_rows(file, 1 + len(ANCHORS_M) * len(TAGS_M), header=False):
-        stamp_ns = _stamp_ns(row)
-        if stamp_ns <= last_ns:
-            raise row.error("time does not increase")
-        last_ns = stamp_ns
-        for link in range(len(row.values) - 1):
-            anchor, tag = divmod(link, len(TAGS_M))
-            if not row.values[1 + link].strip():
-                continue
-            measurements.append(
-                RsuMeasurement(
-                    stamp_ns=stamp_ns,
-                    rsu_id=f"a{anchor}_t{tag}",
-                    vue_id=vue_id,
-                    fields=Field.RANGE,
-                    range_m=row.positive(1 + link, f"distance a{anchor}-t{tag}"),
-                    range_var=errors.range_sd_m**2,
-                    lever_arm=TAGS_M[tag],
-                )
-            )
+    for row in read_rows(file, 1 + len(ANCHORS_M) * len(TAGS_M), skipped, header=False):
+        with row:
+            stamp_ns = _stamp_ns(row)
+            if stamp_ns <= last_ns:
+                raise row.error("time does not increase")
+            measurements += _links_of(row, stamp_ns, vue_id, errors)
+            last_ns = stamp_ns
     return measurements
 
 
-def _truth(file: Path, vue_id: str) -> list[Odometry]:
+def _links_of(row: Row, stamp_ns: int, vue_id: str, errors: RangeErrors) -> list[RsuMeasurement]:
+    """The ranges of one line; an empty field is a link that was not measured."""
+    links = [divmod(link, len(TAGS_M)) for link in range(len(row.values) - 1)]
+    return [
+        RsuMeasurement(
+            stamp_ns=stamp_ns,
+            rsu_id=f"a{anchor}_t{tag}",
+            vue_id=vue_id,
+            fields=Field.RANGE,
+            range_m=row.positive(column, f"distance a{anchor}-t{tag}"),
+            range_var=errors.range_sd_m**2,
+            lever_arm=TAGS_M[tag],
+        )
+        for column, (anchor, tag) in enumerate(links, start=1)
+        if row.values[column].strip()
+    ]
+
+
+def _truth(file: Path, vue_id: str, skipped: Counter[str]) -> list[Odometry]:
     stamps: list[int] = []
     poses: list[list[float]] = []
     last_ns = -1
-    for row in read_rows(file, 8, header=True):
-        stamp_ns = _stamp_ns(row)
-        if stamp_ns < last_ns:  # equal ones occur
-            raise row.error("time decreases")
-        last_ns = stamp_ns
-        if stamps and stamp_ns - stamps[-1] < _TRUTH_INTERVAL_NS:
-            continue
-        w, z = row.number(5, "quaternion w"), row.number(6, "quaternion z")
-        stamps.append(stamp_ns)
-        place = [row.number(column, name) for column, name in enumerate("xyz", start=1)]
-        poses.append([*place, 2.0 * math.atan2(z, w)])
+    for row in read_rows(file, 8, skipped, header=True):
+        with row:
+            stamp_ns = _stamp_ns(row)
+            if stamp_ns < last_ns:  # equal ones occur
+                raise row.error("time decreases")
+            if stamps and stamp_ns - stamps[-1] < _TRUTH_INTERVAL_NS:
+                last_ns = stamp_ns
+                continue
+            w, z = row.number(5, "quaternion w"), row.number(6, "quaternion z")
+            place = [row.number(column, name) for column, name in enumerate("xyz", start=1)]
+            poses.append([*place, 2.0 * math.atan2(z, w)])
+            stamps.append(stamp_ns)
+            last_ns = stamp_ns
     if len(stamps) < 2:
         raise BagError(f"{file} is shorter than 0.1 s; velocities need two poses")
     return truth_of_poses(stamps, np.array(poses), vue_id)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from netpos.bags.importers.car_imu_rtk import LEVER_ARM_M, CarDrive, imu_samples, load_car_drive
+from netpos.bags.importers.car_imu_rtk import MOUNT, CarDrive, imu_samples, load_car_drive
 from netpos.bags.importers.common import recordings
 from netpos.evaluation.metrics import NS
 from netpos.evaluation.reproduce.blocked_drive import (
@@ -90,7 +90,7 @@ def _aligned(found: CarDrive, config: TrackerConfig) -> Start:
     """Coarse alignment from rest, by RTK."""
     start, samples = StrapdownStart(config), SampleBuffer()
     pending = iter(imu_samples(found, VUE))
-    cov, lever = np.diag(np.square(RTK_SD_M)), np.array(LEVER_ARM_M)
+    cov, lever = np.diag(np.square(RTK_SD_M)), np.array(MOUNT.lever_arm_m)
     for stamp, position in zip(found.rtk_ns.tolist(), found.antenna, strict=True):
         if stamp < found.imu_ns[0]:
             continue
@@ -122,14 +122,17 @@ def station_tally(case: Case, seed: int) -> dict[str, Tally]:
     made = station_drive(known.drive, fewest=case.fewest, nearest=case.nearest, seed=seed)
     templates = RowTemplates.of(made.stations, FIELDS)
     heard, row_start, rows, _ = observation_rows(made.seen, templates, 0)
-    rows[:, LEVER : LEVER + 3] = LEVER_ARM_M
+    rows[:, LEVER : LEVER + 3] = MOUNT.lever_arm_m
     after = made.stamps_ns[heard] > known.start[0]
     first = int(np.argmax(after))
     epochs = Epochs(made.stamps_ns[heard][first:], row_start[first:], rows)
     fixes = fix_each(epochs, ground_height_m(made.stations), 0.0)
     variants = _variants(known)
     inputs = dict.fromkeys(variants, epochs)
-    variants[LOOSE], inputs[LOOSE] = variants[TIGHT], loose_epochs(epochs, fixes, LEVER_ARM_M)
+    variants[LOOSE], inputs[LOOSE] = (
+        variants[TIGHT],
+        loose_epochs(epochs, fixes, MOUNT.lever_arm_m),
+    )
     truth, tallies = made.antenna[heard][first:], {}
     for name, variant in variants.items():
         done = _run(known, inputs[name], *variant)
@@ -146,7 +149,7 @@ def _run(known: Recording, epochs: Epochs, sensors: Sensors, start: Start) -> Dr
 def _antenna(nav: Array) -> Array:
     """(n, 3) of states (n, NAV)."""
     return np.asarray(
-        nav[:, NAV_POSITION] + Rotation.from_quat(nav[:, NAV_QUATERNION]).apply(LEVER_ARM_M)
+        nav[:, NAV_POSITION] + Rotation.from_quat(nav[:, NAV_QUATERNION]).apply(MOUNT.lever_arm_m)
     )
 
 
@@ -183,7 +186,7 @@ def outages_with(sensors: Sensors, start: Start) -> Outages:
     used = (known.drive.rtk_ns > known.start[0]) & (known.drive.rtk_ns <= known.imu.stamps_ns[-1])
     stamps, antenna = known.drive.rtk_ns[used], known.drive.antenna[used]
     cov = np.tile(np.diag(np.square(RTK_SD_M)), (len(stamps), 1, 1))
-    rows = place_rows(antenna, cov, LEVER_ARM_M)
+    rows = place_rows(antenna, cov, MOUNT.lever_arm_m)
     row_start = np.arange(len(stamps) + 1) * 3
     aiding = Epochs(stamps, row_start, rows.reshape(-1, rows.shape[-1]))
     aided = _run(known, aiding, sensors, start)

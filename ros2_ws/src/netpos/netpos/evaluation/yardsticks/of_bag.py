@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from netpos.bags import BagReader, codec
 from netpos.evaluation.yardsticks.observations import Kind, Observations
+from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages import topics
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 
@@ -24,7 +25,7 @@ def observations_of_bag(
     range_sd_m: float | None = None,
     kinds: Collection[Kind] = tuple(Kind),
 ) -> Observations:
-    """Azimuths, elevations and ranges of one device in stamp order.
+    """Azimuths, elevations, ranges and time differences of one device in stamp order.
 
     The sd holds all that the RSU states, noise and biases, as if it were white noise;
     ``range_sd_m`` is used in its place for ranges. TOA, phases and position fixes are left out:
@@ -51,15 +52,16 @@ def observations_of_bag(
         if row[0] in kinds
     ]
     if not rows:
-        raise ValueError(f"{path} has no azimuth, elevation or range of {vue_id!r}")
-    n = len(rows)
+        raise ValueError(
+            f"{path} has no azimuth, elevation, range or time difference of {vue_id!r}"
+        )
     return Observations(
         stamp_ns=np.array([m.stamp_ns for m, _ in rows], dtype=np.int64),
         kind=np.array([row[0] for _, row in rows], dtype=np.int64),
         value=np.array([row[1] for _, row in rows]),
         sd=np.array([row[2] for _, row in rows]),
         rsu=np.array([known[m.rsu_id].position for m, _ in rows]),
-        other=np.zeros((n, 3)),
+        other=np.array([_reference(m, known).position for m, _ in rows]),
         axes=np.array([axes[m.rsu_id] for m, _ in rows]),
         lever_arm=_lever_arms([m for m, _ in rows]),
     )
@@ -69,6 +71,12 @@ def _lever_arms(measured: list[RsuMeasurement]) -> Array:
     """(n, 3) m; zero where all are of one antenna, whose place is then the device's."""
     arms = np.array([m.lever_arm for m in measured])
     return arms if np.ptp(arms, axis=0).any() else np.zeros_like(arms)
+
+
+def _reference(m: RsuMeasurement, known: Mapping[str, RsuInfo]) -> RsuInfo:
+    """The RSU that a time difference counts from; that of the measurement itself where there is
+    none."""
+    return known[m.reference_rsu_id if m.fields & Field.TDOA else m.rsu_id]
 
 
 def _rows(m: RsuMeasurement, info: RsuInfo, range_sd_m: float | None) -> Iterator[_Row]:
@@ -85,3 +93,7 @@ def _rows(m: RsuMeasurement, info: RsuInfo, range_sd_m: float | None) -> Iterato
         biases = math.hypot(info.range_bias_sd_m, info.common_range_bias_sd_m)
         sd = range_sd_m or math.hypot(math.sqrt(m.range_var), biases)
         yield Kind.RANGE, m.range_m, sd
+    if m.fields & Field.TDOA and m.tdoa_var > 0:
+        own = math.sqrt(2.0) * info.range_bias_sd_m
+        sd = range_sd_m or math.hypot(SPEED_OF_LIGHT_MPS * math.sqrt(m.tdoa_var), own)
+        yield Kind.TDOA, -SPEED_OF_LIGHT_MPS * m.tdoa_s, sd

@@ -51,6 +51,9 @@ class Reading:
     """(value, variance) of the message, after ``scale``, to those of the row; None: the same."""
     from_master: bool = False
     """The RSU's position in the row is that of its master antenna."""
+    has_reference: bool = False
+    """It compares the RSU with a second one, ``reference_rsu_id``; where that is from the first is
+    in the first three of AXES."""
     along_array: bool = False
     """The first axis in the row is that of the two antennas, in radians (``rows.rsu_place``)."""
     refusals: tuple[Refusal, ...] = ()

@@ -14,6 +14,7 @@ from netpos.filters.sensors import (
     phase,
     position,
     step_velocity,
+    tdoa,
     toa,
 )
 from netpos.filters.sensors import range as two_way_range
@@ -25,6 +26,7 @@ SENSORS: tuple[Sensor, ...] = (
     elevation.SENSOR,
     *cone_angle.SENSORS,
     toa.SENSOR,
+    tdoa.SENSOR,
     two_way_range.SENSOR,
     *phase.SENSORS,
     *position.SENSORS,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from corner_ranges import S
-from netpos.bags.importers.common import write_recording
+from netpos.bags.recording import write_bag
 from netpos.evaluation.yardsticks import (
     Kind,
     observations_of_bag,
@@ -61,7 +61,7 @@ def bag_of(path: Path) -> Path:
         )
         for k in (1, 2)
     ]
-    write_recording(path, [array, anchor], measured, truth, {})
+    write_bag(path, rsus=[array, anchor], measurements=measured, truth=truth)
     return path
 
 
@@ -76,5 +76,7 @@ def test_measurements_of_a_bag(tmp_path: Path) -> None:
     assert not seen.lever_arm.any()  # one antenna: its place is asked for
     assert observations_of_bag(bag, range_sd_m=0.2).sd[0] == 0.2
     assert len(observations_of_bag(bag, kinds=[Kind.ELEVATION])) == 1
-    with pytest.raises(ValueError, match="no azimuth, elevation or range of 'vue_3'"):
+    with pytest.raises(
+        ValueError, match="no azimuth, elevation, range or time difference of 'vue_3'"
+    ):
         observations_of_bag(bag, "vue_3")

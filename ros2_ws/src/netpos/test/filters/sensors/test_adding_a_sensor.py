@@ -129,7 +129,7 @@ def drive(library: Path) -> dict[str, Any]:
 
 
 def test_its_rows_have_its_number(drive: dict[str, Any]) -> None:
-    assert drive["kind"] == 14
+    assert drive["kind"] == 15
 
 
 def test_a_bad_value_is_refused_with_value_and_remedy(drive: dict[str, Any]) -> None:
@@ -165,7 +165,7 @@ def test_it_passes_the_tests_of_all_sensors(library: Path) -> None:
         f"--rootdir={root}",
         f"-c={root}/pyproject.toml",
         "-k",
-        "LOG_RANGE or 14",
+        "LOG_RANGE or 15",
         str(tests),
     )
     assert int(re.findall(r"(\d+) passed", output)[0]) >= 10

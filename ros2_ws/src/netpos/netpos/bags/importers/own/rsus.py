@@ -1,0 +1,109 @@
+"""Where the RSUs are: a small YAML or CSV file."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from netpos.bags.errors import BagError
+from netpos.bags.importers.common import yaw_quaternion
+from netpos.bags.importers.own.records import label, lines, number, problem
+from netpos.common.parameters import nearest
+from netpos.messages.values import AngleConvention, RsuInfo
+
+_FIELDS = [f.name for f in dataclasses.fields(RsuInfo) if f.name not in ("rsu_id", "stamp_ns")]
+_KEYS = [*_FIELDS, "yaw_deg"]
+
+
+def read_rsus(file: Path) -> list[RsuInfo]:
+    """RSUs of a file.
+
+    YAML: ``rsus: {a0: [x, y, z]}``, or ``a0: {position: [x, y, z], yaw_deg: 90, ...}`` with any
+    field of RsuInfo. CSV: a header ``rsu,x,y,z`` and, where wanted, ``yaw_deg``.
+
+    Raises
+    ------
+    BagError  no such file, or an entry that cannot be understood
+    """
+    if not file.is_file():
+        raise BagError(f"{file} does not exist; give a YAML or CSV file with the RSUs' positions")
+    found = _from_yaml(file) if file.suffix in {".yaml", ".yml"} else _from_csv(file)
+    names = [info.rsu_id for info in found]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise BagError(f"{file} names {', '.join(twice)} twice")
+    return found
+
+
+def _from_csv(file: Path) -> list[RsuInfo]:
+    found = []
+    for line, _ in lines(file, ["rsu", "x", "y"], None):
+        place = [0.0, 0.0, 0.0]
+        for axis, name in enumerate("xyz"):
+            if name in line.header:
+                value = number(line, name, name)
+                if value is None:
+                    raise problem(line, f"{name} is empty")
+                place[axis] = value
+        yaw = number(line, "yaw_deg", "yaw_deg") if "yaw_deg" in line.header else 0.0
+        found.append(_info(label(line, "rsu"), place, yaw or 0.0))
+    return found
+
+
+def _from_yaml(file: Path) -> list[RsuInfo]:
+    try:
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise BagError(f"{file} is not YAML: {error}") from error
+    entries = content.get("rsus", content) if isinstance(content, dict) else None
+    if not isinstance(entries, dict) or not entries:
+        raise BagError(f"{file} names no RSU; write it as rsus: {{a0: [x, y, z]}}")
+    return [_of_entry(file, str(name), entry) for name, entry in entries.items()]
+
+
+def _of_entry(file: Path, name: str, entry: Any) -> RsuInfo:
+    values = {"position": entry} if isinstance(entry, list) else entry
+    if not isinstance(values, dict):
+        raise BagError(f"{file}, {name}: give [x, y, z] or fields of RsuInfo, got {entry!r}")
+    for key in values:
+        if key not in _KEYS:
+            raise BagError(f"{file}, {name}: no field {key!r}{nearest(str(key), _KEYS)}")
+    rest = {k: v for k, v in values.items() if k not in ("position", "yaw_deg", "quaternion")}
+    if "angle_convention" in rest:
+        rest["angle_convention"] = _convention(file, name, rest["angle_convention"])
+    try:
+        place = [float(value) for value in values["position"]]
+        yaw_deg = float(values.get("yaw_deg", 0.0))
+        info = dataclasses.replace(_info(name, place, yaw_deg), **rest)
+        if "quaternion" in values:
+            info = dataclasses.replace(
+                info, quaternion=np.array([float(value) for value in values["quaternion"]])
+            )
+    except (KeyError, TypeError, ValueError) as error:
+        raise BagError(f"{file}, {name}: position must be [x, y, z] in metres ({error})") from None
+    return info
+
+
+def _convention(file: Path, name: str, said: Any) -> AngleConvention:
+    for convention in AngleConvention:
+        if said in (convention.name, convention.value):
+            return convention
+    names = " or ".join(convention.name for convention in AngleConvention)
+    raise BagError(f"{file}, {name}: angle_convention must be {names}, got {said!r}")
+
+
+def _info(rsu_id: str, place: list[float], yaw_deg: float) -> RsuInfo:
+    if len(place) == 2:
+        place = [*place, 0.0]
+    if len(place) != 3 or not all(math.isfinite(value) for value in place):
+        raise BagError(f"RSU {rsu_id}: position must be three finite numbers, got {place}")
+    return RsuInfo(
+        rsu_id=rsu_id,
+        position=np.array(place),
+        quaternion=yaw_quaternion(math.radians(yaw_deg)),
+    )

@@ -1,0 +1,147 @@
+"""RSUs and their errors as a small file: written from a bag, put into another one."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from netpos.bags.errors import BagError
+from netpos.bags.importers.own.rsus import read_rsus
+from netpos.bags.reader import BagReader
+from netpos.bags.types import codec
+from netpos.bags.writer import whole_bag
+from netpos.messages.topics import RSU_INFO, RSU_LEARNED, is_tracker_output
+from netpos.messages.values import RsuErrors, RsuInfo
+
+_BIAS_OF = {
+    "RANGE": "range_bias_sd_m",
+    "TOA": "range_bias_sd_m",
+    "AZIMUTH": "azimuth_bias_sd_rad",
+    "COSINE_Y": "azimuth_bias_sd_rad",
+    "ELEVATION": "elevation_bias_sd_rad",
+    "COSINE_Z": "elevation_bias_sd_rad",
+}
+_DIGITS = 6
+
+
+def save_rsus(bag: Path, file: Path) -> list[RsuInfo]:
+    """Write the RSUs of a bag, in the form that ``read_rsus`` reads; where their errors were
+    learned, with the newest spread and time of the biases as what they declare.
+
+    Raises
+    ------
+    BagError  not a readable bag, or one without RSUs
+    FileExistsError  ``file`` exists
+    """
+    if file.exists():
+        raise FileExistsError(f"{file} exists and is never overwritten; name another")
+    make = codec()
+    infos: dict[str, RsuInfo] = {}
+    learned: dict[str, RsuErrors] = {}
+    with BagReader(bag) as source:
+        for entry in source.messages([t for t in (RSU_INFO, RSU_LEARNED) if t in source.topics]):
+            if entry.topic == RSU_INFO:
+                info = make.rsu_info_from_msg(entry.message)
+                infos[info.rsu_id] = info
+            else:
+                errors = make.rsu_errors_from_msg(entry.message)
+                learned[errors.rsu_id] = errors
+    if not infos:
+        raise BagError(f"{bag} has no {RSU_INFO}: there is nothing to save")
+    found = [
+        _declaring(info, learned[name]) if name in learned else info
+        for name, info in sorted(infos.items())
+    ]
+    lines = [f"# RSUs of {bag.name}; m, rad, s, axes of map", "rsus:"]
+    for info in found:
+        said = learned.get(info.rsu_id)
+        if said is not None:
+            scatter = zip(said.quantities, said.scatter, strict=True)
+            text = ", ".join(f"{quantity} {value:.2f}" for quantity, value in scatter)
+            lines.append(f"  # learned; scatter over the sd stated: {text}")
+        entry = yaml.safe_dump(_entry(info), default_flow_style=True, width=10_000).strip()
+        name = yaml.safe_dump(info.rsu_id).splitlines()[0]  # in quotes where it must be
+        lines.append(f"  {name}: {entry}")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return found
+
+
+def load_rsus(file: Path, bag: Path, out: Path) -> list[str]:
+    """Copy a bag, with the RSUs that ``file`` names as it describes them; a tracker's output is
+    left out. Returns their names.
+
+    Raises
+    ------
+    BagError  not a readable bag or file, or an RSU that the bag does not know
+    FileExistsError  ``out`` exists
+    """
+    wanted = {info.rsu_id: info for info in read_rsus(file)}
+    make = codec()
+    with BagReader(bag) as source:
+        if RSU_INFO not in source.topics:
+            raise BagError(f"{bag} has no {RSU_INFO}: there are no RSUs to describe anew")
+        known = {e.message.rsu_id for e in source.messages([RSU_INFO])}
+        strange = sorted(wanted.keys() - known)
+        if strange:
+            raise BagError(
+                f"{file} names {', '.join(strange)}, which {bag} does not know; it knows "
+                f"{', '.join(sorted(known))}"
+            )
+        with whole_bag(out, metadata=source.metadata) as copy:
+            for name, info in source.topics.items():
+                if not is_tracker_output(name):
+                    copy.add_topic(name, info.type_name, info.qos, text=info.definition or None)
+            for entry in source.messages([t for t in source.topics if not is_tracker_output(t)]):
+                if entry.topic == RSU_INFO and entry.message.rsu_id in wanted:
+                    old = make.rsu_info_from_msg(entry.message)
+                    new = replace(wanted[old.rsu_id], stamp_ns=old.stamp_ns, network=old.network)
+                    copy.write(RSU_INFO, make.rsu_info_to_msg(new), entry.log_time_ns)
+                else:
+                    copy.write_raw(entry.topic, entry.type_name, entry.cdr, entry.log_time_ns)
+    return sorted(wanted)
+
+
+def _declaring(info: RsuInfo, errors: RsuErrors) -> RsuInfo:
+    """With what was learned in place of what was declared; of several quantities that share a
+    bias the larger spread and its time."""
+    changes: dict[str, float] = {}
+    largest = 0.0
+    for quantity, spread, time_s in zip(
+        errors.quantities, errors.bias_spread, errors.correlation_time_s, strict=True
+    ):
+        name = _BIAS_OF.get(quantity)
+        if name is None:
+            continue
+        changes[name] = max(changes.get(name, 0.0), spread)
+        if spread >= largest:
+            largest, changes["bias_correlation_time_s"] = spread, time_s
+    return replace(info, **changes)  # type: ignore[arg-type]
+
+
+def _entry(info: RsuInfo) -> dict[str, Any]:
+    """The fields that are not as by default, as plain values."""
+    plain = RsuInfo(rsu_id=info.rsu_id, position=info.position)
+    found: dict[str, Any] = {"position": _rounded(info.position)}
+    for entry in fields(RsuInfo):
+        value, default = getattr(info, entry.name), getattr(plain, entry.name)
+        if entry.name in ("rsu_id", "position", "stamp_ns", "frame_id"):
+            continue
+        if isinstance(value, np.ndarray):
+            if not np.array_equal(value, default):
+                found[entry.name] = _rounded(value, 9)
+        elif value != default:
+            found[entry.name] = _rounded(value) if isinstance(value, float) else value
+    if "angle_convention" in found:
+        found["angle_convention"] = info.angle_convention.name
+    return found
+
+
+def _rounded(value: Any, digits: int = _DIGITS) -> Any:
+    if isinstance(value, np.ndarray):
+        return [round(float(v), digits) for v in value]
+    return round(float(value), digits)

@@ -1,0 +1,270 @@
+"""``netpos import csv`` and ``netpos import ros``: anybody's recording, without code."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast, get_args
+
+import typer
+
+from netpos.cli.runs import parse_setting, refuse_existing
+
+if TYPE_CHECKING:
+    from netpos.bags.importers.own import Columns, Truth
+    from netpos.messages.values import RsuInfo
+
+Bag = Annotated[Path, typer.Argument(help="Bag to write; it must not exist.")]
+Map = Annotated[
+    str,
+    typer.Option(
+        "--map",
+        metavar="NAME=WHERE,...",
+        help="Which column (header or number from 1) or field holds time, rsu, range, azimuth, "
+        "elevation, toa, phase, tdoa (with reference), x, y, z, vue, rssi, line_of_sight; "
+        "range:a1=3 where each RSU has a column; range_sd or range_var where the spread is given.",
+    ),
+]
+Units = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME=UNIT,...",
+        help="time: s, ms, us, ns, iso; range and position: m, cm, mm, km, ft; angles: rad, deg; "
+        "toa: s, ms, us, ns, m. Default: SI.",
+    ),
+]
+Sd = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME=VALUE,...",
+        help="Standard deviation as the data sheet says it, in the unit of the quantity.",
+    ),
+]
+Rsus = Annotated[
+    Path | None,
+    typer.Option(help="YAML (rsus: {a0: [x, y, z]}) or CSV (rsu,x,y,z) with the RSUs' positions."),
+]
+Vue = Annotated[str, typer.Option(help="Name of the device where no column names it.")]
+Height = Annotated[float | None, typer.Option(help="Height of the device in the map, m.")]
+Lever = Annotated[
+    str | None,
+    typer.Option(metavar="X,Y,Z", help="Antenna in the device's axes, forward-left-up, m."),
+]
+TruthMap = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME=WHERE,...",
+        help="Where time, x, y, z and yaw or qx, qy, qz, qw of the truth are.",
+    ),
+]
+TruthUnits = Annotated[
+    str, typer.Option(metavar="NAME=UNIT,...", help="Of time, position and yaw of the truth.")
+]
+Offset = Annotated[
+    str, typer.Option(metavar="SECONDS|auto", help="Added to the times of the truth, or found.")
+]
+Align = Annotated[
+    str,
+    typer.Option(
+        metavar="none|shift|rigid",
+        help="Move, or turn and move, the truth onto the measurements; said in the figures.",
+    ),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Parameter of the tracker, kept in the bag; may repeat."
+    ),
+]
+AnyOrder = Annotated[
+    bool, typer.Option("--any-order", help="Lines need not be in the order of time.")
+]
+Skip = Annotated[bool, typer.Option("--skip-bad-lines", help="Skip and count what is not valid.")]
+
+
+def import_csv(
+    file: Annotated[Path, typer.Argument(help="CSV, TSV or blanks between columns; .gz too.")],
+    bag: Bag,
+    mapping: Map,
+    units: Units = "",
+    sd: Sd = "",
+    rsus: Rsus = None,
+    vue: Vue = "vue_1",
+    device_height: Height = None,
+    lever_arm: Lever = None,
+    delimiter: Annotated[
+        str | None, typer.Option(help="comma, tab, semicolon or blank. Default: found.")
+    ] = None,
+    truth: Annotated[
+        Path | None, typer.Option(help="Text file with the truth; TUM needs no --truth-map.")
+    ] = None,
+    truth_map: TruthMap = None,
+    truth_units: TruthUnits = "",
+    truth_time_offset: Offset = "0",
+    truth_align: Align = "none",
+    settings: Settings = None,
+    skip_bad_lines: Skip = False,
+    any_order: AnyOrder = False,
+) -> None:
+    """Ranges, angles, times or fixes of any text file.
+
+    One measurement a line:
+    netpos import csv uwb.csv BAG --map time=t,rsu=anchor,range=dist --units time=ms,range=mm
+    --sd range=100 --rsus anchors.yaml
+
+    One column for each RSU:
+    netpos import csv uwb.tsv BAG --map "time=1,range:a1=6,range:a2=7,range:a3=8"
+    --sd range=0.1 --rsus anchors.csv --truth walk.tum
+    """
+    from netpos.bags.importers.own import import_csv as work  # noqa: PLC0415
+    from netpos.bags.importers.own.records import DELIMITERS  # noqa: PLC0415
+
+    refuse_existing(bag)
+    if delimiter is not None and delimiter not in DELIMITERS:
+        raise ValueError(f"--delimiter {delimiter}: give one of {', '.join(DELIMITERS)}")
+    counts = work(
+        file,
+        bag,
+        _columns(mapping, units, sd, vue, lever_arm),
+        _rsus(rsus),
+        truth=truth_option(
+            truth, truth_map, truth_units, truth_time_offset, truth_align, device_height
+        ),
+        delimiter=DELIMITERS[delimiter] if delimiter else None,
+        skip_bad_lines=skip_bad_lines,
+        any_order=any_order,
+        tracker=_tracker(settings, device_height),
+    )
+    tell(bag, counts)
+
+
+def import_ros(
+    source: Annotated[
+        Path, typer.Argument(help="ROS 1 .bag, or ROS 2 bag (folder, .mcap, .db3).")
+    ],
+    bag: Bag,
+    topic: Annotated[str, typer.Option(help="Topic with the measurements.")],
+    mapping: Map,
+    units: Units = "",
+    sd: Sd = "",
+    rsus: Rsus = None,
+    vue: Vue = "vue_1",
+    device_height: Height = None,
+    lever_arm: Lever = None,
+    truth_topic: Annotated[str | None, typer.Option(help="Topic with the truth.")] = None,
+    truth_map: TruthMap = None,
+    truth_units: TruthUnits = "",
+    truth_time_offset: Offset = "0",
+    truth_align: Align = "none",
+    settings: Settings = None,
+    skip_bad_lines: Skip = False,
+    any_order: AnyOrder = False,
+) -> None:
+    """Ranges, angles, times or fixes of a topic of any ROS 1 or ROS 2 bag.
+
+    Fields are given by their path; the RSU's own position may be one of them:
+    netpos import ros walk.bag BAG --topic /uwb --map
+    time=header.stamp,rsu=responder_id,range=distance,rsu_x=place.x,rsu_y=place.y,rsu_z=place.z
+    --sd range=0.1 --truth-topic /pose --truth-map
+    time=header.stamp,x=pose.position.x,y=pose.position.y
+    """
+    from netpos.bags.importers.own import import_ros as work  # noqa: PLC0415
+
+    refuse_existing(bag)
+    counts = work(
+        source,
+        bag,
+        _columns(mapping, units, sd, vue, lever_arm),
+        topic,
+        _rsus(rsus),
+        truth=truth_option(
+            truth_topic, truth_map, truth_units, truth_time_offset, truth_align, device_height
+        ),
+        skip_bad_messages=skip_bad_lines,
+        any_order=any_order,
+        tracker=_tracker(settings, device_height),
+    )
+    tell(bag, counts)
+
+
+def three(text: str, option: str) -> tuple[float, float, float]:
+    """Three numbers between commas; ValueError for anything else."""
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"{option} takes three numbers such as 0,0.05,0, got {text!r}") from None
+    return x, y, z
+
+
+def tell(bag: Path, counts: Mapping[str, int]) -> None:
+    """What was written and skipped, and what to do next."""
+    from netpos.bags import BagReader  # noqa: PLC0415
+    from netpos.bags.recording import TRUTH_ALIGNMENT  # noqa: PLC0415
+
+    for topic, count in sorted(counts.items()):
+        typer.echo(f"  {topic}: {count}")
+    with BagReader(bag) as written:
+        aligned = written.metadata.get(TRUTH_ALIGNMENT)
+    if aligned:
+        typer.echo(aligned)
+    typer.echo(f"wrote {bag}; track it with: netpos replay {bag} --out NEW_BAG")
+
+
+def _columns(mapping: str, units: str, sd: str, vue: str, lever_arm: str | None) -> Columns:
+    from netpos.bags.importers.own import Columns  # noqa: PLC0415
+
+    arm = (0.0, 0.0, 0.0) if lever_arm is None else three(lever_arm, "--lever-arm")
+    return Columns.parse(mapping, units, sd, vue_id=vue, lever_arm_m=arm)
+
+
+def _rsus(file: Path | None) -> list[RsuInfo]:
+    from netpos.bags.importers.own.rsus import read_rsus  # noqa: PLC0415
+
+    return [] if file is None else read_rsus(file)
+
+
+def _tracker(settings: list[str] | None, height_m: float | None) -> dict[str, object]:
+    from netpos.tracking.config import TrackerConfig  # noqa: PLC0415
+
+    chosen: dict[str, object] = dict(parse_setting(text) for text in settings or [])
+    if height_m is not None:
+        chosen["device_height_m"] = height_m
+    TrackerConfig.from_mapping(chosen)
+    return chosen
+
+
+def truth_option(
+    source: Path | str | None,
+    mapping: str | None,
+    units: str,
+    offset: str,
+    way: str,
+    height_m: float | None,
+) -> Truth | None:
+    from netpos.bags.importers.own import Truth  # noqa: PLC0415
+    from netpos.bags.importers.own.alignment import Way  # noqa: PLC0415
+    from netpos.bags.importers.own.truth import TUM, TruthColumns  # noqa: PLC0415
+
+    if source is None:
+        if mapping is not None or way != "none":
+            raise ValueError("there is no truth to map or align; name its file or topic")
+        return None
+    if mapping is None:
+        if not isinstance(source, Path) or source.suffix not in {".tum", ".txt"}:
+            raise ValueError("--truth-map must say where time, x and y of the truth are")
+        columns = TruthColumns(sources=TUM)
+    else:
+        columns = TruthColumns.parse(mapping, units)
+    if way not in get_args(Way):
+        raise ValueError(f"--truth-align {way}: give none, shift or rigid")
+    try:
+        offset_s = None if offset == "auto" else float(offset)
+    except ValueError:
+        raise ValueError(f"--truth-time-offset {offset}: give seconds or auto") from None
+    return Truth(
+        source=source,
+        columns=columns,
+        offset_s=offset_s,
+        align=cast("Way", way),
+        height_m=height_m or 0.0,
+    )

@@ -1,0 +1,102 @@
+"""``netpos.write_bag``: what goes in comes out, and what cannot be tracked is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import netpos
+import numpy as np
+import pytest
+import yaml
+from imported_bag import values
+from netpos.bags import BagError, BagReader
+
+RSUS = [
+    netpos.RsuInfo(rsu_id=name, position=np.array([x, 0.0, 2.0]))
+    for name, x in (("a", 0.0), ("b", 10.0))
+]
+
+
+def measured(stamp_ns: int, rsu_id: str, vue_id: str = "vue_1") -> netpos.RsuMeasurement:
+    return netpos.RsuMeasurement(
+        stamp_ns=stamp_ns,
+        rsu_id=rsu_id,
+        vue_id=vue_id,
+        fields=netpos.Field.RANGE,
+        range_m=5.0,
+        range_var=0.01,
+    )
+
+
+def truth(stamp_ns: int) -> netpos.Odometry:
+    return netpos.Odometry(
+        stamp_ns=stamp_ns,
+        vue_id="vue_1",
+        position=np.array([1.0, 2.0, 3.0]),
+        quaternion=np.array([0.0, 0.0, 0.0, 1.0]),
+        linear_velocity=np.zeros(3),
+    )
+
+
+def test_any_order_goes_in_and_beacons_are_numbered(tmp_path: Path) -> None:
+    given = [measured(20, "b"), measured(10, "a"), measured(20, "a")]
+    counts = netpos.write_bag(
+        tmp_path / "bag",
+        rsus=RSUS,
+        measurements=given,
+        truth=[truth(30), truth(5)],
+        tracker={"device_height_m": 1.5},
+        metadata={"source": "a test"},
+    )
+    assert counts == {"/rsu/info": 2, "/rsu/measurements": 3, "/vue_1/ground_truth": 2}
+    infos, found, poses = values(tmp_path / "bag")
+    assert [info.stamp_ns for info in infos] == [5, 5]
+    assert [(m.stamp_ns, m.rsu_id, m.sequence, m.expected) for m in found] == [
+        (10, "a", 0, 1),
+        (20, "a", 1, 2),
+        (20, "b", 1, 2),
+    ]
+    assert [pose.stamp_ns for pose in poses] == [5, 30]
+    with BagReader(tmp_path / "bag") as bag:
+        assert yaml.safe_load(bag.metadata["tracker"]) == {"device_height_m": 1.5}
+        assert bag.metadata["source"] == "a test"
+
+
+def test_two_devices_at_one_stamp_are_two_beacons(tmp_path: Path) -> None:
+    given = [measured(20, "a", "vue_2"), measured(20, "a", "vue_1")]
+    netpos.write_bag(tmp_path / "bag", rsus=RSUS, measurements=given)
+    _, found, _ = values(tmp_path / "bag")
+    assert [(m.vue_id, m.sequence, m.expected) for m in found] == [
+        ("vue_1", 0, 1),
+        ("vue_2", 1, 1),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ([], "there is no measurement"),
+        ([measured(10, "c")], "no position of RSU c; give an RsuInfo of each .there are a, b"),
+        ([measured(0, "a")], "stamp 0 ns is no stamp; add a constant"),
+        ([measured(10, "a")] * 2, "RSU a measures vue_1 twice at stamp 10 ns"),
+    ],
+)
+def test_refuses_what_cannot_be_tracked(
+    tmp_path: Path, given: list[netpos.RsuMeasurement], message: str
+) -> None:
+    with pytest.raises(BagError, match=message):
+        netpos.write_bag(tmp_path / "bag", rsus=RSUS, measurements=given)
+    assert not (tmp_path / "bag").exists()
+
+
+def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
+    netpos.write_bag(tmp_path / "bag", rsus=RSUS, measurements=[measured(10, "a")])
+    with pytest.raises(FileExistsError):
+        netpos.write_bag(tmp_path / "bag", rsus=RSUS, measurements=[replace(measured(10, "a"))])
+
+
+def test_the_library_names_what_it_offers() -> None:
+    with pytest.raises(AttributeError, match="no 'write_bags'; it offers Field"):
+        _ = netpos.write_bags
+    assert all(hasattr(netpos, name) for name in netpos.__all__)

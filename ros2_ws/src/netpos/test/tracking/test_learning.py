@@ -1,0 +1,299 @@
+"""Learned error models against errors that are known, because they are simulated."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from netpos.messages.values import Array, Field, Odometry, RsuInfo, RsuMeasurement
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.learning import ErrorModel, LearnedErrors
+from netpos.tracking.report import TrackOutput
+from netpos.tracking.tracker import Tracker
+
+RSUS = np.array(
+    [[15.0, 0.0, 3.0], [4.0, 12.0, 3.0], [-12.0, 7.0, 3.0], [-12.0, -7.0, 3.0], [4.0, -12.0, 3.0]]
+)
+RATE_HZ = 5.0
+NAMES = [("rsu/a", "RANGE"), ("rsu/b", "RANGE"), ("rsu/c", "RANGE"), ("rsu/d", "RANGE")]
+SIDES = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+
+
+def learned_of(errors: Array, stated_sd: float, rate_hz: int = 5) -> LearnedErrors:
+    """What is learned of four RSUs to the four sides of a device whose place is known: errors
+    (n, 4) m, ``rate_hz`` a second."""
+    learned = LearnedErrors()
+    for name in NAMES:
+        learned.model(name, stated_sd, 0.0, 0.0)
+    for k, row in enumerate(errors):
+        stamp_ns = k * 1_000_000_000 // rate_hz
+        for name, error, side in zip(NAMES, row.tolist(), SIDES.tolist(), strict=True):
+            variance = learned.models[name].scale * stated_sd**2
+            learned.hear(name, [error, error**2, variance, *side, 0.0], stated_sd**2)
+        learned.move(stamp_ns, 0.0)
+        learned.conclude(stamp_ns)
+    return learned
+
+
+def slow_and_white(
+    seed: int, seconds: int, noise_sd: float, bias_sd: float, time_s: float, rate_hz: int = 5
+) -> Array:
+    """(n, 4) m: first-order Gauss-Markov biases and white noise."""
+    rng, n = np.random.default_rng(seed), seconds * rate_hz
+    decay = math.exp(-1.0 / rate_hz / time_s)
+    bias = np.empty((n, 4))
+    bias[0] = rng.normal(0.0, bias_sd, 4)
+    for k in range(1, n):
+        bias[k] = decay * bias[k - 1] + rng.normal(0.0, bias_sd * math.sqrt(1 - decay**2), 4)
+    return bias + rng.normal(0.0, noise_sd, (n, 4))
+
+
+@pytest.mark.parametrize("factor", [0.25, 1.0, 4.0])
+def test_white_noise_is_learned_as_scatter_without_a_bias(factor: float) -> None:
+    sd = 0.1 * math.sqrt(factor)
+    for seed in range(3):
+        learned = learned_of(slow_and_white(seed, 120, sd, 0.0, 1.0), 0.1)
+        for model in learned.models.values():
+            assert factor / 1.6 < model.scale < factor * 1.6
+            assert factor / 1.3 < model.gate_scale < factor * 1.3
+            assert model.bias_sd < 0.35 * sd
+
+
+@pytest.mark.parametrize("bias_sd", [0.1, 0.3, 0.5])
+def test_a_bias_is_learned_with_its_sd_and_its_time(bias_sd: float) -> None:
+    """Within a factor of 2: a bias twice as large that lasts four times as long changes by as much
+    in a second, and ten correlation times of four RSUs do not tell them apart."""
+    spreads, times = [], []
+    for seed in range(6):
+        learned = learned_of(slow_and_white(seed, 300, 0.1, bias_sd, 30.0), 0.1)
+        spreads += [m.bias_sd for m in learned.models.values()]
+        times += [m.time_s(0.0) for m in learned.models.values()]
+    assert bias_sd / 2.0 < np.sqrt(np.mean(np.square(spreads))) < 2.0 * bias_sd
+    assert 10.0 < np.median(times) < 150.0
+
+
+def test_what_a_shift_of_the_position_explains_is_not_an_error_of_the_rsus() -> None:
+    """All residuals are those of a device 3 m to the side: nothing contradicts anything."""
+    rng = np.random.default_rng(5)
+    shift = np.outer(3.0 * np.sin(np.arange(600) / 50.0), SIDES @ [1.0, 0.5])
+    learned = learned_of(shift + rng.normal(0.0, 0.1, (600, 4)), 0.1)
+    for model in learned.models.values():
+        assert model.bias_sd < 0.1
+        assert model.scale < 2.0
+
+
+def test_nothing_is_learned_of_rsus_that_nobody_checks() -> None:
+    """Two directions, two unknowns: every residual is a shift of the position."""
+    learned = LearnedErrors()
+    for name in NAMES[:2]:
+        learned.model(name, 0.1, 0.0, 0.0)
+    before = {name: learned.models[name].bias_sd for name in NAMES[:2]}
+    for k in range(500):
+        for name, side in zip(NAMES[:2], SIDES.tolist(), strict=False):
+            learned.hear(name, [0.7, 0.49, 0.01, *side, 0.0], 0.01)
+        learned.conclude(k * 200_000_000)
+    for name in NAMES[:2]:
+        assert not learned.models[name].evidence.any()
+        assert learned.models[name].bias_sd == before[name]
+
+
+def test_what_is_declared_is_the_prior() -> None:
+    undeclared = ErrorModel.declared(0.1, 0.0, 0.0)
+    declared = ErrorModel.declared(0.1, 0.5, 20.0)
+    assert undeclared.scale == pytest.approx(1.0, rel=0.05)
+    assert undeclared.bias_sd < 0.3
+    assert 0.25 < declared.bias_sd < 1.5
+    assert 10.0 < declared.time_s(0.0) < 60.0
+    assert declared.time_s(2.0) < declared.time_s(0.0)
+
+
+def test_a_copy_goes_its_own_way() -> None:
+    errors = slow_and_white(3, 60, 0.2, 0.3, 20.0)
+    learned = learned_of(errors[:150], 0.1)
+    twin = learned.copy()
+    kept = {name: (m.bias_sd, m.scale) for name, m in twin.models.items()}
+    for k, row in enumerate(errors[150:], start=150):
+        for name, error, side in zip(NAMES, row.tolist(), SIDES.tolist(), strict=True):
+            learned.hear(name, [error, error**2, 0.01, *side, 0.0], 0.01)
+        learned.conclude(k * 200_000_000)
+    assert {name: (m.bias_sd, m.scale) for name, m in twin.models.items()} == kept
+    assert any(learned.models[n].bias_sd != kept[n][0] for n in NAMES)
+
+
+def _measurements(seed: int, seconds: float, noise_sd: float, bias: Array) -> list[RsuMeasurement]:
+    """Ranges of a device on an ellipse, with constant biases (5,) m."""
+    rng, found = np.random.default_rng(seed), []
+    for k in range(int(seconds * RATE_HZ)):
+        t = k / RATE_HZ
+        place = np.array([8.0 * math.cos(t / 8), 5.0 * math.sin(t / 8), 0.0])
+        for i, rsu in enumerate(RSUS):
+            found.append(
+                RsuMeasurement(
+                    stamp_ns=round((1.0 + t) * 1e9),
+                    rsu_id=f"a{i}",
+                    vue_id="vue_1",
+                    sequence=k,
+                    expected=len(RSUS),
+                    fields=Field.RANGE,
+                    range_m=float(np.linalg.norm(place - rsu) + bias[i] + rng.normal(0, noise_sd)),
+                    range_var=0.01,
+                )
+            )
+    return found
+
+
+def _track(measurements: list[RsuMeasurement], **parameters: object) -> list[Odometry]:
+    _, outputs = _outputs(measurements, **parameters)
+    return [o.odometry for o in outputs if o.odometry is not None]
+
+
+def _outputs(
+    measurements: list[RsuMeasurement], **parameters: object
+) -> tuple[Tracker, list[TrackOutput]]:
+    tracker = Tracker(TrackerConfig(**{"accel_density_mps2_sqrthz": 0.3, **parameters}))  # type: ignore[arg-type]
+    for i, rsu in enumerate(RSUS):
+        tracker.add_rsu(RsuInfo(rsu_id=f"a{i}", position=rsu))
+    outputs = []
+    for m in measurements:
+        tracker.add(m)
+        outputs += tracker.process()
+    outputs += tracker.flush()
+    return tracker, outputs
+
+
+def _scores(odometry: list[Odometry], from_s: float) -> tuple[float, float]:
+    """RMSE [m] and mean NEES of the position."""
+    errors, nees = [], []
+    for o in odometry:
+        t = o.stamp_ns * 1e-9 - 1.0
+        if t < from_s:
+            continue
+        error = o.position[:2] - [8.0 * math.cos(t / 8), 5.0 * math.sin(t / 8)]
+        errors.append(float(error @ error))
+        nees.append(float(error @ np.linalg.solve(o.pose_cov[:2, :2], error)))
+    return math.sqrt(np.mean(errors)), float(np.mean(nees))
+
+
+@pytest.mark.parametrize("filter_name", ["iekf", "ekf", "ukf", "srukf"])
+def test_biases_nobody_declared_are_learned_by_every_filter(filter_name: str) -> None:
+    """Biases of 3 sd: believed, they are errors of the position; learned, they are not."""
+    bias = np.array([0.3, -0.2, 0.25, -0.3, 0.1])
+    measured = _measurements(7, 90.0, 0.1, bias)
+    told = {"filter": filter_name}
+    rmse, nees = _scores(_track(measured, **told), 30.0)
+    learned_rmse, learned_nees = _scores(_track(measured, learn_errors=True, **told), 30.0)
+    assert nees > 10.0
+    assert learned_nees < 4.0
+    assert learned_rmse < 0.8 * rmse
+
+
+def test_a_late_measurement_ends_in_the_same_estimate_as_one_in_order() -> None:
+    """What is learned is part of the state a track goes back to."""
+    measured = _measurements(9, 40.0, 0.2, np.array([0.4, 0.0, -0.3, 0.2, 0.0]))
+    late = list(measured)
+    for k in range(50, len(late) - 20, 35):
+        late.insert(k + 12, late.pop(k))
+    parameters = {"learn_errors": True, "hold_s": 0.0, "history_s": 5.0, "isolate_rsus": False}
+    in_order = _track(measured, **parameters)[-1]
+    revised = _track(late, **parameters)[-1]
+    assert revised.stamp_ns == in_order.stamp_ns
+    np.testing.assert_array_equal(revised.position, in_order.position)
+    np.testing.assert_array_equal(revised.pose_cov, in_order.pose_cov)
+
+
+def test_what_is_learned_is_told_every_second() -> None:
+    bias = np.array([0.8, 0.0, 0.0, 0.0, 0.0])
+    tracker, outputs = _outputs(_measurements(4, 60.0, 0.3, bias), learn_errors=True)
+    told = [errors for output in outputs for errors in output.errors]
+    assert {errors.rsu_id for errors in told} == {"a0", "a1", "a2", "a3", "a4"}
+    assert 55 * 5 <= len(told) <= 60 * 5
+    newest = {errors.rsu_id: errors for errors in told}
+    for name, expected in zip(sorted(newest), bias, strict=True):
+        errors = newest[name]
+        assert errors.quantities == ("RANGE",)
+        assert abs(errors.bias[0] - expected) < 4.0 * errors.bias_sd[0]
+        assert 0.7 < errors.scatter[0] / 3.0 < 1.15  # 0.3 m, stated as 0.1 m
+    assert abs(newest["a0"].bias[0] - 0.8) < 0.3
+    findings = {f.hardware_id: f for f in tracker.findings({}, {})}
+    assert "m long, scatter " in findings["a0"].message
+    assert "learned bias: RANGE" in findings["a1"].values
+
+
+def test_nothing_is_told_where_nothing_is_learned() -> None:
+    _, outputs = _outputs(_measurements(4, 10.0, 0.1, np.zeros(5)))
+    assert not any(output.errors for output in outputs)
+
+
+BIASED = np.array([0.3, -0.2, 0.25, -0.3, 0.1])
+
+
+def _of_another(
+    measured: list[RsuMeasurement], vue_id: str, after_s: float
+) -> list[RsuMeasurement]:
+    """The same measurements of another device, later."""
+    return [
+        replace(m, vue_id=vue_id, stamp_ns=m.stamp_ns + round(after_s * 1e9)) for m in measured
+    ]
+
+
+def _start_of_the_second(first: list[RsuMeasurement], seed: int, bias: Array) -> Array:
+    """RMSE [m] and NEES in the first 15 s of a device that appears after 90 s."""
+    second = _of_another(_measurements(seed, 15.0, 0.1, bias), "vue_2", 90.0)
+    _, outputs = _outputs([*first, *second], learn_errors=True)
+    found = [o.odometry for o in outputs if o.status.vue_id == "vue_2" and o.odometry is not None]
+    return np.array(
+        _scores([replace(o, stamp_ns=o.stamp_ns - 90_000_000_000) for o in found], 2.0)
+    )
+
+
+def test_a_device_takes_over_what_others_have_learned() -> None:
+    """Of biases of 3 sd that nobody declared, it knows from the start how large they are."""
+    alone, helped = np.zeros(2), np.zeros(2)
+    for seed in range(12):
+        bias = np.random.default_rng(seed).normal(0.0, 0.3, 5)
+        alone += _start_of_the_second([], seed, bias) / 12
+        first = _measurements(100 + seed, 90.0, 0.1, bias)
+        helped += _start_of_the_second(first, seed, bias) / 12
+    assert helped[1] < 0.9 * alone[1]
+    assert helped[0] < 1.03 * alone[0]
+
+
+def test_what_is_shared_does_not_depend_on_the_order_of_arrival() -> None:
+    """Two devices at once, one of them late by up to a second."""
+    both = [_measurements(seed, 40.0, 0.1, BIASED) for seed in (7, 8)]
+    other = _of_another(both[1], "vue_2", 0.05)
+    in_order = sorted([*both[0], *other], key=lambda m: m.stamp_ns)
+    late = sorted(
+        [*both[0], *other], key=lambda m: m.stamp_ns + (m.vue_id == "vue_2") * 900_000_000
+    )
+    ends = []
+    for measured in (in_order, late):
+        _, outputs = _outputs(measured, learn_errors=True, history_s=2.0, isolate_rsus=False)
+        newest = {o.status.vue_id: o.odometry for o in outputs if o.odometry is not None}
+        ends.append(newest)
+    for vue_id in ("vue_1", "vue_2"):
+        np.testing.assert_array_equal(ends[0][vue_id].position, ends[1][vue_id].position)
+        np.testing.assert_array_equal(ends[0][vue_id].pose_cov, ends[1][vue_id].pose_cov)
+
+
+def test_a_track_that_is_lost_keeps_what_it_has_learned() -> None:
+    measured = _measurements(7, 90.0, 0.1, BIASED)
+    again = _of_another(_measurements(8, 15.0, 0.1, BIASED), "vue_1", 300.0)  # beyond max_gap_s
+    _, outputs = _outputs([*measured, *again], learn_errors=True, max_gap_s=60.0)
+    told = [errors for o in outputs if o.status.stamp_ns > 301_000_000_000 for errors in o.errors]
+    fresh = [errors for o in _outputs(again, learn_errors=True)[1] for errors in o.errors]
+    first, alone = (
+        {e.rsu_id: e.bias_spread[0] for e in reversed(found)} for found in (told, fresh)
+    )
+    assert np.mean(list(first.values())) > 1.3 * np.mean(list(alone.values()))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("motion_model", "strapdown"), ("motion_model", "interacting"), ("backend", "filterpy")],
+)
+def test_learning_is_refused_where_there_is_none(name: str, value: str) -> None:
+    with pytest.raises(ValueError, match=r"learn_errors.*set it to false"):
+        TrackerConfig(**{"learn_errors": True, "filter": "ekf", name: value})  # type: ignore[arg-type]

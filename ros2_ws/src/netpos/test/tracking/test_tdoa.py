@@ -1,0 +1,314 @@
+"""Time differences of arrival, and times of arrival whose emission nobody knows: their twin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from netpos.bags import BagReader, codec
+from netpos.bags.importers.common import recordings
+from netpos.bags.importers.own import Columns, Truth, import_csv
+from netpos.bags.importers.own.truth import TruthColumns
+from netpos.bags.recording import number_beacons
+from netpos.evaluation import evaluate_bag
+from netpos.messages.values import Array, Field, InitialPose, Odometry, RsuInfo, RsuMeasurement
+from netpos.scenario import load_scenario
+from netpos.scenario.offline import simulate_to_bag
+from netpos.tracking import Tracker, TrackerConfig
+from netpos.tracking.replay import replay_bag
+from scipy.optimize import least_squares
+
+C = 299_792_458.0
+SITES = {
+    "a": (0.0, 0.0, 6.0),
+    "b": (60.0, 0.0, 6.0),
+    "c": (60.0, 40.0, 6.0),
+    "d": (0.0, 40.0, 6.0),
+    "e": (30.0, -10.0, 6.0),
+}
+PLACE = np.array([22.0, 13.0, 0.0])
+START_NS = 1_000_000_000
+SD_M = 0.3
+
+
+def distance(name: str, place: Array = PLACE) -> float:
+    return float(np.linalg.norm(place - SITES[name]))
+
+
+def tdoa(stamp_ns: int, name: str, reference: str, value_m: float, sd_m: float = SD_M) -> Any:
+    return RsuMeasurement(
+        stamp_ns=stamp_ns,
+        rsu_id=name,
+        reference_rsu_id=reference,
+        vue_id="v",
+        fields=Field.TDOA,
+        tdoa_s=value_m / C,
+        tdoa_var=(sd_m / C) ** 2,
+    )
+
+
+def tracker(names: Sequence[str] = tuple(SITES), **config: Any) -> Tracker:
+    made = Tracker(TrackerConfig(**{"hold_s": 0.0, **config}))
+    for name in names:
+        made.add_rsu(RsuInfo(rsu_id=name, position=np.array(SITES[name])))
+    return made
+
+
+def said(made: Tracker, items: Sequence[Any]) -> list[Any]:
+    for item in items:
+        assert made.add(item) is None
+    return made.process()
+
+
+def fix_of(outputs: Sequence[Any]) -> Odometry:
+    odometry = outputs[-1].odometry
+    assert odometry is not None
+    return odometry
+
+
+def star(stamp_ns: int, rng: np.random.Generator | None = None, place: Array = PLACE) -> list[Any]:
+    """Differences of all others to ``a``; with noise of each receiver where there is ``rng``."""
+    noise = dict.fromkeys(SITES, 0.0)
+    if rng is not None:
+        noise = {name: float(rng.normal(scale=SD_M / np.sqrt(2))) for name in SITES}
+    late = {name: distance(name, place) + noise[name] for name in SITES}
+    items = [tdoa(stamp_ns, name, "a", late[name] - late["a"]) for name in SITES if name != "a"]
+    return number_beacons(items)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_first_fix_is_that_of_least_squares(seed: int) -> None:
+    items = star(START_NS, np.random.default_rng(seed))
+    fix = fix_of(said(tracker(coverage_radius_m=1e3), items))
+    values = {m.rsu_id: C * m.tdoa_s for m in items}
+    mix = 0.5 * (np.eye(len(values)) + np.ones((len(values),) * 2))
+    whiten = np.linalg.inv(np.linalg.cholesky(SD_M**2 * mix))
+
+    def residuals(xy: Array) -> Array:
+        place = np.array([*xy, 0.0])
+        expected = [distance(name, place) - distance("a", place) for name in values]
+        return np.asarray(whiten @ (np.array(list(values.values())) - expected))
+
+    found = least_squares(residuals, PLACE[:2])
+    cov = np.linalg.inv(found.jac.T @ found.jac)
+    apart = fix.position[:2] - found.x
+    # The first fix weighs the differences as if they were independent.
+    assert float(apart @ np.linalg.solve(cov, apart)) < 3.0
+
+
+def test_too_few_differences_are_no_fix() -> None:
+    assert all(o.odometry is None for o in said(tracker(), star(START_NS)[:1]))
+
+
+# So narrow a prior that what linearising leaves out does not count.
+NEAR_M, PRIOR_SD_M, FINE_M = np.array([0.004, -0.003, 0.0]), 0.01, 0.01
+
+
+def prior(stamp_ns: int) -> InitialPose:
+    return InitialPose(
+        stamp_ns=stamp_ns, vue_id="v", position=PLACE + NEAR_M, cov=PRIOR_SD_M**2 * np.eye(3)
+    )
+
+
+def linear_update(rows: Array, R: Array, innovation: Array) -> tuple[Array, Array]:
+    """Mean and covariance of the position from the prior of ``prior`` by linear algebra."""
+    P = PRIOR_SD_M**2 * np.eye(2)
+    gain = P @ rows.T @ np.linalg.inv(rows @ P @ rows.T + R)
+    return prior(0).position[:2] + gain @ innovation, P - gain @ rows @ P
+
+
+def direction(name: str) -> Array:
+    d = prior(0).position - SITES[name]
+    return np.asarray(d[:2] / np.linalg.norm(d))
+
+
+ONE_STEP = {
+    "filter": "ekf",
+    "gate_probability": 1.0,
+    "initial_speed_sd_mps": 1e-3,
+    "isolate_rsus": False,
+}
+
+
+@pytest.mark.parametrize("names", [("b",), ("b", "c"), ("b", "c", "d", "e")])
+def test_differences_with_one_reference_share_its_error(names: tuple[str, ...]) -> None:
+    made = tracker(**ONE_STEP)
+    items = number_beacons(
+        [tdoa(START_NS, n, "a", distance(n) - distance("a") + 0.02, FINE_M) for n in names]
+    )
+    fix = fix_of(said(made, [prior(START_NS), *items]))
+    start = prior(0).position
+    H = np.array([direction(name) - direction("a") for name in names])
+    innovation = np.array(
+        [
+            distance(n) - distance("a") + 0.02 - distance(n, start) + distance("a", start)
+            for n in names
+        ]
+    )
+    R = 0.5 * FINE_M**2 * (np.eye(len(names)) + np.ones((len(names),) * 2))
+    mean, cov = linear_update(H, R, innovation)
+    np.testing.assert_allclose(fix.position[:2], mean, rtol=1e-6)
+    np.testing.assert_allclose(fix.pose_cov[:2, :2], cov, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("names", [("a", "b"), ("a", "b", "c"), tuple(SITES)])
+def test_its_twin_is_a_time_of_arrival_with_unknown_emission(names: tuple[str, ...]) -> None:
+    """n receivers that time a beacon of unknown emission say what n - 1 differences say."""
+    sd = FINE_M / np.sqrt(2)
+    late = {name: distance(name) + 0.01 * k for k, name in enumerate(names)}
+    times = [
+        RsuMeasurement(
+            stamp_ns=START_NS,
+            rsu_id=name,
+            vue_id="v",
+            fields=Field.TOA,
+            toa_s=(late[name] + 1234.5) / C,
+            toa_var=(sd / C) ** 2,
+        )
+        for name in names
+    ]
+    differences = [
+        tdoa(START_NS, n, names[0], late[n] - late[names[0]], FINE_M) for n in names[1:]
+    ]
+    # The offset's prior is what is not known: 3 km.
+    unknown = {**ONE_STEP, "clock_offset_sd_s": 1e-5}
+    by_time = fix_of(said(tracker(**unknown), [prior(START_NS), *number_beacons(times)]))
+    by_difference = fix_of(
+        said(tracker(**ONE_STEP), [prior(START_NS), *number_beacons(differences)])
+    )
+    np.testing.assert_allclose(by_time.position, by_difference.position, rtol=1e-6)
+    np.testing.assert_allclose(by_time.pose_cov, by_difference.pose_cov, rtol=1e-6, atol=1e-9)
+
+
+def test_an_emission_that_is_unknown_every_time_tracks_like_differences() -> None:
+    """White frequency noise of 1e-4 s/sqrt(s) makes the clock forget itself between beacons."""
+    rng = np.random.default_rng(3)
+    found = {}
+    for kind in ("time", "difference"):
+        made = tracker(clock_white_density=1e-4, clock_offset_sd_s=1e-3, coverage_radius_m=100.0)
+        rng = np.random.default_rng(3)
+        outputs = []
+        for k in range(100):
+            stamp_ns = START_NS + k * 100_000_000
+            noise = rng.normal(scale=SD_M / np.sqrt(2), size=len(SITES))
+            late = dict(zip(SITES, [distance(n) for n in SITES] + noise, strict=True))
+            emission_m = float(rng.normal(scale=1000.0))
+            if kind == "time":
+                items = [
+                    RsuMeasurement(
+                        stamp_ns=stamp_ns,
+                        rsu_id=n,
+                        vue_id="v",
+                        fields=Field.TOA,
+                        toa_s=(late[n] + emission_m) / C,
+                        toa_var=0.5 * (SD_M / C) ** 2,
+                    )
+                    for n in SITES
+                ]
+            else:
+                items = [tdoa(stamp_ns, n, "a", late[n] - late["a"]) for n in list(SITES)[1:]]
+            outputs += said(made, number_beacons(items))
+        found[kind] = fix_of(outputs)
+    np.testing.assert_allclose(
+        found["time"].position, found["difference"].position, rtol=0, atol=0.01
+    )
+    np.testing.assert_allclose(
+        found["time"].pose_cov[:2, :2], found["difference"].pose_cov[:2, :2], rtol=0.02, atol=1e-5
+    )
+
+
+def test_differences_to_several_references_at_one_stamp_are_no_duplicates() -> None:
+    pairs = [("b", "a"), ("c", "b"), ("c", "a"), ("d", "c"), ("e", "d")]
+    items = [tdoa(START_NS, n, ref, distance(n) - distance(ref)) for n, ref in pairs]
+    made = tracker()
+    fix = fix_of(said(made, number_beacons(items)))
+    assert np.linalg.norm(fix.position[:2] - PLACE[:2]) < 1.0
+    assert made.add(items[1]) == "duplicate"
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"reference_rsu_id": ""}, "no_reference"),
+        ({"reference_rsu_id": "b"}, "no_reference"),
+        ({"reference_rsu_id": "z"}, "unknown_reference"),
+        ({"tdoa_s": 64.0 / C}, "tdoa_too_large"),  # 60 m apart, 10 sd are 3 m
+        ({"tdoa_s": -64.0 / C}, "tdoa_too_large"),
+        ({"tdoa_s": 62.9 / C}, None),
+        ({"tdoa_s": float("nan")}, "not_finite"),
+        ({"tdoa_var": 0.0}, "variance"),
+    ],
+)
+def test_refusals(change: dict[str, Any], reason: str | None) -> None:
+    item = replace(tdoa(START_NS, "b", "a", 1.0), **change)
+    assert tracker().add(item) == reason
+
+
+def test_the_yard_is_tracked_close_to_its_bound(tmp_path: Path) -> None:
+    scenario = load_scenario("tdoa_yard")
+    ratios, nees = [], []
+    for seed in range(3):
+        simulate_to_bag(scenario.model_copy(update={"seed": seed}), tmp_path / f"in{seed}")
+        replay_bag(tmp_path / f"in{seed}", tmp_path / f"out{seed}", scenario.tracker)
+        figures = evaluate_bag(tmp_path / f"out{seed}").vues["vue_1"].scored.figures
+        assert figures.bound_ratio is not None
+        assert figures.nees_mean is not None
+        ratios.append(figures.bound_ratio)
+        nees.append(figures.nees_mean)
+        assert figures.protection_exceeded == 0.0
+    assert np.mean(ratios) < 1.15
+    assert 1.5 < np.mean(nees) < 2.5
+
+
+def test_a_bag_written_before_there_were_differences_is_read(tmp_path: Path) -> None:
+    """The shipped bag carries the older definition."""
+    shipped = Path(__file__).parents[5] / "bags" / "fast_pass"
+    with BagReader(shipped) as bag:
+        assert "tdoa" not in bag.topics["/rsu/measurements"].definition
+    replay_bag(shipped, tmp_path / "out")
+    with BagReader(shipped) as before, BagReader(tmp_path / "out") as after:
+        topic = ["/rsu/measurements"]
+        assert [e.cdr for e in before.messages(topic)] == [e.cdr for e in after.messages(topic)]
+        values = [codec().measurement_from_msg(e.message) for e in after.messages(topic)]
+    assert values
+    assert all(v.fields & Field.TOA and not v.reference_rsu_id for v in values)
+
+
+def test_a_real_drone(tmp_path: Path) -> None:
+    """Eight anchors one after the other; a planar track of a flight at about 1.5 m whose antenna
+    is 0.18 m off the tracked body."""
+    data = recordings("uwb_tdoa")
+    if data is None:
+        pytest.skip("uwb_tdoa is not there; set NETPOS_DATA to the folder of the recordings")
+    file = data / "const1_trial1_tdoa2.csv.gz"
+    places = [
+        *((-2.4175, -4.0208, 0.1818), (-2.8205, 3.5250, 2.5874), (3.4819, 3.3050, 0.1545)),
+        *((3.4507, -3.7181, 2.6693), (-3.2776, -3.8690, 2.6739), (3.2655, -3.6511, 0.1752)),
+        *((3.8321, 3.6521, 2.6249), (-2.7228, 3.2191, 0.1583)),
+    ]
+    counts = import_csv(
+        file,
+        tmp_path / "in",
+        Columns.parse(
+            "time=t_tdoa,rsu=idB,reference=idA,tdoa=tdoa_meas",
+            "tdoa=m",
+            "tdoa=0.1",
+            lever_arm_m=(0.0, 0.0, -0.18),
+        ),
+        [RsuInfo(rsu_id=str(i), position=np.array(xyz)) for i, xyz in enumerate(places)],
+        truth=Truth(source=file, columns=TruthColumns.parse("time=t_pose,x=pose_x,y=pose_y")),
+        tracker={"device_height_m": 1.5},
+    )
+    assert counts["/rsu/measurements"] == 67206
+    replay_bag(tmp_path / "in", tmp_path / "out")
+    figures = evaluate_bag(tmp_path / "out").vues["vue_1"].scored.figures
+    assert figures.rmse_m is not None
+    assert figures.nees_mean is not None
+    assert figures.rmse_m < 0.08
+    assert figures.nees_mean < 2.5
+    assert figures.protection_exceeded == 0.0
+    assert figures.lost_tracks == 0
