@@ -16,7 +16,17 @@ from netpos.messages.values import ImuSample
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.offline import simulate_to_bag
 from netpos_msgs.msg import Step
-from runs import PATIENT, TRACK_STATUS, changed_scenario, finish, graphs, messages, netpos, script
+from runs import (
+    PATIENT,
+    TRACK_STATUS,
+    changed_scenario,
+    finish,
+    graphs,
+    is_of_measurements,
+    messages,
+    netpos,
+    script,
+)
 
 RATE = 4
 
@@ -172,8 +182,9 @@ def test_the_run_script_dead_reckons_who_walks(
 
 
 def steps_learned(bag: Path) -> tuple[float, ...]:
-    """Length factor, heading offset and their sds as last said."""
-    said = {stamp_ns(s.header.stamp): s for s in messages(bag, TRACK_STATUS)}
+    """Length factor, heading offset and their sds as last said of measurements."""
+    statuses = filter(is_of_measurements, messages(bag, TRACK_STATUS))
+    said = {stamp_ns(s.header.stamp): s for s in statuses}
     last = said[max(said)]
     return (
         *(last.step_length_factor, last.step_length_factor_sd),
