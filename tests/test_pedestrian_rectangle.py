@@ -19,6 +19,7 @@ from runs import (
     finish,
     graphs,
     horizontal_errors,
+    is_of_measurements,
     messages,
     netpos,
     script,
@@ -94,7 +95,7 @@ def test_measurements_are_ranges_and_wrapped_phases(recorded: Recorded) -> None:
 
 
 def test_the_sector_is_open_until_steps_decide_it(recorded: Recorded) -> None:
-    statuses = messages(recorded.live, TRACK_STATUS)
+    statuses = list(filter(is_of_measurements, messages(recorded.live, TRACK_STATUS)))
     states = [s.state for s in statuses]
     first = states.index(TrackState.TRACKING)
     assert first > 5  # standing still decides nothing
