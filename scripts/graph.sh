@@ -105,15 +105,6 @@ graph_abandon() { # the script ends early (Ctrl-C, an error): leave nothing runn
   stop "${!pid_of[@]}" 2>/dev/null
 }
 
-parameters_of() { # SCENARIO_OR_BAG [ARGUMENT...]: the tracker's parameters, as a recording keeps them, in `parameters`
-  local file
-  file=$(mktemp)
-  python "$NETPOS_ROOT/scripts/tracker_metadata.py" "$@" >"$file" || { rm -f "$file"; give_up; }
-  # shellcheck disable=SC2034 # for the script that sources this file
-  mapfile -d '' -t parameters <"$file"
-  rm -f "$file"
-}
-
 start_trackers() { # SCENARIO_OR_BAG [ARGUMENT...]: one tracker, or one per network and the fusion of their tracks; waits
   local source=$1 network names
   shift

@@ -22,8 +22,7 @@ bag=${positional[0]} out=${positional[1]} rate=${positional[2]:-1}
 . "$NETPOS_ROOT/scripts/graph.sh"
 
 graph_begin "$(basename "$out")"
-parameters_of "$bag" "$@"
-start netpos_record netpos_bag record --output "$out" --log-time clock --metadata "${parameters[@]}"
+start netpos_record netpos_bag record --output "$out" --log-time clock
 start_up netpos_record
 start_trackers "$bag" "$@"
 start netpos_play netpos_bag play "$bag" --rate "$rate" --input-only --subscribers "$((1 + ${#trackers[@]}))" --wait-timeout 60

@@ -20,8 +20,7 @@ scenario=${positional[0]} bag=${positional[1]} rate=${positional[2]:-1} seed=${p
 . "$NETPOS_ROOT/scripts/graph.sh"
 
 graph_begin "$(basename "$bag")"
-parameters_of "$scenario" "$@"
-start netpos_record netpos_bag record --output "$bag" --log-time clock --metadata scenario="$scenario" seed="$seed" rate="$rate" "${parameters[@]}"
+start netpos_record netpos_bag record --output "$bag" --log-time clock
 start_up netpos_record # first of all: what is published before a recorder is up is lost
 start_trackers "$scenario" "$@"
 start rsu_sensor rsu_sensor rsu_sensor --ros-args -p scenario:="$scenario" -p seed:="$seed" -p subscribers:="$((1 + ${#trackers[@]}))"

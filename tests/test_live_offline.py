@@ -10,6 +10,7 @@ import pytest
 import yaml
 from netpos.bags import BagReader
 from netpos.bags.qos import is_latched, is_reliable
+from netpos.scenario.load import scenario_of_text
 from runs import (
     ESTIMATES,
     INFOS,
@@ -107,15 +108,18 @@ def test_a_live_recording_carries_the_parameters_of_its_tracker(pairs: dict[str,
     """The same as an offline one: replaying it does not depend on a scenario that may change."""
     for pair in pairs.values():
         with BagReader(pair.live) as live, BagReader(pair.offline) as offline:
-            assert yaml.safe_load(live.metadata["tracker"])["device_height_m"] is not None
-            assert live.metadata["tracker"] == offline.metadata["tracker"]
+            (said,) = live.facts["tracker"]
+            assert yaml.safe_load(said)["device_height_m"] is not None
+            assert offline.facts["tracker"] == (said,)
+            assert live.facts["scenario"] == offline.facts["scenario"]
 
 
 def test_a_live_recording_notes_run_and_qos(pairs: dict[str, Pair]) -> None:
     with BagReader(pairs["metis"].live) as bag:
-        assert bag.metadata["seed"] == SEED
-        assert bag.metadata["rate"] == "4"
-        assert bag.metadata["scenario"].endswith("metis_short.yaml")
+        (text,) = bag.facts["scenario"]
+        scenario = scenario_of_text(text, bag.path)
+        assert (scenario.name, str(scenario.seed)) == ("metis_short", SEED)
+        assert bag.facts["rate"] == ("4",)
         assert is_latched(bag.topics[INFOS].qos)
         for topic in (MEASUREMENTS, *ESTIMATES, *pairs["metis"].topics):
             assert is_reliable(bag.topics[topic].qos)

@@ -11,10 +11,21 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStam
 from netpos.messages import topics
 from netpos.messages.values import RsuMeasurement as Measurement
 from netpos.tracking import Tracker, TrackOutput
+from netpos.tracking.settings import tracker_fact
 from netpos.tracking.validation import explanation
 from netpos.tracking.warm_up import warm_up, warm_up_anchors, warm_up_components
 from netpos_msgs.msg import NetworkTrack, RsuErrors, RsuInfo, RsuMeasurement
-from netpos_node import BACKLOG, CDR, CODEC, LATCHED, STREAM, patience, run, take_waiting
+from netpos_node import (
+    BACKLOG,
+    CDR,
+    CODEC,
+    LATCHED,
+    STREAM,
+    patience,
+    run,
+    say_of_run,
+    take_waiting,
+)
 from netpos_node.estimating import EstimatingNode
 from sensor_msgs.msg import Imu
 
@@ -54,6 +65,7 @@ class EkfTrackerNode(EstimatingNode):
         extra = [self._track_pub] if self._track_pub is not None else []
         self._wait_for_subscribers(parameters.subscribers, extra)
         self._listen(RsuMeasurement, topics.RSU_MEASUREMENTS, self._on_measurement, raw=True)
+        say_of_run(self, topics.RUN_ESTIMATOR, tracker_fact(parameters.config))
         self._be_ready()
         self.get_logger().info(f"tracking {', '.join(parameters.vue_ids)}")
 

@@ -9,8 +9,9 @@ from typing import Any
 
 import rclpy
 from netpos.bags import BagEntry, BagReader
-from netpos.messages.topics import CLOCK
-from netpos_node import init, message_class, wait_until_heard
+from netpos.messages.topics import CLOCK, RUN_SCENARIO
+from netpos.tracking.settings import FUSION_FACT, TRACKER_FACT
+from netpos_node import init, message_class, say_of_run, wait_until_heard
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -22,6 +23,7 @@ from netpos_bag.conversions import clock_cdr, profile_to_play
 from netpos_bag.parameters import PlayConfig, play_config, play_flags
 from netpos_bag.playback import Plan
 
+_NOT_OF_THE_INPUT = (TRACKER_FACT, FUSION_FACT, "netpos_version")
 ACK_S = 5.0  # Fast DDS asks its readers every 3 s
 LINGER_S = 0.5  # latched messages stay available for so long after the end
 
@@ -36,6 +38,9 @@ class PlayNode(Node):
         self.plan = Plan.make(self.bag, self.config)
         self.outlets = {topic: self._outlet(topic) for topic in self.plan.topics}
         self.counts = dict.fromkeys(self.outlets, 0)
+        if RUN_SCENARIO not in self.bag.topics:
+            noted = {k: v for k, v in self.bag.metadata.items() if k not in _NOT_OF_THE_INPUT}
+            say_of_run(self, RUN_SCENARIO, noted)
         clock_class = message_class("rosgraph_msgs/msg/Clock")
         self._ticker = self.create_publisher(clock_class, CLOCK, 10)
         self.max_lag_s = 0.0

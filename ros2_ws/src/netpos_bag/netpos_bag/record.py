@@ -1,112 +1,133 @@
-"""Record the topics of a running graph: ``ros2 run netpos_bag record --output DIR``."""
+"""Record the topics of a running graph: ``ros2 run netpos_bag record --output DIR``.
+
+The recorder asks its subscriptions in turn for what has arrived: an executor looks at every topic
+for each message, which of some hundred topics costs more than the messages.
+"""
 
 from __future__ import annotations
 
 import signal
 import sys
 import time
-from collections import Counter
-from collections.abc import Callable
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import rclpy
+import yaml
 from netpos import __version__
-from netpos.bags import BagError, BagWriter
-from netpos.messages.topics import CLOCK
-from netpos_node import init, message_class
-from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.executors import SingleThreadedExecutor
+from netpos.bags import LOST_METADATA, BagError, BagWriter
+from netpos.messages.topics import CLOCK, RUN_TOPICS
+from netpos_node import init, message_class, waiting
 from rclpy.node import Node
+from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 from rclpy.utilities import remove_ros_args
 
 from netpos_bag.conversions import clock_ns, profile_to_bag, profile_to_record, unique
+from netpos_bag.losses import Losses
 from netpos_bag.parameters import RecordConfig, record_config, record_flags
 from netpos_bag.recording import Recording
 
-POLL_S = 0.05
-FLUSH_S = 0.25
-DRAIN_S = 0.3  # after the signal to stop, what is on its way still arrives
-CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
+_TAKE_S = 0.01
+_LOOK_S = 0.05
+_FLUSH_S = 0.25
+_WARN_S = 2.0
+_DRAIN_S = 0.3  # after the signal to stop, what is on its way still arrives
 
 
 class RecordNode(Node):
     """Subscribes to topics as they appear and writes what they bring."""
 
     def __init__(self, flags: dict[str, Any]) -> None:
-        super().__init__("netpos_record")
+        super().__init__("netpos_record", start_parameter_services=False)
         self.config: RecordConfig = record_config(self, flags)
         pairs = (item.partition("=") for item in self.config.metadata)
         run = {"netpos_version": __version__} | {key: value for key, _, value in pairs}
         self.writer = BagWriter(self.config.output, metadata=run)
         self.recording = Recording(self.writer, self.config.log_time)
-        self.lost: Counter[str] = Counter()
-        self._known: set[str] = set()
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(POLL_S, self._look_for_topics, clock=steady)
-        self.create_timer(FLUSH_S, self._tick, clock=steady)
-        self._look_for_topics()
+        self._topics: dict[str, _Topic] = {}
+        self._left_out: set[str] = set()
+        self._due_s = dict.fromkeys((self._look_for_topics, self._tick), 0.0)
+
+    def run(self, stopping: list[int], seconds: float = float("inf")) -> None:
+        """Record until ``stopping`` holds a signal, at most ``seconds``."""
+        end_s = time.monotonic() + seconds
+        while not stopping and (now_s := time.monotonic()) < end_s:
+            for task, period_s in ((self._look_for_topics, _LOOK_S), (self._tick, _FLUSH_S)):
+                if now_s >= self._due_s[task]:
+                    self._due_s[task] = now_s + period_s
+                    task()
+            self._take()
+            time.sleep(_TAKE_S)
 
     def _look_for_topics(self) -> None:
-        for topic, types in self.get_topic_names_and_types():
-            if topic not in self._known and self.count_publishers(topic):
-                self._known.add(topic)
-                self._subscribe(topic, types)
+        for name, types in self.get_topic_names_and_types():
+            publishers = self.count_publishers(name)
+            known = self._topics.get(name)
+            if known is None and publishers and name not in self._left_out:
+                self._subscribe(name, types)
+            elif known is not None and publishers > known.publishers:
+                self._check_publishers(known)
 
-    def _subscribe(self, topic: str, types: list[str]) -> None:
-        wanted = not self.config.topics or topic in self.config.topics
-        if not wanted and topic != CLOCK:
+    def _subscribe(self, name: str, types: list[str]) -> None:
+        wanted = not self.config.topics or name in (*self.config.topics, *RUN_TOPICS)
+        if not wanted and name != CLOCK:
             return
         if len(types) > 1:
-            self._leave_out(topic, f"it has several types: {', '.join(types)}")
+            self._leave_out(name, f"it has several types: {', '.join(types)}")
             return
-        offered = unique(
-            profile_to_bag(info.qos_profile) for info in self.get_publishers_info_by_topic(topic)
-        )
+        offered = [info.qos_profile for info in self.get_publishers_info_by_topic(name)]
+        noted = unique(map(profile_to_bag, offered))
         try:
             kind = message_class(types[0])
             if wanted:
-                self.writer.add_topic(topic, types[0], offered)
+                self.writer.add_topic(name, types[0], noted)
         except (BagError, ImportError, AttributeError) as error:
-            self._leave_out(topic, str(error))
+            self._leave_out(name, str(error))
             return
-        events = SubscriptionEventCallbacks(
-            message_lost=partial(self._on_lost, topic),
-            incompatible_qos=partial(self._on_incompatible, topic),
-        )
-        receive = self._on_clock if topic == CLOCK else self._on_message
-        self.create_subscription(
-            kind,
-            topic,
-            partial(receive, topic, types[0], wanted),
-            profile_to_record(offered),
-            event_callbacks=events,
-            raw=True,
+        profile = profile_to_record(noted)
+        subscription = self.create_subscription(kind, name, lambda _: None, profile, raw=True)
+        losses = Losses(partial(self.count_publishers, name))
+        self._topics[name] = _Topic(
+            name, types[0] if wanted else "", subscription, profile, losses, len(offered)
         )
 
-    def _leave_out(self, topic: str, reason: str) -> None:
-        self.get_logger().warning(f"{topic} is not recorded: {reason}")
+    def _leave_out(self, name: str, reason: str) -> None:
+        self._left_out.add(name)
+        self.get_logger().warning(f"{name} is not recorded: {reason}")
 
-    def _on_lost(self, topic: str, event: Any) -> None:
-        self.lost[topic] += event.total_count_change
-        self.get_logger().warning(
-            f"{topic}: {self.lost[topic]} messages lost", throttle_duration_sec=2.0
-        )
+    def _check_publishers(self, topic: _Topic) -> None:
+        """Tell of publishers that offer less than what was asked of the first ones."""
+        infos = self.get_publishers_info_by_topic(topic.name)
+        topic.publishers = len(infos)
+        for info in infos:
+            fits, reason = qos_check_compatible(info.qos_profile, topic.profile)
+            if fits == QoSCompatibility.ERROR:
+                self.get_logger().warning(
+                    f"{topic.name}: {info.node_name} is not recorded: it offers less than the "
+                    f"first publisher did ({reason})"
+                )
 
-    def _on_incompatible(self, topic: str, event: Any) -> None:
-        self.get_logger().warning(
-            f"{topic}: a publisher offers less than the first one did; it is not recorded"
-        )
-
-    def _on_clock(self, topic: str, type_name: str, wanted: bool, cdr: bytes) -> None:
-        self.recording.clock(clock_ns(cdr))
-        if wanted:
-            self._on_message(topic, type_name, wanted, cdr)
-
-    def _on_message(self, topic: str, type_name: str, wanted: bool, cdr: bytes) -> None:
-        self.recording.message(topic, type_name, cdr, time.time_ns())
+    def _take(self) -> None:
+        """Write what has arrived, in the order of arrival."""
+        arrived = [
+            (told["received_timestamp"], topic, cdr, told["publication_sequence_number"])
+            for topic in self._topics.values()
+            for cdr, told in waiting(topic.subscription)
+        ]
+        wall_ns = time.time_ns()
+        for _, topic, cdr, number in sorted(arrived, key=itemgetter(0)):
+            if topic.losses.arrived(number):
+                self.get_logger().warning(
+                    f"{topic.name}: {topic.losses.count} messages lost",
+                    throttle_duration_sec=_WARN_S,
+                )
+            if topic.name == CLOCK:
+                self.recording.clock(clock_ns(cdr))
+            if topic.type_name:
+                self.recording.message(topic.name, topic.type_name, cdr, wall_ns)
 
     def _tick(self) -> None:
         jumps = self.recording.backward_jumps
@@ -117,6 +138,17 @@ class RecordNode(Node):
                 throttle_duration_sec=10.0,
             )
 
+    @property
+    def lost(self) -> dict[str, int]:
+        """Messages that were published and did not arrive, by topic."""
+        topics = sorted(self._topics.values(), key=lambda topic: topic.name)
+        return {topic.name: topic.losses.count for topic in topics if topic.losses.count}
+
+    def close(self) -> None:
+        """Note what was lost, and finish the bag."""
+        self.writer.note(LOST_METADATA, yaml.safe_dump(self.lost))
+        self.recording.close()
+
     def report(self) -> str:
         """Counts per topic, and what was lost."""
         counts = self.writer.counts
@@ -124,15 +156,30 @@ class RecordNode(Node):
         lines += [f"  {topic}: {count}" for topic, count in sorted(counts.items())]
         missing = sorted(set(self.config.topics) - counts.keys())
         lines += [f"  MISSING {topic}: nothing was published" for topic in missing]
-        lines += [f"  LOST {topic}: {count}" for topic, count in sorted(self.lost.items())]
+        lines += [f"  LOST {topic}: {count}" for topic, count in self.lost.items()]
         return "\n".join(lines)
 
 
-def spin_until(executor: SingleThreadedExecutor, done: Callable[[], bool], seconds: float) -> None:
-    """Spin until ``done``, at most ``seconds``."""
-    end = time.monotonic() + seconds
-    while not done() and time.monotonic() < end:
-        executor.spin_once(timeout_sec=POLL_S)
+class _Topic:
+    """A topic that is listened to; ``type_name`` is empty where it is not recorded."""
+
+    __slots__ = ("losses", "name", "profile", "publishers", "subscription", "type_name")
+
+    def __init__(
+        self,
+        name: str,
+        type_name: str,
+        subscription: Subscription,
+        profile: QoSProfile,
+        losses: Losses,
+        publishers: int,
+    ) -> None:
+        self.name = name
+        self.type_name = type_name
+        self.subscription = subscription
+        self.profile = profile
+        self.losses = losses
+        self.publishers = publishers
 
 
 def main() -> None:
@@ -148,14 +195,12 @@ def main() -> None:
         rclpy.try_shutdown()
         print(f"record: {error}", file=sys.stderr)
         sys.exit(2)
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
     try:
         print(f"recording to {node.config.output}", flush=True)
-        spin_until(executor, lambda: bool(stopping), float("inf"))
-        spin_until(executor, lambda: False, DRAIN_S)
+        node.run(stopping)
+        node.run([], _DRAIN_S)
     finally:
-        node.recording.close()
+        node.close()
         rclpy.try_shutdown()
     print(node.report(), flush=True)
 

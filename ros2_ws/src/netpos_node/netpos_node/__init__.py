@@ -16,6 +16,7 @@ from threading import Event, Thread
 from typing import Any, TypeVar
 
 import rclpy
+from diagnostic_msgs.msg import KeyValue
 from netpos.bags import cdr_codec
 from netpos.messages.codec import Codec
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -202,12 +203,25 @@ def spin_until_stopped(node: Node, finish: Callable[[], None]) -> None:
     finish()
 
 
-def take_waiting(subscription: Subscription, on_message: Callable[[Any], None]) -> None:
-    """Hand over all that has arrived of a subscription."""
+def waiting(subscription: Subscription) -> Iterator[tuple[Any, Mapping[str, Any]]]:
+    """What has arrived of a subscription, each message with what the middleware says of it."""
     kind = subscription.msg_type, subscription.raw
     with subscription.handle:
         while taken := subscription.handle.take_message(*kind):
-            on_message(taken[0])
+            yield taken
+
+
+def take_waiting(subscription: Subscription, on_message: Callable[[Any], None]) -> None:
+    """Hand over all that has arrived of a subscription."""
+    for message, _ in waiting(subscription):
+        on_message(message)
+
+
+def say_of_run(node: Node, topic: str, facts: Mapping[str, str]) -> None:
+    """Tell whoever records, now or later, what a recording should say of its run."""
+    publisher = node.create_publisher(KeyValue, topic, LATCHED)
+    for key, value in facts.items():
+        publisher.publish(KeyValue(key=key, value=value))
 
 
 def see_delivered(node: Node) -> None:

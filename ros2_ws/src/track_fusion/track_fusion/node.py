@@ -8,8 +8,9 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from netpos.messages import topics
 from netpos.tracking.networks.tertiary import TrackFusion
+from netpos.tracking.settings import fusion_fact
 from netpos_msgs.msg import NetworkTrack
-from netpos_node import run
+from netpos_node import run, say_of_run
 from netpos_node.estimating import EstimatingNode
 
 from track_fusion.conversions import diagnostics_to_msg, network_track_from_msg
@@ -30,6 +31,8 @@ class TrackFusionNode(EstimatingNode):
         self._wait_for_subscribers(parameters.subscribers)
         for network in parameters.networks:
             self._listen(NetworkTrack, topics.tracks_of(network), self._on_track)
+        fact = fusion_fact(parameters.networks, parameters.config)
+        say_of_run(self, topics.RUN_ESTIMATOR, fact)
         self._be_ready()
         self.get_logger().info(f"fusing the tracks of {', '.join(parameters.networks)}")
 

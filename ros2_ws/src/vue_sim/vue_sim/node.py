@@ -8,11 +8,12 @@ from contextlib import suppress
 from threading import Thread
 from typing import Any
 
-from netpos.messages.topics import BEACON, CLOCK, IMU, INITIAL_POSE, MAG, split
+from netpos.messages.topics import BEACON, CLOCK, IMU, INITIAL_POSE, MAG, RUN_SCENARIO, split
 from netpos.messages.values import InitialPose
 from netpos.scenario import Simulation
+from netpos.scenario.load import scenario_text
 from netpos.scenario.offline import timeline
-from netpos_node import LATCHED, STREAM, run, wait_until_heard
+from netpos_node import LATCHED, STREAM, run, say_of_run, wait_until_heard
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -65,6 +66,11 @@ class VueSimNode(Node):
             topic: self.create_publisher(message_class, topic, _qos(topic))
             for topic, message_class in publications(self._settings.scenario).items()
         }
+        facts = {
+            "scenario": scenario_text(self._settings.scenario),
+            "rate": f"{self._settings.rate:g}",
+        }
+        say_of_run(self, RUN_SCENARIO, facts)
 
     def play(self) -> None:
         """Wait to be heard, publish everything at its time, wait for delivery."""

@@ -5,11 +5,13 @@ killed recorder left, ``netpos.bags.importers`` turn other people's recordings i
 """
 
 from netpos.bags.errors import BagError
+from netpos.bags.layout import LOST_METADATA
 from netpos.bags.reader import BagEntry, BagReader, TopicInfo
 from netpos.bags.types import cdr_codec, codec, has_common_definition, typestore
 from netpos.bags.writer import BagWriter, whole_bag
 
 __all__ = [
+    "LOST_METADATA",
     "BagEntry",
     "BagError",
     "BagReader",

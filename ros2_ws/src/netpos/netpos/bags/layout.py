@@ -19,6 +19,7 @@ ROS_DISTRO = "jazzy"
 METADATA_FILE = "metadata.yaml"
 LIBRARY = "netpos"  # first word of the library in the MCAP header
 RUN_RECORD = "netpos"  # MCAP metadata record of the run; custom_data in metadata.yaml
+LOST_METADATA = "lost"  # messages that a recorder missed, by topic, as YAML
 DEFINITION_ATTACHMENT = "netpos/definition"  # schema and channel record of one topic
 ROSBAG2_RECORD = "rosbag2"  # MCAP metadata record in which rosbag2 repeats metadata.yaml
 

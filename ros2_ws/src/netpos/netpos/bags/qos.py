@@ -11,7 +11,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 
-from netpos.messages.topics import CLOCK, INITIAL_POSE, RSU_INFO, split
+from netpos.messages.topics import CLOCK, INITIAL_POSE, RSU_INFO, RUN_TOPICS, split
 
 INFINITE = QosTime(9223372036, 854775807)
 
@@ -32,11 +32,12 @@ def profile(*, reliable: bool = True, latched: bool = False, depth: int = 1000) 
 
 
 def default_profile(topic: str) -> Qos:
-    """What the nodes of netpos offer on ``topic``: all reliable; /rsu/info and initial poses
-    latched."""
+    """What the nodes of netpos offer on ``topic``: all reliable; /rsu/info, initial poses and
+    what is said of the run latched."""
     if topic == CLOCK:
         return profile(depth=10)
-    return profile(latched=topic == RSU_INFO or split(topic)[1] == INITIAL_POSE)
+    latched = topic in (RSU_INFO, *RUN_TOPICS) or split(topic)[1] == INITIAL_POSE
+    return profile(latched=latched)
 
 
 def is_latched(profiles: list[Qos]) -> bool:

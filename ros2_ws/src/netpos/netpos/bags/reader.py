@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -19,6 +20,7 @@ from netpos.bags.errors import BagError
 from netpos.bags.scan import summary_is_sound
 from netpos.bags.single_file import open_single_file
 from netpos.bags.types import require_type, store_of_definition
+from netpos.messages.topics import RUN_TOPICS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,10 +179,26 @@ class BagReader:
         if self.path.is_dir():
             return _texts(getattr(self._reader.storage.metadata, "custom", None) or {})
         with self.path.open("rb") as stream:
-            for record in make_reader(stream).iter_metadata():
-                if record.name == layout.RUN_RECORD:
-                    return dict(record.metadata)
-        return {}
+            records = [
+                record.metadata
+                for record in make_reader(stream).iter_metadata()
+                if record.name == layout.RUN_RECORD
+            ]
+        return {key: value for record in records for key, value in record.items()}
+
+    @cached_property
+    def facts(self) -> dict[str, tuple[str, ...]]:
+        """What is known of the run, by name: the metadata, and what nodes said on its topics.
+
+        Several values where they do not agree.
+        """
+        found = {key: [value] for key, value in self.metadata.items()}
+        for entry in self.messages(self.topics.keys() & set(RUN_TOPICS)):
+            said = entry.message
+            values = found.setdefault(str(said.key), [])
+            if said.value not in values:
+                values.append(str(said.value))
+        return {key: tuple(values) for key, values in found.items()}
 
     def _decode(self, topic: str, cdr: bytes) -> Any:
         info = self.topics[topic]

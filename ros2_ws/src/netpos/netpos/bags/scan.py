@@ -231,7 +231,7 @@ def _take(found: Scan, position: int) -> int:
     elif isinstance(record, (Schema, Channel)):
         found.define(record, verified=False)
     elif isinstance(record, Metadata):
-        found.metadata.setdefault(record.name, record.metadata)
+        found.metadata.setdefault(record.name, {}).update(record.metadata)
     elif isinstance(record, Attachment) and record.name == DEFINITION_ATTACHMENT:
         _take_definition(found, record.data)
     found.complete = isinstance(record, Footer)

@@ -19,9 +19,7 @@ from netpos.bags.errors import BagError
 from netpos.bags.qos import default_profile
 from netpos.bags.types import check_type_name, definition, require_type, type_hash
 
-CHUNK_BYTES = (
-    64 * 1024
-)  # of uncompressed messages; what a kill may lose between two calls of flush()
+CHUNK_BYTES = 1024 * 1024  # of uncompressed messages; its index stays in memory to the end
 MAX_TIME_NS = 2**63 - 1
 
 
@@ -172,6 +170,11 @@ class BagWriter:
             entry.count & 0xFFFFFFFF,
         )
         entry.count += 1
+
+    def note(self, key: str, value: str) -> None:
+        """Add to the metadata what is known only now."""
+        self._run[key] = value
+        self._mcap.add_metadata(layout.RUN_RECORD, {key: value})
 
     def flush(self) -> None:
         """Close the chunk in progress and hand everything to the operating system."""

@@ -103,11 +103,11 @@ def _truth_from(
     from netpos.bags.importers.own import truth_of  # noqa: PLC0415
     from netpos.bags.importers.own.truth import ODOMETRY  # noqa: PLC0415
     from netpos.cli.own_recordings import truth_option  # noqa: PLC0415
+    from netpos.evaluation.evaluate import config_of  # noqa: PLC0415
     from netpos.tracking.config import TrackerConfig  # noqa: PLC0415
-    from netpos.tracking.settings import bag_settings  # noqa: PLC0415
 
     with BagReader(bag) as reader:
-        config = TrackerConfig.from_mapping(bag_settings(reader.metadata).parameters)
+        config = config_of(reader) or TrackerConfig()
     if topic is not None and mapping is None:
         mapping = ",".join(f"{name}={place}" for name, place in ODOMETRY.items())
     named: Path | str = source if topic is None else topic

@@ -19,6 +19,7 @@ from netpos.cli.errors import WorkFailedError
 
 if TYPE_CHECKING:
     from netpos.scenario import Scenario
+    from netpos.tracking.settings import TrackerSettings
 
 
 def scenarios() -> None:
@@ -101,11 +102,23 @@ def replay(
         bool,
         typer.Option("--smooth", help="Add the odometry of every epoch given all measurements."),
     ] = False,
+    parameters: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SOURCE",
+            help="Whose tracker parameters: a scenario, another bag, or 'defaults'. "
+            "Default: the bag's own.",
+        ),
+    ] = None,
 ) -> None:
     """Estimate again from the recorded measurements, without ROS."""
+    from netpos.tracking.settings import settings_from  # noqa: PLC0415
+
     overrides = dict(parse_setting(text) for text in settings or [])
     refuse_existing(out)
-    _track(bag, out, overrides, smooth=smooth)
+    source = "" if parameters in (None, "defaults") else str(parameters)
+    given = None if parameters is None else settings_from(source)
+    _track(bag, out, overrides, smooth=smooth, settings=given, source=parameters or str(bag))
     if smooth:
         _tell_gain(out)
     typer.echo(f"wrote {out}")
@@ -148,10 +161,30 @@ def refuse_existing(path: Path) -> None:
         )
 
 
-def _track(bag: Path, out: Path, overrides: Mapping[str, object], *, smooth: bool = False) -> None:
+def _track(
+    bag: Path,
+    out: Path,
+    overrides: Mapping[str, object],
+    *,
+    smooth: bool = False,
+    settings: TrackerSettings | None = None,
+    source: str,
+) -> None:
+    """Replay ``bag`` with parameters of ``source``, and tell of it."""
     from rich.console import Console  # noqa: PLC0415
 
+    from netpos.bags import BagReader  # noqa: PLC0415
     from netpos.tracking.replay import replay_bag  # noqa: PLC0415
+    from netpos.tracking.settings import bag_settings  # noqa: PLC0415
+
+    if settings is None:
+        with BagReader(bag) as reader:
+            try:
+                settings = bag_settings(reader)
+            except ValueError as error:
+                raise ValueError(
+                    f"{error}; give --parameters SCENARIO, another BAG, or 'defaults'"
+                ) from error
 
     with Console(stderr=True).status("tracking") as status:
 
@@ -159,7 +192,9 @@ def _track(bag: Path, out: Path, overrides: Mapping[str, object], *, smooth: boo
             if done % 500 == 0:
                 status.update(f"tracking: {done} messages")
 
-        summary = replay_bag(bag, out, overrides, show, smooth=smooth)
+        summary = replay_bag(bag, out, overrides, show, smooth=smooth, settings=settings)
+    others = ", ".join(f"{name} {value}" for name, value in summary.parameters.items())
+    typer.echo(f"tracker parameters of {source}; not the default: {others or 'none'}")
     typer.echo(f"{summary.epochs} epochs")
     for vue, counts in sorted(summary.rejected.items()):
         reasons = ", ".join(f"{reason} {n}" for reason, n in sorted(counts.items()) if n)
@@ -182,7 +217,7 @@ def _run_offline(scenario: Scenario, target: Path) -> None:
         simulated = Path(folder) / target.name
         with Console(stderr=True).status("simulating"):
             simulate_to_bag(scenario, simulated)
-        _track(simulated, target, scenario.tracker)
+        _track(simulated, target, scenario.tracker, source=scenario.name)
 
 
 def _run_live(scenario: str, target: Path, rate: float, seed: int) -> None:
@@ -206,6 +241,17 @@ def _run_live(scenario: str, target: Path, rate: float, seed: int) -> None:
         raise WorkFailedError(f"the graph ended with status {status}; its messages are above")
     if not target.exists():
         raise WorkFailedError(f"the graph ended without a recording at {target}")
+    _tell_losses(target)
+
+
+def _tell_losses(bag: Path) -> None:
+    """What the recorder missed."""
+    from netpos.bags import BagReader  # noqa: PLC0415
+    from netpos.evaluation.evaluate import lost_of  # noqa: PLC0415
+
+    with BagReader(bag) as reader:
+        for sentence in lost_of(reader):
+            typer.echo(f"netpos: {sentence}", err=True)
 
 
 def _wait(graph: subprocess.Popen[bytes]) -> int:

@@ -9,8 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from netpos.bags import BagReader, codec
+from netpos.bags import LOST_METADATA, BagReader, codec
 from netpos.bags.recording import SKIPPED, TRUTH_ALIGNMENT
+from netpos.bags.single_file import load_yaml
 from netpos.evaluation.metrics import SKIP_EPOCHS, Figures, Run, Scored, score
 from netpos.evaluation.pairing import Trajectory
 from netpos.evaluation.recorded_bound import recorded_bound_m
@@ -278,10 +279,10 @@ def _read(bag: BagReader, vues: list[str], networks: list[tuple[str, str]]) -> _
     return recording
 
 
-def _config_of(bag: BagReader) -> TrackerConfig | None:
-    """Parameters of the tracker, None where the scenario the bag names is not to be found."""
+def config_of(bag: BagReader) -> TrackerConfig | None:
+    """Parameters of the tracker, None where the bag does not say."""
     try:
-        return TrackerConfig.from_mapping(bag_settings(bag.metadata).parameters)
+        return TrackerConfig.from_mapping(bag_settings(bag).parameters)
     except ValueError:
         return None
 
@@ -306,12 +307,18 @@ def _with_bound(
     return replace(scored, figures=replace(scored.figures, bound_ratio=rmse / bound))
 
 
-def notes_of(metadata: Mapping[str, str]) -> tuple[str, ...]:
-    """What the metadata of a bag says was done to its data on import."""
-    notes = [metadata[TRUTH_ALIGNMENT]] if TRUTH_ALIGNMENT in metadata else []
-    if SKIPPED in metadata:
-        notes.append(f"skipped on import: {metadata[SKIPPED]}")
-    return tuple(notes)
+def notes_of(bag: BagReader) -> tuple[str, ...]:
+    """What a bag says is missing in it, and what was done to its data on import."""
+    facts = bag.facts
+    skipped = [f"skipped on import: {text}" for text in facts.get(SKIPPED, ())]
+    return (*lost_of(bag), *facts.get(TRUTH_ALIGNMENT, ()), *skipped)
+
+
+def lost_of(bag: BagReader) -> list[str]:
+    """What recorders say they missed, a sentence each; none where nothing was lost."""
+    found = [load_yaml(text) or {} for text in bag.facts.get(LOST_METADATA, ())]
+    told = [", ".join(f"{n} of {topic}" for topic, n in sorted(lost.items())) for lost in found]
+    return [f"LOST while recording: {text}" for text in told if text]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -340,9 +347,9 @@ def _contents(path: Path, choose: Callable[[BagReader], list[str]]) -> _Contents
             recording=recording,
             rsus=tuple(recording.rsus[name] for name in sorted(recording.rsus)),
             topics={topic: (info.type_name, info.count) for topic, info in bag.topics.items()},
-            buildings=buildings_of(bag.metadata),
-            config=_config_of(bag),
-            notes=notes_of(bag.metadata),
+            buildings=buildings_of(bag),
+            config=config_of(bag),
+            notes=notes_of(bag),
         )
 
 

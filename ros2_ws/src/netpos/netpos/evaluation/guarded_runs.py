@@ -203,7 +203,7 @@ def _material_of(bag: Path) -> Material:
     make, truth = codec(), defaultdict(list)
     items: list[Item | ImuSample] = []
     with BagReader(bag) as source:
-        settings = bag_settings(source.metadata)
+        settings = bag_settings(source)
         config = TrackerConfig.from_mapping(settings.parameters)
         read = {name: reading_of(name, info, config) for name, info in source.topics.items()}
         infos = source.messages([topics.RSU_INFO])

@@ -102,7 +102,7 @@ def recording_row(recording: Recording, folder: Path) -> Json:
 def _learning(bag: Path) -> bool | None:
     """Whether the tracker of a bag learns the errors of RSUs; None: its motion model cannot."""
     with BagReader(bag) as source:
-        config = TrackerConfig.from_mapping(bag_settings(source.metadata).parameters)
+        config = TrackerConfig.from_mapping(bag_settings(source).parameters)
     return None if config.motion_model == "strapdown" else config.learn_errors
 
 
@@ -110,7 +110,7 @@ def default_parameters(bag: Path) -> Json:
     """Overrides that give every parameter a bag carries its default again, but for the facts of
     the recording (``FACTS``)."""
     with BagReader(bag) as source:
-        carried = bag_settings(source.metadata).parameters
+        carried = bag_settings(source).parameters
     usual = TrackerConfig()
     return {name: getattr(usual, name) for name in carried if name not in FACTS}
 

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
+from netpos.bags import BagReader
 from netpos.messages.values import Array
 
 
-def buildings_of(metadata: Mapping[str, str]) -> Array:
-    """(k, 4) rectangles x_min, y_min, x_max, y_max [m] of the scenario the bag names.
+def buildings_of(bag: BagReader) -> Array:
+    """(k, 4) rectangles x_min, y_min, x_max, y_max [m] of the scenario in the bag.
 
-    None (k = 0) where the bag names no scenario, or one that is not installed: a map without
+    None (k = 0) where the bag holds no scenario, or none that this version reads: a map without
     buildings is then the honest one.
     """
-    from netpos.scenario import load_scenario, scenario_names  # noqa: PLC0415 - slow to load
-    from netpos.scenario.build import buildings_of as buildings_of_scenario  # noqa: PLC0415
+    from netpos.scenario.build import buildings_of as buildings_of_scenario  # noqa: PLC0415 - slow
+    from netpos.scenario.load import ScenarioError, scenario_of_text  # noqa: PLC0415
 
-    name = metadata.get("scenario")
-    if name is None or name not in scenario_names():
+    texts = bag.facts.get("scenario", ())
+    try:
+        return buildings_of_scenario(scenario_of_text(texts[-1], bag.path))
+    except (IndexError, ScenarioError):
         return np.zeros((0, 4))
-    return buildings_of_scenario(load_scenario(name))

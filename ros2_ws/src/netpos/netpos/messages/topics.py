@@ -9,6 +9,11 @@ RSU_LEARNED = "/rsu/learned"
 DIAGNOSTICS = "/diagnostics"
 TF = "/tf"
 
+# What nodes say of the run, latched: diagnostic_msgs/KeyValue with YAML.
+RUN_SCENARIO = "/run/scenario"  # of the simulator: scenario, rate
+RUN_ESTIMATOR = "/run/estimator"  # of trackers and fusion: their parameters
+RUN_TOPICS = (RUN_SCENARIO, RUN_ESTIMATOR)
+
 # Per device: /<vue>/<name>.
 BEACON = "beacon"
 GROUND_TRUTH = "ground_truth"
@@ -31,6 +36,7 @@ TRACKS = "tracks"
 TRACKER_OUTPUTS = (ODOMETRY, ODOMETRY_SMOOTHED, CLOCK_STATE, TRACK_STATUS)
 
 
+_NO_DEVICES = ("rsu", "run")
 _NAME_MAX = 100  # that of a device and of its network fit into a topic, of 247 characters in ROS
 
 
@@ -54,7 +60,8 @@ def tracks_of(network: str) -> str:
 def split(topic: str) -> tuple[str, str]:
     """Device and name of a device's topic; ("", topic) for any other."""
     parts = topic.strip("/").split("/")
-    return (parts[0], parts[1]) if len(parts) == 2 and parts[0] != "rsu" else ("", topic)
+    found = len(parts) == 2 and parts[0] not in _NO_DEVICES
+    return (parts[0], parts[1]) if found else ("", topic)
 
 
 def split_network(topic: str) -> tuple[str, str, str]:
@@ -68,6 +75,6 @@ def split_network(topic: str) -> tuple[str, str, str]:
 def is_tracker_output(topic: str) -> bool:
     """Whether a topic is published by a tracker or by the fusion of tracks (and left out when a
     bag is re-estimated)."""
-    if topic in (DIAGNOSTICS, RSU_LEARNED, TF) or topic.startswith(f"/{NETWORKS}/"):
+    if topic in (DIAGNOSTICS, RSU_LEARNED, RUN_ESTIMATOR, TF) or topic.startswith(f"/{NETWORKS}/"):
         return True
     return split(topic)[1] in TRACKER_OUTPUTS

@@ -66,18 +66,33 @@ def load_scenario(
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{path}: cannot be read: {error}") from error
+    return _parse(path, text, {} if seed is None else {"seed": seed}, changes or {})
+
+
+def scenario_text(scenario: Scenario) -> str:
+    """A scenario as YAML, with the seed it runs with; ``scenario_of_text`` reads it."""
+    content = scenario.model_dump(mode="json", exclude_unset=True)
+    return str(yaml.safe_dump({**content, "seed": scenario.seed}, sort_keys=False))
+
+
+def scenario_of_text(text: str, place: Path) -> Scenario:
+    """The scenario of a text found at ``place``. Raises ``ScenarioError`` as ``load_scenario``."""
+    return _parse(place, text, {}, {})
+
+
+def _parse(
+    path: Path, text: str, given: Mapping[str, object], changes: Mapping[str, object]
+) -> Scenario:
     node = _compose(path, text)
     content: dict[str, Any] = yaml.load(text, _Loader)
     content.setdefault("name", path.stem)
-    if seed is not None:
-        content["seed"] = seed
-    for key, value in (changes or {}).items():
+    content.update(given)
+    for key, value in changes.items():
         _change(content, key, value)
     try:
-        scenario = Scenario.model_validate(content)
+        return Scenario.model_validate(content)
     except ValidationError as error:
         raise ScenarioError(_describe(path, node, error)) from error
-    return scenario
 
 
 def place_of(name_or_path: str, *keys: str) -> str:

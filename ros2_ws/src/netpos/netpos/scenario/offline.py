@@ -8,12 +8,14 @@ from pathlib import Path
 
 import yaml
 
+import netpos
 from netpos.bags import BagWriter, codec
 from netpos.inertial.pdr import PedestrianDeadReckoning
 from netpos.inertial.pdr_config import PdrConfig
 from netpos.inertial.pdr_values import values_of
 from netpos.messages.topics import CLOCK
 from netpos.messages.values import Beacon, ImuSample, MagneticSample, Step, Velocity
+from netpos.scenario.load import scenario_text
 from netpos.scenario.schema import NS, Scenario
 from netpos.scenario.simulation import Simulation
 from netpos.scenario.topics import Value, to_message, topic_of
@@ -35,9 +37,9 @@ def simulate_to_bag(
     convert = codec()
     count = 0
     metadata = {
-        "scenario": scenario.name,
-        "seed": str(scenario.seed),
-        "tracker": yaml.safe_dump(dict(scenario.tracker)),  # the name alone may not be found again
+        "netpos_version": netpos.__version__,
+        "scenario": scenario_text(scenario),
+        "tracker": yaml.safe_dump(dict(scenario.tracker)),
     }
     if scenario.networks:
         names = [network.name for network in scenario.networks]

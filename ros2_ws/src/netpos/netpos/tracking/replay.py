@@ -29,8 +29,9 @@ from netpos.tracking.report import TrackOutput
 from netpos.tracking.sequencer import Item
 from netpos.tracking.settings import (
     TrackerSettings,
-    as_metadata,
     bag_settings,
+    fusion_fact,
+    tracker_fact,
 )
 from netpos.tracking.tracker import Tracker
 
@@ -40,9 +41,10 @@ _FUSION = "fusion."
 
 @dataclass(frozen=True, slots=True)
 class ReplaySummary:
-    """What a replay did: epochs written, estimates in them, and measurements refused or rejected,
-    by device and reason."""
+    """What a replay did: parameters of the tracker that are not the defaults, epochs written,
+    estimates in them, and measurements refused or rejected, by device and reason."""
 
+    parameters: Mapping[str, Any]
     epochs: int
     estimates: int
     rejected: Mapping[str, Mapping[str, int]]
@@ -55,23 +57,27 @@ def replay_bag(
     progress: Callable[[int], None] | None = None,
     *,
     smooth: bool = False,
+    settings: TrackerSettings | None = None,
 ) -> ReplaySummary:
     """Run a bag's measurements through the tracker and write a bag with all input and the new
     output.
 
-    Parameters come from the bag's own metadata, then ``overrides``. ``progress`` is called with
-    the number of messages done. ``smooth`` adds the odometry of every epoch given all
-    measurements. Raises ``BagError`` for a bag without measurements, ``ValueError`` for a bad
-    parameter, ``FileExistsError`` where ``bag_out`` exists.
+    Parameters are ``settings``, by default those the bag holds, then ``overrides``. ``progress``
+    is called with the number of messages done. ``smooth`` adds the odometry of every epoch given
+    all measurements. Raises ``BagError`` for a bag without measurements or parameters,
+    ``ValueError`` for a bad parameter, ``FileExistsError`` where ``bag_out`` exists.
     """
     with BagReader(bag_in) as source:
-        settings = _changed(bag_settings(source.metadata), overrides or {})
+        settings = _changed(settings or bag_settings(source), overrides or {})
         config = TrackerConfig.from_mapping(settings.parameters)
         if topics.RSU_MEASUREMENTS not in source.topics:
             raise BagError(
                 f"{bag_in} has no {topics.RSU_MEASUREMENTS}: record that topic to replay"
             )
-        metadata = {**source.metadata, **as_metadata(asdict(config), settings)}
+        metadata = source.metadata | tracker_fact(config)
+        if settings.networks:
+            fusion = FusionConfig.from_mapping(settings.fusion)
+            metadata |= fusion_fact(settings.networks, fusion)
         tracker = tracker_of(config, settings, smooth=smooth)
         epochs = estimates = 0
         with whole_bag(bag_out, metadata=metadata) as out:
@@ -88,9 +94,13 @@ def replay_bag(
                     progress(done)
             for vue_id, odometry in tracker.smoothed().items() if smooth else ():
                 _write_smoothed(out, vue_id, odometry)
-        return ReplaySummary(
-            epochs, estimates, {v: dict(c) for v, c in tracker.rejected().items()}
-        )
+        rejected = {vue: dict(counts) for vue, counts in tracker.rejected().items()}
+        return ReplaySummary(_not_usual(config), epochs, estimates, rejected)
+
+
+def _not_usual(config: TrackerConfig) -> dict[str, Any]:
+    usual = asdict(TrackerConfig())
+    return {name: value for name, value in asdict(config).items() if value != usual[name]}
 
 
 def _changed(settings: TrackerSettings, overrides: Mapping[str, Any]) -> TrackerSettings:

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from netpos.bags import BagReader
+from netpos.bags import BagError, BagReader
 from netpos.bags.single_file import load_yaml
 from netpos.messages import topics
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.networks.config import FusionConfig
 
-# Name of the metadata entry of a bag that holds parameters for its measurements, as YAML.
-TRACKER_METADATA = "tracker"
-# The same of the networks whose tracks are fused and the parameters of that, as YAML.
-FUSION_METADATA = "fusion"
+# What a bag calls the parameters of the tracker of its measurements, as YAML.
+TRACKER_FACT = "tracker"
+# The same of the networks whose tracks are fused and the parameters of that.
+FUSION_FACT = "fusion"
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,39 +44,47 @@ class TrackerSettings:
 DEFAULTS = TrackerSettings()
 
 
-def bag_settings(metadata: Mapping[str, str]) -> TrackerSettings:
-    """Settings a bag carries: its own parameters, else those of the scenario it was made from.
+def bag_settings(bag: BagReader) -> TrackerSettings:
+    """Settings a bag holds: what its trackers said they used, or who wrote it noted.
 
-    Raises ``ValueError`` where the scenario it names is not to be found.
+    Raises ``BagError`` where it holds none, or several that do not agree.
     """
-    if TRACKER_METADATA not in metadata:
-        return _scenario_settings(metadata["scenario"]) if "scenario" in metadata else DEFAULTS
-    loaded = _mapping(metadata, TRACKER_METADATA)
-    fusion = _mapping(metadata, FUSION_METADATA)
-    networks = tuple(map(str, fusion.pop("networks", ())))
-    return TrackerSettings(loaded, networks=networks, fusion=fusion)
+    fusion = _mapping(bag, FUSION_FACT)
+    if fusion is None and TRACKER_FACT not in bag.facts:
+        raise BagError(f"{bag.path} does not say with which parameters it is to be tracked")
+    networks = tuple(map(str, (fusion or {}).pop("networks", ())))
+    parameters = _mapping(bag, TRACKER_FACT) or {}
+    return TrackerSettings(parameters, networks=networks, fusion=fusion or {})
 
 
-def as_metadata(parameters: Mapping[str, Any], settings: TrackerSettings) -> dict[str, str]:
-    """What a bag says of the ``parameters`` of its tracker, every one of them, and of the networks
-    of ``settings``; ``bag_settings`` reads it."""
-    metadata = {TRACKER_METADATA: yaml.safe_dump(dict(parameters))}
-    if settings.networks:
-        fusion = {"networks": list(settings.networks), **settings.fusion}
-        metadata[FUSION_METADATA] = yaml.safe_dump(fusion)
-    return metadata
+def tracker_fact(config: TrackerConfig) -> dict[str, str]:
+    """What a bag is told of the parameters of its tracker, every one of them; trackers of several
+    networks say the same."""
+    return {TRACKER_FACT: yaml.safe_dump(asdict(replace(config, network="")))}
 
 
-def _mapping(metadata: Mapping[str, str], name: str) -> dict[str, Any]:
-    loaded = load_yaml(metadata.get(name, "")) or {}
-    if not isinstance(loaded, dict):
-        raise ValueError(f"the bag's {name!r} metadata is not a mapping of parameters")
-    return loaded
+def fusion_fact(networks: tuple[str, ...], config: FusionConfig) -> dict[str, str]:
+    """What a bag is told of the networks and the fusion of their tracks."""
+    return {FUSION_FACT: yaml.safe_dump({"networks": list(networks), **asdict(config)})}
+
+
+def _mapping(bag: BagReader, name: str) -> dict[str, Any] | None:
+    """The one value of a fact, None where nothing is said."""
+    texts = bag.facts.get(name, ())
+    values = [load_yaml(text) or {} for text in texts]
+    if not all(isinstance(value, dict) for value in values):
+        raise BagError(f"{bag.path}: {name!r} is not a mapping of parameters")
+    if len(values) > 1:
+        first, second = values[:2]
+        keys = sorted(key for key in first | second if first.get(key) != second.get(key))
+        differences = ", ".join(f"{k} {first.get(k)} and {second.get(k)}" for k in keys)
+        raise BagError(f"{bag.path} was tracked with different parameters: {differences}")
+    return dict(values[0]) if values else None
 
 
 def settings_from(source: str) -> TrackerSettings:
     """Settings of a scenario (name or YAML file) or of a bag (folder or .mcap file); defaults for
-    no source. The devices of a bag are those its topics name.
+    no source, or a bag that holds none. The devices of a bag are those its topics name.
 
     Raises ``ValueError`` naming what is wrong with the source.
     """
@@ -83,7 +93,8 @@ def settings_from(source: str) -> TrackerSettings:
     if Path(source).is_dir() or source.endswith(".mcap"):
         with BagReader(Path(source)) as bag:
             vue_ids = sorted({topics.split(topic)[0] for topic in bag.topics} - {""})
-            settings = bag_settings(bag.metadata)
+            known = TRACKER_FACT in bag.facts or FUSION_FACT in bag.facts
+            settings = bag_settings(bag) if known else DEFAULTS
             return replace(settings, vue_ids=tuple(vue_ids) or DEFAULTS.vue_ids)
     return _scenario_settings(source)
 

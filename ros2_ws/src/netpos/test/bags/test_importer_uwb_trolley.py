@@ -93,7 +93,7 @@ def test_truth_by_hand(tmp_path: Path) -> None:
 def test_tracker_parameters_are_in_the_bag(tmp_path: Path) -> None:
     import_uwb_trolley(trolley_folder(tmp_path / "in"), tmp_path / "bag")
     with BagReader(tmp_path / "bag") as reader:
-        config = TrackerConfig.from_mapping(bag_settings(reader.metadata).parameters)
+        config = TrackerConfig.from_mapping(bag_settings(reader).parameters)
     assert config.motion_model == "rigid_body"
     assert config.device_height_m == 0.97
 

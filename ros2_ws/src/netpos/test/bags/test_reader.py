@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 from netpos.bags import BagError, BagReader, BagWriter, codec
+from netpos.messages.topics import RUN_ESTIMATOR
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -121,3 +122,33 @@ def test_payload_that_does_not_fit_its_type(tmp_path: Path) -> None:
         (entry,) = reader.messages()
         with pytest.raises(BagError, match="/clock"):
             _ = entry.message
+
+
+def say(bag: BagWriter, key: str, value: str) -> None:
+    """A node says how it runs."""
+    store, name = get_typestore(Stores.ROS2_JAZZY), "diagnostic_msgs/msg/KeyValue"
+    said = store.types[name](key=key, value=value)
+    bag.write_raw(RUN_ESTIMATOR, name, bytes(store.serialize_cdr(said, name)), 1)
+
+
+def test_facts_are_those_of_the_metadata_and_those_that_nodes_said(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "run", metadata={"seed": "3", "tracker": "a: 1"}) as bag:
+        say(bag, "fusion", "b: 2")
+        say(bag, "tracker", "a: 1")
+        say(bag, "tracker", "a: 2")
+        say(bag, "tracker", "a: 2")
+    with BagReader(tmp_path / "run") as reader:
+        assert reader.facts == {
+            "seed": ("3",),
+            "fusion": ("b: 2",),
+            "tracker": ("a: 1", "a: 2"),
+        }
+
+
+def test_what_is_noted_at_the_end_is_metadata(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "run", metadata={"seed": "3"}) as bag:
+        bag.write("/clock", codec().clock_to_msg(9), 9)
+        bag.note("lost", "/a: 4")
+    for path in (tmp_path / "run", tmp_path / "run" / "run_0.mcap"):
+        with BagReader(path) as reader:
+            assert reader.metadata == {"seed": "3", "lost": "/a: 4"}

@@ -84,7 +84,7 @@ def test_report_tells_of_a_recording_without_metadata(
 
 
 def test_a_replay_without_estimates_says_so(netpos: Netpos, tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "in") as writer:
+    with BagWriter(tmp_path / "in", metadata={"tracker": "{}"}) as writer:
         known = RsuInfo(rsu_id="a", position=np.zeros(3), stamp_ns=1)
         writer.write("/rsu/info", codec().rsu_info_to_msg(known), 1)
         measured = RsuMeasurement(

@@ -165,7 +165,7 @@ def write_drive(
     ]
     for topic, odometry in (others or {}).items():
         rows += [(o.stamp_ns, topic, convert.odometry_to_msg(o)) for o in odometry]
-    with BagWriter(path) as bag:
+    with BagWriter(path, metadata={"tracker": "{}"}) as bag:
         for stamp, topic, message in sorted(rows, key=lambda row: row[0]):
             bag.write(topic, message, stamp)
     return path

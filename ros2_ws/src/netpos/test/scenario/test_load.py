@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from netpos.messages.values import Odometry
 from netpos.scenario import ScenarioError, Simulation, load_scenario, scenario_names
+from netpos.scenario.load import scenario_of_text, scenario_text
 from scipy.spatial.transform import Rotation
 
 GOOD = """\
@@ -123,6 +124,18 @@ def test_a_scenario_cannot_be_altered(tmp_path: Path) -> None:
 def test_every_shipped_scenario_loads(name: str) -> None:
     assert load_scenario(name).name == name
     assert load_scenario(name).description
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_the_text_of_a_scenario_gives_the_scenario(name: str) -> None:
+    """Buildings, RSUs and tracker of a bag are those of its run, whatever is installed later."""
+    scenario = load_scenario(name, seed=77)
+    assert scenario_of_text(scenario_text(scenario), Path("a bag")) == scenario
+
+
+def test_a_scenario_text_that_cannot_be_read_names_its_bag() -> None:
+    with pytest.raises(ScenarioError, match="a bag"):
+        scenario_of_text("rsus: [", Path("a bag"))
 
 
 def test_metis_interval_is_a_whole_number_of_frames() -> None:

@@ -27,6 +27,7 @@ from netpos.tracking import TrackerConfig, TrackOutput
 from netpos.tracking.replay import reading_of, replay_bag, write_output
 
 NS = 10**9
+USUAL = {"tracker": "{}"}  # the tracker's defaults
 MEASURED = RsuMeasurement(
     stamp_ns=5 * NS,
     rsu_id="a",
@@ -60,7 +61,7 @@ def read(path: Path, config: Any) -> list[Any]:
 @pytest.fixture
 def bag(tmp_path: Path) -> Path:
     make = codec()
-    with BagWriter(tmp_path / "bag") as out:
+    with BagWriter(tmp_path / "bag", metadata=USUAL) as out:
         out.write("/clock", make.clock_to_msg(0), 0)
         out.write("/rsu/measurements", make.measurement_to_msg(MEASURED), 1)
         out.write("/car/step_velocity", make.velocity_to_msg(MOVED), 2)
@@ -82,7 +83,7 @@ def test_every_kind_of_input_is_read(bag: Path) -> None:
 def test_the_other_byte_order_is_read_too(tmp_path: Path) -> None:
     msg = codec().measurement_to_msg(MEASURED)
     cdr = bytes(typestore().serialize_cdr(msg, msg.__msgtype__, little_endian=False))
-    with BagWriter(tmp_path / "bag") as out:
+    with BagWriter(tmp_path / "bag", metadata=USUAL) as out:
         out.write_raw("/rsu/measurements", msg.__msgtype__, cdr, 1)
     (value,) = read(tmp_path / "bag", TrackerConfig())
     assert repr(value) == repr(MEASURED)
@@ -94,7 +95,7 @@ def test_a_bag_with_its_own_definition_is_read_by_that(tmp_path: Path) -> None:
     text = "uint64 odd\n" + definition(type_name)
     msg = codec().measurement_to_msg(MEASURED)
     usual = bytes(typestore().serialize_cdr(msg, type_name))
-    with BagWriter(tmp_path / "bag") as out:
+    with BagWriter(tmp_path / "bag", metadata=USUAL) as out:
         out.add_topic("/rsu/measurements", type_name, text=text)
         out.write_raw("/rsu/measurements", type_name, usual[:4] + bytes(8) + usual[4:], 1)
     (value,) = read(tmp_path / "bag", TrackerConfig())
@@ -102,7 +103,7 @@ def test_a_bag_with_its_own_definition_is_read_by_that(tmp_path: Path) -> None:
 
 
 def test_damaged_input_is_named(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "bag") as out:
+    with BagWriter(tmp_path / "bag", metadata=USUAL) as out:
         type_name = "netpos_msgs/msg/RsuMeasurement"
         out.write_raw("/rsu/measurements", type_name, b"\0\1\0\0" + bytes(30), 1)
     with pytest.raises(BagError, match="/rsu/measurements"):
@@ -110,7 +111,7 @@ def test_damaged_input_is_named(tmp_path: Path) -> None:
 
 
 def test_a_bag_without_measurements_is_refused(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "bag") as out:
+    with BagWriter(tmp_path / "bag", metadata=USUAL) as out:
         out.write("/clock", codec().clock_to_msg(0), 0)
     with pytest.raises(BagError, match="record that topic to replay"):
         replay_bag(tmp_path / "bag", tmp_path / "out")
@@ -120,7 +121,7 @@ def test_a_bag_without_measurements_is_refused(tmp_path: Path) -> None:
 def test_all_input_is_copied_and_old_estimates_are_not(tmp_path: Path) -> None:
     make = codec()
     estimate = ClockState(stamp_ns=NS, vue_id="car", offset_s=7.0, drift=0.0)
-    with BagWriter(tmp_path / "bag") as out:
+    with BagWriter(tmp_path / "bag", metadata=USUAL) as out:
         out.write("/rsu/info", make.rsu_info_to_msg(RsuInfo(rsu_id="a", position=np.ones(3))), 0)
         out.write("/rsu/measurements", make.measurement_to_msg(MEASURED), 5 * NS)
         out.write("/car/clock_state", make.clock_state_to_msg(estimate), 5 * NS)
@@ -143,7 +144,7 @@ def test_what_there_is_of_an_output_is_written_at_its_stamp(tmp_path: Path) -> N
         linear_velocity=np.ones(3),
     )
     clock = ClockState(stamp_ns=3 * NS, vue_id="car", offset_s=1e-6, drift=0.0)
-    with BagWriter(tmp_path / "bag") as out:
+    with BagWriter(tmp_path / "bag", metadata=USUAL) as out:
         write_output(out, TrackOutput(None, None, status))
         write_output(out, TrackOutput(pose, clock, status))
     with BagReader(tmp_path / "bag") as bag:
@@ -165,7 +166,7 @@ def test_what_there_is_of_an_output_is_written_at_its_stamp(tmp_path: Path) -> N
 
 def test_a_replay_that_does_not_end_well_leaves_no_bag(tmp_path: Path) -> None:
     """Not even one that looks finished."""
-    with BagWriter(tmp_path / "in") as bag:
+    with BagWriter(tmp_path / "in", metadata=USUAL) as bag:
         known = RsuInfo(rsu_id="b", position=np.zeros(3), stamp_ns=NS)
         bag.write("/rsu/info", codec().rsu_info_to_msg(known), NS)
         for k in range(3):

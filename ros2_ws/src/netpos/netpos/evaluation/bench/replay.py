@@ -30,7 +30,7 @@ def _simulate(bag: Path, quick: bool) -> None:
 def read_and_track(path: Path) -> int:
     """Read the bag's RSU messages and track; returns the number of estimates."""
     with BagReader(path) as bag:
-        config = TrackerConfig.from_mapping(bag_settings(bag.metadata).parameters)
+        config = TrackerConfig.from_mapping(bag_settings(bag).parameters)
         tracker, estimates = Tracker(config), 0
         for entry in bag.messages([topics.RSU_INFO]):
             tracker.add_rsu(codec().rsu_info_from_msg(entry.message))
@@ -45,7 +45,7 @@ def read_and_track(path: Path) -> int:
 def consumed_topics(path: Path) -> set[str]:
     """The topics ``read_and_track`` takes."""
     with BagReader(path) as bag:
-        config = TrackerConfig.from_mapping(bag_settings(bag.metadata).parameters)
+        config = TrackerConfig.from_mapping(bag_settings(bag).parameters)
         taken = {t for t, info in bag.topics.items() if reading_of(t, info, config) is not None}
         return {*taken, topics.RSU_INFO}
 

@@ -57,11 +57,11 @@ def test_parameters_of_the_fusion_can_be_set(simulated: Path, tmp_path: Path) ->
     replay_bag(simulated, out)
     assert all(s.used == 1 for s in messages(out, "/vue_1/track_status"))
     with BagReader(out) as bag:
-        assert bag_settings(bag.metadata).networks == ("wimax", "wifi")
+        assert bag_settings(bag).networks == ("wimax", "wifi")
     stale = tmp_path / "stale"
     replay_bag(simulated, stale, {"fusion.association": "names", "fusion.method": "ci"})
     with BagReader(stale) as bag:
-        assert bag_settings(bag.metadata).fusion["method"] == "ci"
+        assert bag_settings(bag).fusion["method"] == "ci"
         assert "/wifi_1/odometry" in bag.topics
     with pytest.raises(ValueError, match="unknown fusion parameter 'rule'"):
         replay_bag(simulated, tmp_path / "no", {"fusion.rule": "ci"})
