@@ -25,6 +25,7 @@ _CLOCK_DEPTH = 10
 _INPUTS = (BEACON, INITIAL_POSE)  # what others need from the first message on
 _STEPS_INPUTS = (IMU, MAG)  # what dead reckoning needs of who walks
 _POLL_S = 0.02
+_TOLD_EVERY_S = 5.0
 _DELIVERY_S = 5
 _STALL_S = 0.05  # further behind than this, what is lost is not caught up with
 
@@ -82,6 +83,7 @@ class VueSimNode(Node):
         )
         self._hand_over_initial_poses()
         pace = Pace(rate)
+        told_s = time.monotonic()
         for item in timeline(self._simulation, self._settings.clock_hz):
             if isinstance(item, InitialPose):
                 continue
@@ -90,6 +92,10 @@ class VueSimNode(Node):
             if not self.context.ok():
                 return
             self._pubs[topic].publish(message)
+            if time.monotonic() - told_s > _TOLD_EVERY_S:
+                told_s = time.monotonic()
+                past_s = (stamp_ns - scenario.start_ns) * 1e-9
+                self.get_logger().info(f"simulated {past_s:.0f} of {scenario.duration_s:.0f} s")
         for publisher in self._pubs.values():
             publisher.wait_for_all_acked(Duration(seconds=_DELIVERY_S))
         self.get_logger().info(f"{scenario.name} is over{_told(pace.lost_s)}")

@@ -200,7 +200,8 @@ class BagReader:
                 values.append(str(said.value))
         return {key: tuple(values) for key, values in found.items()}
 
-    def _decode(self, topic: str, cdr: bytes) -> Any:
+    def decode(self, topic: str, cdr: bytes) -> Any:
+        """A message of a topic; ``BagError`` where it is not of the topic's type."""
         info = self.topics[topic]
         if info.definition:
             store = store_of_definition(info.type_name, info.definition)
@@ -229,7 +230,7 @@ class BagReader:
         wanted = {name: self.topics[name] for name in names}
         stream = self._by_chunk(names) or self._by_message(names)
         counts = dict.fromkeys(names, 0)
-        types, decode = {name: info.type_name for name, info in wanted.items()}, self._decode
+        types, decode = {name: info.type_name for name, info in wanted.items()}, self.decode
         try:
             for log_time_ns, _, topic, cdr in stream:
                 counts[topic] += 1

@@ -37,6 +37,15 @@ def _tell(error: BaseException) -> None:
         typer.echo(f"netpos: {sentence}", err=True)
 
 
+def _is_interrupt(error: BaseException) -> bool:
+    """Ctrl-C, also one that came while compiled code was called, which Python tells of as a
+    ``SystemError``."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, KeyboardInterrupt):
+        cause = cause.__cause__ or cause.__context__
+    return cause is not None
+
+
 class Commands(TyperGroup):
     """Turns errors of bad input and failed work into one sentence and an exit status; errors of
     the program itself stay loud.
@@ -46,7 +55,9 @@ class Commands(TyperGroup):
         """Run the chosen command."""
         try:
             return super().invoke(ctx)
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemError) as error:
+            if not _is_interrupt(error):
+                raise
             typer.echo("netpos: interrupted", err=True)
             raise typer.Exit(130) from None
         except BrokenPipeError:  # the reader of our output has gone, as in `netpos ... | head`

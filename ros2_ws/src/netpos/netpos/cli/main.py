@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from netpos.cli import recordings, reproduce, results, rsus, runs
+from netpos.cli import recordings, reproduce, results, rsus, runs, sweep
 from netpos.cli.errors import Commands
 
 app = typer.Typer(
@@ -21,6 +21,7 @@ for command in (
     results.evaluate,
     results.report,
     results.compare,
+    sweep.sweep,
     results.bench,
     reproduce.reproduce,
     recordings.recover,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
+from netpos.cli.progress import doing
 from netpos.cli.runs import parse_setting, refuse_existing
 
 if TYPE_CHECKING:
@@ -54,7 +55,15 @@ TruthMap = Annotated[
     str | None,
     typer.Option(
         metavar="NAME=WHERE,...",
-        help="Where time, x, y, z and yaw or qx, qy, qz, qw of the truth are.",
+        help="Where time, x, y, z (or latitude, longitude, height) and yaw or qx, qy, qz, qw of "
+        "the truth are. An Odometry, PoseStamped or NavSatFix topic needs none.",
+    ),
+]
+TruthOrigin = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LATITUDE,LONGITUDE,HEIGHT",
+        help="Where on earth the origin of map is, for a truth of latitudes.",
     ),
 ]
 TruthUnits = Annotated[
@@ -102,6 +111,7 @@ def import_csv(
     truth_units: TruthUnits = "",
     truth_time_offset: Offset = "0",
     truth_align: Align = "none",
+    truth_origin: TruthOrigin = None,
     settings: Settings = None,
     skip_bad_lines: Skip = False,
     any_order: AnyOrder = False,
@@ -122,19 +132,26 @@ def import_csv(
     refuse_existing(bag)
     if delimiter is not None and delimiter not in DELIMITERS:
         raise ValueError(f"--delimiter {delimiter}: give one of {', '.join(DELIMITERS)}")
-    counts = work(
-        file,
-        bag,
-        _columns(mapping, units, sd, vue, lever_arm),
-        _rsus(rsus),
-        truth=truth_option(
-            truth, truth_map, truth_units, truth_time_offset, truth_align, device_height
-        ),
-        delimiter=DELIMITERS[delimiter] if delimiter else None,
-        skip_bad_lines=skip_bad_lines,
-        any_order=any_order,
-        tracker=_tracker(settings, device_height),
-    )
+    with doing("importing"):
+        counts = work(
+            file,
+            bag,
+            _columns(mapping, units, sd, vue, lever_arm),
+            _rsus(rsus),
+            truth=truth_option(
+                truth,
+                truth_map,
+                truth_units,
+                truth_time_offset,
+                truth_align,
+                device_height,
+                truth_origin,
+            ),
+            delimiter=DELIMITERS[delimiter] if delimiter else None,
+            skip_bad_lines=skip_bad_lines,
+            any_order=any_order,
+            tracker=_tracker(settings, device_height),
+        )
     tell(bag, counts)
 
 
@@ -156,6 +173,7 @@ def import_ros(
     truth_units: TruthUnits = "",
     truth_time_offset: Offset = "0",
     truth_align: Align = "none",
+    truth_origin: TruthOrigin = None,
     settings: Settings = None,
     skip_bad_lines: Skip = False,
     any_order: AnyOrder = False,
@@ -171,19 +189,26 @@ def import_ros(
     from netpos.bags.importers.own import import_ros as work  # noqa: PLC0415
 
     refuse_existing(bag)
-    counts = work(
-        source,
-        bag,
-        _columns(mapping, units, sd, vue, lever_arm),
-        topic,
-        _rsus(rsus),
-        truth=truth_option(
-            truth_topic, truth_map, truth_units, truth_time_offset, truth_align, device_height
-        ),
-        skip_bad_messages=skip_bad_lines,
-        any_order=any_order,
-        tracker=_tracker(settings, device_height),
-    )
+    with doing("importing"):
+        counts = work(
+            source,
+            bag,
+            _columns(mapping, units, sd, vue, lever_arm),
+            topic,
+            _rsus(rsus),
+            truth=truth_option(
+                truth_topic,
+                truth_map,
+                truth_units,
+                truth_time_offset,
+                truth_align,
+                device_height,
+                truth_origin,
+            ),
+            skip_bad_messages=skip_bad_lines,
+            any_order=any_order,
+            tracker=_tracker(settings, device_height),
+        )
     tell(bag, counts)
 
 
@@ -240,7 +265,9 @@ def truth_option(
     offset: str,
     way: str,
     height_m: float | None,
+    origin: str | None = None,
 ) -> Truth | None:
+    """What the options say of a truth: ``source`` a text file (Path) or a topic."""
     from netpos.bags.importers.own import Truth  # noqa: PLC0415
     from netpos.bags.importers.own.alignment import Way  # noqa: PLC0415
     from netpos.bags.importers.own.truth import TUM, TruthColumns  # noqa: PLC0415
@@ -250,9 +277,9 @@ def truth_option(
             raise ValueError("there is no truth to map or align; name its file or topic")
         return None
     if mapping is None:
-        if not isinstance(source, Path) or source.suffix not in {".tum", ".txt"}:
+        if isinstance(source, Path) and source.suffix not in {".tum", ".txt"}:
             raise ValueError("--truth-map must say where time, x and y of the truth are")
-        columns = TruthColumns(sources=TUM)
+        columns = TruthColumns(sources=TUM) if isinstance(source, Path) else None
     else:
         columns = TruthColumns.parse(mapping, units)
     if way not in get_args(Way):
@@ -267,4 +294,5 @@ def truth_option(
         offset_s=offset_s,
         align=cast("Way", way),
         height_m=height_m or 0.0,
+        origin=None if origin is None else three(origin, "--truth-origin"),
     )

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from netpos.cli.own_recordings import Bag, import_csv, import_ros, tell, three
+from netpos.cli.progress import doing
 
 importers = typer.Typer(no_args_is_help=True, help="Turn other people's recordings into bags.")
 
@@ -19,7 +20,9 @@ def recover(bag: Annotated[Path, typer.Argument(help="Bag that was cut off.")]) 
     """Save what a killed recorder left."""
     from netpos.bags.recover import recover as recover_bag  # noqa: PLC0415
 
-    typer.echo(str(recover_bag(bag)))
+    with doing("recovering"):
+        found = recover_bag(bag)
+    typer.echo(str(found))
 
 
 @importers.command("ble-aoa")
@@ -33,7 +36,8 @@ def ble_aoa(
     """Angles of four BLE arrays, Zenodo record 7759557."""
     from netpos.bags.importers.ble_aoa import import_ble_aoa  # noqa: PLC0415
 
-    counts = import_ble_aoa(path, bag, run=run)
+    with doing("importing"):
+        counts = import_ble_aoa(path, bag, run=run)
     tell(bag, counts)
 
 
@@ -44,7 +48,8 @@ def uwb_anchors(
     """Ranges of four UWB anchors on a car to a tag."""
     from netpos.bags.importers.uwb_anchors import import_uwb_anchors  # noqa: PLC0415
 
-    counts = import_uwb_anchors(path, bag)
+    with doing("importing"):
+        counts = import_uwb_anchors(path, bag)
     tell(bag, counts)
 
 
@@ -56,7 +61,8 @@ def uwb_trolley(
     """Ranges of eight UWB anchors to three tags on a trolley."""
     from netpos.bags.importers.uwb_trolley import import_uwb_trolley  # noqa: PLC0415
 
-    counts = import_uwb_trolley(path, bag)
+    with doing("importing"):
+        counts = import_uwb_trolley(path, bag)
     tell(bag, counts)
 
 
@@ -94,7 +100,10 @@ def car_imu_rtk(
         lever_arm_m=three(antenna, "--antenna") if antenna else MOUNT.lever_arm_m,
         clock_offset_s=MOUNT.clock_offset_s if clock_offset is None else clock_offset,
     )
-    counts = import_car_drive(path, bag, fewest=fewest, nearest=nearest, seed=seed, mount=chosen)
+    with doing("importing"):
+        counts = import_car_drive(
+            path, bag, fewest=fewest, nearest=nearest, seed=seed, mount=chosen
+        )
     if mount is None:
         typer.echo("the mount of the IMU is that of run 1934; for another car give --mount")
     tell(bag, counts)
@@ -105,9 +114,9 @@ def _imu_command(recording_format: str, what: str) -> None:
     def command(path: Annotated[Path, typer.Argument(help="The recording.")], bag: Bag) -> None:
         from netpos.bags.importers.imu import import_imu  # noqa: PLC0415
 
-        for topic, count in sorted(
-            import_imu(path, bag, recording_format=recording_format).items()
-        ):
+        with doing("importing"):
+            counts = import_imu(path, bag, recording_format=recording_format)
+        for topic, count in sorted(counts.items()):
             typer.echo(f"  {topic}: {count}")
         typer.echo(f"wrote {bag}; play it into a running pdr_node: ros2 run netpos_bag play {bag}")
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from netpos.cli.errors import WorkFailedError
+from netpos.cli.progress import Bars
 from netpos.cli.results import check_json, write_json
+from netpos.cli.work import ClusterAddress, Resume, Workers, worked
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
     from rich.table import Table
 
     from netpos.evaluation.reproduce import Reproduction
@@ -25,15 +24,15 @@ def reproduce(
         typer.Option(help="Runs (seeds) of each experiment. Default: 1000; deng2022: 100."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the first run; run i has seed + i.")] = 1,
-    workers: Annotated[
-        int | None, typer.Option(help="Processes. Default: one per processor.")
-    ] = None,
+    workers: Workers = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write the rows as JSON.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Draw the paper's pictures there.")
     ] = None,
+    cluster: ClusterAddress = None,
+    resume: Resume = None,
 ) -> None:
     """Reproduce a paper's figures; every row says whether its target is kept.
 
@@ -43,18 +42,26 @@ def reproduce(
     from rich.console import Console  # noqa: PLC0415
 
     from netpos.evaluation.reproduce import reproduce as run  # noqa: PLC0415
+    from netpos.evaluation.work import Kept  # noqa: PLC0415
 
     if out is not None and out.exists() and not out.is_dir():
         raise NotADirectoryError(f"--out {out} is a file; give a folder")
     if json_file is not None:
         check_json(json_file)
-    bar = _Bar()
+    bars = Bars()
     try:
-        result = run(paper, runs=runs, seed=seed, workers=workers, progress=bar.show)
-    except BrokenProcessPool as error:
-        raise WorkFailedError("a worker process died; try fewer --workers") from error
+        with worked():
+            result = run(
+                paper,
+                runs=runs,
+                seed=seed,
+                workers=workers,
+                progress=bars.show,
+                cluster=cluster,
+                kept=None if resume is None else Kept(resume),
+            )
     finally:
-        bar.stop()
+        bars.stop()
     Console().print(_table(result))
     for note in result.outcome.notes:
         typer.echo(note, err=True)
@@ -63,34 +70,6 @@ def reproduce(
     if out is not None:
         for path in result.outcome.draw(out):
             typer.echo(f"wrote {path}")
-
-
-class _Bar:
-    """Progress on stderr, one line per experiment. It starts with the first report: its thread
-    must not exist when the worker processes are forked."""
-
-    def __init__(self) -> None:
-        self._progress: Progress | None = None
-        self._tasks: dict[str, TaskID] = {}
-
-    def show(self, label: str, done: int, total: int) -> None:
-        """Report of ``frame.Progress``."""
-        if self._progress is None:
-            from rich.console import Console  # noqa: PLC0415
-            from rich.progress import Progress, TimeElapsedColumn  # noqa: PLC0415
-
-            self._progress = Progress(
-                *Progress.get_default_columns(), TimeElapsedColumn(), console=Console(stderr=True)
-            )
-            self._progress.start()
-        if label not in self._tasks:
-            self._tasks[label] = self._progress.add_task(label, total=total)
-        self._progress.update(self._tasks[label], completed=done)
-
-    def stop(self) -> None:
-        """Leave the lines as they are."""
-        if self._progress is not None:
-            self._progress.stop()
 
 
 def _table(result: Reproduction) -> Table:

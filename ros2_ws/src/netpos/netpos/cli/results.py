@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from netpos.cli.own_recordings import Align, Offset, TruthMap, TruthUnits
+from netpos.cli.own_recordings import Align, Offset, TruthMap, TruthOrigin, TruthUnits
+from netpos.cli.progress import doing
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
     from netpos.evaluation.bench import Result
     from netpos.evaluation.evaluate import TruthOf
     from netpos.messages.values import Odometry, RsuInfo, RsuMeasurement
+
+_DEVICES_BESIDE = 3  # more of them, or longer figures, do not fit into 80 columns
+_FIGURES_BESIDE = 5
+_HEAD_WIDTH = 13
 
 
 def evaluate(
@@ -53,12 +58,16 @@ def evaluate(
     ] = None,
     truth_topic: Annotated[
         str | None,
-        typer.Option(help="Topic of the bag with the truth; Odometry needs no --truth-map."),
+        typer.Option(
+            help="Topic of the bag with the truth: Odometry, PoseStamped, NavSatFix, or another "
+            "with --truth-map."
+        ),
     ] = None,
     truth_map: TruthMap = None,
     truth_units: TruthUnits = "",
     truth_time_offset: Offset = "0",
     truth_align: Align = "none",
+    truth_origin: TruthOrigin = None,
 ) -> None:
     """Score a recording against its ground truth; without one, say what it tells of itself."""
     from rich.console import Console  # noqa: PLC0415
@@ -70,11 +79,14 @@ def evaluate(
     for file in (map_file, errors_file, bounds_file):
         if file is not None:
             refuse_recording(file)
-    options = (truth_topic, truth_map, truth_units, truth_time_offset, truth_align)
+    options = (
+        truth_topic, truth_map, truth_units, truth_time_offset, truth_align, truth_origin,
+    )  # fmt: skip
     elsewhere = None if truth is None else _truth_from(bag, truth, *options)
-    if truth is None and options != (None, None, "", "0", "none"):
+    if truth is None and options != (None, None, "", "0", "none", None):
         raise ValueError("there is no truth to map or align; name it with --truth")
-    evaluation = assess_bag(bag, skip=skip, vue=vue, truth=elsewhere)
+    with doing("reading") as tell:
+        evaluation = assess_bag(bag, skip=skip, vue=vue, truth=elsewhere, progress=tell)
     if json_file is not None:
         write_json(json_file, evaluation.to_json())
     pictures = (("map", map_file), ("errors", errors_file), ("bounds", bounds_file))
@@ -97,21 +109,19 @@ def _truth_from(
     units: str,
     offset: str,
     way: str,
+    origin: str | None,
 ) -> TruthOf:
     """What reads a truth and brings it to the measurements of a bag."""
     from netpos.bags import BagReader  # noqa: PLC0415
     from netpos.bags.importers.own import truth_of  # noqa: PLC0415
-    from netpos.bags.importers.own.truth import ODOMETRY  # noqa: PLC0415
     from netpos.cli.own_recordings import truth_option  # noqa: PLC0415
     from netpos.evaluation.evaluate import config_of  # noqa: PLC0415
     from netpos.tracking.config import TrackerConfig  # noqa: PLC0415
 
     with BagReader(bag) as reader:
         config = config_of(reader) or TrackerConfig()
-    if topic is not None and mapping is None:
-        mapping = ",".join(f"{name}={place}" for name, place in ODOMETRY.items())
     named: Path | str = source if topic is None else topic
-    truth = truth_option(named, mapping, units, offset, way, config.device_height_m)
+    truth = truth_option(named, mapping, units, offset, way, config.device_height_m, origin)
     assert truth is not None
 
     def read(
@@ -149,10 +159,10 @@ def _print_survey(console: Console, survey: Survey) -> None:
     for name, vue in survey.vues.items():
         title = f"{name}: measured minus where the track is"
         table = Table(*RESIDUAL_HEAD[:-1], title=title, box=SIMPLE)
-        for *row, _ in residual_rows(vue):
+        for *row, _ in residual_rows(vue.figures.residuals):
             table.add_row(*map(escape, row))
         console.print(table)
-        for rsu_id, *_, learned in residual_rows(vue):
+        for rsu_id, *_, learned in residual_rows(vue.figures.residuals):
             if learned:
                 console.print(f"learned of {rsu_id}: {learned}", markup=False, highlight=False)
 
@@ -192,7 +202,8 @@ def report(
 
     refuse_recording(out)
     bags = bags_in(source)
-    left_out = write_report(bags, out, skip=skip)
+    with doing("reading") as tell:
+        left_out = write_report(bags, out, skip=skip, progress=tell)
     for reason in left_out:
         typer.echo(f"netpos: left out: {reason}", err=True)
     typer.echo(f"wrote {out}: {len(bags) - len(left_out)} of {len(bags)} bags")
@@ -217,7 +228,8 @@ def compare(
 
     if json_file is not None:
         check_json(json_file)
-    found = compare_bags(bags, skip=skip)
+    with doing("comparing"):
+        found = compare_bags(bags, skip=skip)
     console = Console()
     for difference in found:
         console.print(difference.sentence(), markup=False, highlight=False)
@@ -266,23 +278,45 @@ def write_json(path: Path, figures: dict[str, Any]) -> None:
 
 def tables(evaluation: Evaluation) -> list[Table]:
     """Figures and verdicts as tables for the terminal."""
+    from netpos.evaluation.summary import figure_rows, verdict_rows  # noqa: PLC0415
+
+    name, vues = evaluation.path.name, list(evaluation.vues)
+    figures = (["figure", "unit"], list(evaluation.columns()), figure_rows(evaluation))
+    verdicts = (["requirement", "", "required"], vues, verdict_rows(evaluation))
+    return [
+        *_side_by_side(f"{name}: accuracy", *figures),
+        *_side_by_side(f"{name}: requirements", *verdicts),
+    ]
+
+
+def _side_by_side(
+    title: str, about: list[str], devices: list[str], rows: list[list[str]]
+) -> list[Table]:
+    """Rows that begin with what they are ``about``: a column for each of a few devices, a row for
+    each of many."""
+    from rich.box import SIMPLE  # noqa: PLC0415
     from rich.markup import escape  # noqa: PLC0415
     from rich.table import Table  # noqa: PLC0415
 
-    from netpos.evaluation.summary import figure_rows, verdict_rows  # noqa: PLC0415
-
-    names = list(evaluation.vues)
-    figures = Table("figure", "unit", title=f"{evaluation.path.name}: accuracy")
-    for name in evaluation.columns():
-        figures.add_column(name, justify="right")
-    for row in figure_rows(evaluation):
-        figures.add_row(*map(escape, row))
-    verdicts = Table("requirement", "", "required", title=f"{evaluation.path.name}: requirements")
-    for name in names:
-        verdicts.add_column(name, justify="right")
-    for row in verdict_rows(evaluation):
-        verdicts.add_row(*map(escape, row))
-    return [figures, verdicts]
+    if len(devices) <= _DEVICES_BESIDE:
+        table = Table(*about, title=title)
+        for name in devices:
+            table.add_column(escape(name), justify="right")
+        for row in rows:
+            table.add_row(*map(escape, row))
+        return [table]
+    tables = []
+    for first in range(0, len(rows), _FIGURES_BESIDE):
+        shown = rows[first : first + _FIGURES_BESIDE]
+        table = Table("device", title=None if first else title, box=SIMPLE, padding=(0, 1, 0, 0))
+        for row in shown:
+            unit = f" [{row[1]}]" if row[1] and about[1] == "unit" else ""
+            head = "\n".join(filter(None, [row[0] + unit, *row[2 : len(about)]]))
+            table.add_column(escape(head), justify="right", max_width=_HEAD_WIDTH)
+        for index, name in enumerate(devices):
+            table.add_row(escape(name), *(escape(row[len(about) + index]) for row in shown))
+        tables.append(table)
+    return tables
 
 
 def bench(
@@ -307,12 +341,11 @@ def bench(
         check_json(json_file)
     console = Console()
     around = surroundings(quick)
-    results = []
-    with console.status("measuring") as status:
-        parts = chosen(only or [])
-        for name, rows in run_bench(parts, quick):
-            status.update(f"measured {name}")
+    results: list[Result] = []
+    with doing("measuring", "parts done") as tell:
+        for done, (_, rows) in enumerate(run_bench(chosen(only or []), quick), start=1):
             results += rows
+            tell(done)
     console.print(bench_table(results))
     load, cores = around["load_average"][0], around["cores"]
     remarks = [f"The load average was {load:.1f} on {cores} cores before the first measurement."]
@@ -324,19 +357,22 @@ def bench(
 
 def bench_table(results: Iterable[Result]) -> Table:
     """The rows that were measured."""
+    from rich.box import SIMPLE  # noqa: PLC0415
     from rich.markup import escape  # noqa: PLC0415
     from rich.table import Table  # noqa: PLC0415
 
     from netpos.evaluation.bench import Row, quantity  # noqa: PLC0415
 
-    table = Table("what", "ours", "reference", "", "ratio", "target", "")
+    table = Table("what, and beside what", box=SIMPLE, padding=(0, 1, 1, 0), expand=False)
+    for head in ("ours", "beside", "ratio", "target"):
+        table.add_column(head, justify="right", no_wrap=True)
+    table.add_column("")
     for row in results:
         if isinstance(row, Row):
             sign = "≥" if row.relation == ">=" else "≤"
             table.add_row(
-                escape(row.name),
+                f"{escape(row.name)}\n{escape(row.reference)}",
                 quantity(row.ours, row.unit),
-                escape(row.reference),
                 quantity(row.reference_value, row.unit),
                 f"{row.ratio:.3g}",
                 f"{sign} {row.target:g}",

@@ -16,10 +16,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from netpos.cli.errors import WorkFailedError
+from netpos.cli.progress import Bars, doing
+from netpos.cli.work import ClusterAddress, Workers, worked
 
 if TYPE_CHECKING:
+    from netpos.evaluation.replays import Replays
     from netpos.scenario import Scenario
     from netpos.tracking.settings import TrackerSettings
+
+_INTERRUPTED = 130
 
 
 def scenarios() -> None:
@@ -90,8 +95,11 @@ def _check_tracker(scenario: str, values: Mapping[str, object]) -> None:
 
 
 def replay(
-    bag: Annotated[Path, typer.Argument(help="Recorded bag.")],
-    out: Annotated[Path, typer.Option(help="Bag to write; it must not exist.")],
+    bags: Annotated[list[Path], typer.Argument(metavar="BAG...", help="Recorded bags.")],
+    out: Annotated[
+        Path,
+        typer.Option(help="Bag to write; it must not exist. Of several: the folder they go to."),
+    ],
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -110,18 +118,55 @@ def replay(
             "Default: the bag's own.",
         ),
     ] = None,
+    workers: Workers = None,
+    cluster: ClusterAddress = None,
 ) -> None:
-    """Estimate again from the recorded measurements, without ROS."""
+    """Estimate again from the recorded measurements, without ROS.
+
+    Several bags are tracked side by side; those whose track is there already, with the same
+    parameters, are left out.
+    """
     from netpos.tracking.settings import settings_from  # noqa: PLC0415
 
     overrides = dict(parse_setting(text) for text in settings or [])
-    refuse_existing(out)
     source = "" if parameters in (None, "defaults") else str(parameters)
     given = None if parameters is None else settings_from(source)
+    if len(bags) > 1 or cluster is not None:
+        from netpos.evaluation.replays import Replays  # noqa: PLC0415
+
+        plan = Replays(out=out, settings=given, overrides=overrides, smooth=smooth)
+        _replay_all(bags, plan, workers, cluster)
+        return
+    (bag,) = bags
+    refuse_existing(out)
     _track(bag, out, overrides, smooth=smooth, settings=given, source=parameters or str(bag))
     if smooth:
         _tell_gain(out)
     typer.echo(f"wrote {out}")
+
+
+def _replay_all(bags: list[Path], plan: Replays, workers: int | None, cluster: str | None) -> None:
+    from netpos.evaluation.replays import replay_bags  # noqa: PLC0415
+    from netpos.evaluation.work import Work  # noqa: PLC0415
+
+    if plan.out.is_file() or (plan.out / "metadata.yaml").exists():
+        raise NotADirectoryError(f"--out {plan.out}: several bags need a folder to go to")
+    bars, refused, done = Bars(), 0, 0
+    try:
+        with worked(), Work(1, 0, workers, bars.show, cluster=cluster) as work:
+            for bag, summary in replay_bags(bags, plan, work):
+                if isinstance(summary, str):
+                    refused += 1
+                    typer.echo(f"netpos: {summary}", err=True)
+                else:
+                    done += 1
+                    typer.echo(f"wrote {plan.target(bag)}: {summary.epochs} epochs")
+    finally:
+        bars.stop()
+    there = len(bags) - done - refused
+    typer.echo(f"{done} of {len(bags)} bags tracked, {there} were there, {refused} refused")
+    if refused:
+        raise WorkFailedError(f"{refused} bags were not tracked")
 
 
 def _tell_gain(bag: Path) -> None:
@@ -171,8 +216,6 @@ def _track(
     source: str,
 ) -> None:
     """Replay ``bag`` with parameters of ``source``, and tell of it."""
-    from rich.console import Console  # noqa: PLC0415
-
     from netpos.bags import BagReader  # noqa: PLC0415
     from netpos.tracking.replay import replay_bag  # noqa: PLC0415
     from netpos.tracking.settings import bag_settings  # noqa: PLC0415
@@ -186,13 +229,8 @@ def _track(
                     f"{error}; give --parameters SCENARIO, another BAG, or 'defaults'"
                 ) from error
 
-    with Console(stderr=True).status("tracking") as status:
-
-        def show(done: int) -> None:
-            if done % 500 == 0:
-                status.update(f"tracking: {done} messages")
-
-        summary = replay_bag(bag, out, overrides, show, smooth=smooth, settings=settings)
+    with doing("tracking") as tell:
+        summary = replay_bag(bag, out, overrides, tell, smooth=smooth, settings=settings)
     others = ", ".join(f"{name} {value}" for name, value in summary.parameters.items())
     typer.echo(f"tracker parameters of {source}; not the default: {others or 'none'}")
     typer.echo(f"{summary.epochs} epochs")
@@ -208,15 +246,14 @@ def _track(
 
 
 def _run_offline(scenario: Scenario, target: Path) -> None:
-    from rich.console import Console  # noqa: PLC0415
 
     from netpos.scenario.offline import simulate_to_bag  # noqa: PLC0415
 
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".netpos_") as folder:
         simulated = Path(folder) / target.name
-        with Console(stderr=True).status("simulating"):
-            simulate_to_bag(scenario, simulated)
+        with doing("simulating") as tell:
+            simulate_to_bag(scenario, simulated, progress=tell)
         _track(simulated, target, scenario.tracker, source=scenario.name)
 
 
@@ -237,6 +274,8 @@ def _run_live(scenario: str, target: Path, rate: float, seed: int) -> None:
     command = [str(script), name, str(target.absolute()), f"{rate:g}", str(seed)]
     with subprocess.Popen(command) as graph:
         status = _wait(graph)
+    if status == _INTERRUPTED:
+        raise KeyboardInterrupt
     if status != 0:
         raise WorkFailedError(f"the graph ended with status {status}; its messages are above")
     if not target.exists():

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import chi2
-from scipy.stats import t as student_t
+from scipy.special import gammaincinv, stdtrit
 
 from netpos.evaluation.correlated import mean_square_given_shape
 from netpos.evaluation.pairing import Mask
@@ -68,7 +67,7 @@ def chi2_mean_bounds(dof: float, n: float, confidence: float = CONFIDENCE) -> tu
     each; n need not be whole.
     """
     tail = (1.0 - confidence) / 2.0
-    low, high = chi2.ppf([tail, 1.0 - tail], dof * n) / n
+    low, high = 2.0 * gammaincinv(dof * n / 2.0, [tail, 1.0 - tail]) / n  # chi-square quantiles
     return float(low), float(high)
 
 
@@ -149,6 +148,6 @@ def nees_over_runs(sums: Array, counts: Array, dof: int) -> MeanTest:
         return MeanTest(mean=mean, bounds=chi2_mean_bounds(dof, 1.0), n_eff=1.0)
     residuals = sums - mean * counts
     error = float(np.sqrt(runs / (runs - 1) * (residuals**2).sum()) / counts.sum())
-    reach = float(student_t.ppf((1.0 + CONFIDENCE) / 2.0, runs - 1)) * error
+    reach = float(stdtrit(runs - 1, (1.0 + CONFIDENCE) / 2.0)) * error
     n_eff = 2.0 * dof / error**2 if error > 0.0 else np.inf
     return MeanTest(mean=mean, bounds=(dof - reach, dof + reach), n_eff=float(n_eff))

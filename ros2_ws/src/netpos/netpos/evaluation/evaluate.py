@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Mapping
+import pickle
+import zlib
+from array import array
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from netpos.bags import LOST_METADATA, BagReader, codec
+import numpy as np
+
+from netpos.bags import LOST_METADATA, BagEntry, BagReader, codec
 from netpos.bags.recording import SKIPPED, TRUTH_ALIGNMENT
 from netpos.bags.single_file import load_yaml
 from netpos.evaluation.metrics import SKIP_EPOCHS, Figures, Run, Scored, score
-from netpos.evaluation.pairing import Trajectory
+from netpos.evaluation.pairing import Clock, Poses, at_stamps
 from netpos.evaluation.recorded_bound import recorded_bound_m
 from netpos.evaluation.requirements import Verdict, judge
+from netpos.evaluation.residuals import Series, series_of
 from netpos.evaluation.scene import buildings_of
 from netpos.evaluation.survey import Survey, VueRecord, survey_vue
 from netpos.messages import topics
 from netpos.messages.values import (
     Array,
-    ClockState,
     InitialPose,
     Odometry,
     RsuErrors,
@@ -33,7 +38,9 @@ from netpos.tracking.config import TrackerConfig
 from netpos.tracking.settings import bag_settings
 
 _ODOMETRY, _CLOCK = "nav_msgs/msg/Odometry", "netpos_msgs/msg/ClockState"
-_Sink = tuple[str, Callable[[Any], Any], Callable[[Any], None]]
+_Sink = tuple[str, Callable[[BagEntry], None]]
+_BLOCK = 1000  # measurements compressed together
+Progress = Callable[[int], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,46 +62,48 @@ class Delivery:
     missing: int | None
 
 
-@dataclass(slots=True)
 class _DeliveryCounter:
-    received: int = 0
-    out_of_order: int = 0
-    newest_ns: int = -1
-    expected: dict[tuple[int, int], int] = field(default_factory=dict)
-    seen: set[tuple[int, int, str]] = field(default_factory=set)
+    """Takes measurements as they come, of each four numbers."""
+
+    def __init__(self) -> None:
+        self._rows = array("q")
+        self._rsus: dict[str, int] = {}
 
     def add(self, measurement: RsuMeasurement) -> None:
-        epoch = (measurement.stamp_ns, measurement.sequence)
-        self.received += 1
-        self.out_of_order += measurement.stamp_ns < self.newest_ns
-        self.newest_ns = max(self.newest_ns, measurement.stamp_ns)
-        self.expected[epoch] = max(self.expected.get(epoch, 0), measurement.expected)
-        self.seen.add((*epoch, measurement.rsu_id))
+        rsu = self._rsus.setdefault(measurement.rsu_id, len(self._rsus))
+        at = (measurement.stamp_ns, measurement.sequence)
+        self._rows.extend((*at, rsu, measurement.expected))
 
     def result(self, beacons: int | None) -> Delivery:
-        announced = self.received > 0 and all(self.expected.values())
-        expected = sum(self.expected.values()) if announced else None
+        rows = np.array(self._rows, dtype=np.int64).reshape(-1, 4)
+        stamps = rows[:, 0]
+        epochs, of = np.unique(rows[:, :2], axis=0, return_inverse=True)
+        expected = np.zeros(len(epochs), dtype=np.int64)
+        np.maximum.at(expected, of, rows[:, 3])
+        seen = len(np.unique(rows[:, :3], axis=0))
+        announced = int(expected.sum()) if len(rows) and expected.all() else None
         return Delivery(
             beacons=beacons,
-            epochs=len(self.expected),
-            received=self.received,
-            duplicates=self.received - len(self.seen),
-            out_of_order=self.out_of_order,
-            expected=expected,
-            missing=None if expected is None else expected - len(self.seen),
+            epochs=len(epochs),
+            received=len(rows),
+            duplicates=len(rows) - seen,
+            out_of_order=int((stamps < np.maximum.accumulate(stamps)).sum()),
+            expected=announced,
+            missing=None if announced is None else announced - seen,
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VueEvaluation:
-    """One device: its run, the scored pairs with their figures, the verdicts and what was
-    delivered.
+    """One device: its run, the scored pairs with their figures, the verdicts, what was
+    delivered, and, where asked for, what each RSU measured minus what it should have.
     """
 
     run: Run
     scored: Scored
     verdicts: tuple[Verdict, ...]
     delivery: Delivery
+    series: tuple[Series, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,7 +112,7 @@ class Evaluation:
     network and device, under the devices' true names only. ``topics``: type and number of
     messages; ``notes``: what the importer did to the data, to be read before the figures;
     ``buildings``: (k, 4) rectangles x_min, y_min, x_max, y_max [m], none where the bag
-    does not hold its scenario."""
+    does not hold its scenario; ``facts``: what the bag says of how it was made."""
 
     path: Path
     skip: int
@@ -113,6 +122,7 @@ class Evaluation:
     buildings: Array
     topics: Mapping[str, tuple[str, int]]
     notes: tuple[str, ...] = ()
+    facts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def columns(self) -> dict[str, Figures]:
         """Figures by the name of their column in a table: devices, then devices by network."""
@@ -151,31 +161,75 @@ def _key(vue: str, network: str) -> str:
 
 
 @dataclass(slots=True)
-class _Recording:
-    """The messages of a bag that matter here, as values, in recorded order, by device; what a
-    network says by "network/device"."""
+class _Statuses:
+    """Those of a device; what a status has in common with the one before is held once."""
 
-    truth: dict[str, list[Odometry]] = field(default_factory=lambda: defaultdict(list))
-    estimate: dict[str, list[Odometry]] = field(default_factory=lambda: defaultdict(list))
-    status: dict[str, list[TrackStatus]] = field(default_factory=lambda: defaultdict(list))
-    clock: dict[str, list[ClockState]] = field(default_factory=lambda: defaultdict(list))
-    clock_truth: dict[str, list[ClockState]] = field(default_factory=lambda: defaultdict(list))
+    kept: list[TrackStatus] = field(default_factory=list)
+
+    def append(self, status: TrackStatus) -> None:
+        if self.kept:
+            last = self.kept[-1]
+            same = {
+                name: getattr(last, name)
+                for name in ("vue_id", "rejected", "sources", "steps", "reason")
+                if getattr(last, name) == getattr(status, name)
+            }
+            status = replace(status, **same)
+        self.kept.append(status)
+
+
+@dataclass(slots=True)
+class _Measured:
+    """Measurements of a device, in recorded order, kept as they were recorded and compressed:
+    their values take twenty times the place."""
+
+    decode: Callable[[bytes], RsuMeasurement]
+    _blocks: list[bytes] = field(default_factory=list)
+    _open: list[bytes] = field(default_factory=list)
+
+    def append(self, cdr: bytes) -> None:
+        self._open.append(cdr)
+        if len(self._open) == _BLOCK:
+            self._blocks.append(zlib.compress(pickle.dumps(self._open), level=1))
+            self._open.clear()
+
+    def __iter__(self) -> Iterator[RsuMeasurement]:
+        for block in self._blocks:
+            yield from map(self.decode, pickle.loads(zlib.decompress(block)))
+        yield from map(self.decode, self._open)
+
+
+@dataclass(slots=True)
+class _Recording:
+    """What matters here of the messages of a bag, by device; what a network says by
+    "network/device". Of a million messages the values would not fit into memory."""
+
+    measured: dict[str, _Measured]
+    truth: dict[str, Poses] = field(default_factory=lambda: defaultdict(Poses))
+    estimate: dict[str, Poses] = field(default_factory=lambda: defaultdict(Poses))
+    status: dict[str, _Statuses] = field(default_factory=lambda: defaultdict(_Statuses))
+    clock: dict[str, Clock] = field(default_factory=lambda: defaultdict(Clock))
+    clock_truth: dict[str, Clock] = field(default_factory=lambda: defaultdict(Clock))
     rsus: dict[str, RsuInfo] = field(default_factory=dict)
-    measured: dict[str, list[RsuMeasurement]] = field(default_factory=lambda: defaultdict(list))
     poses: dict[str, list[InitialPose]] = field(default_factory=lambda: defaultdict(list))
     errors: dict[str, list[RsuErrors]] = field(default_factory=lambda: defaultdict(list))
     delivery: dict[str, _DeliveryCounter] = field(
         default_factory=lambda: defaultdict(_DeliveryCounter)
     )
 
+    def forget(self, vue: str) -> None:
+        """Make room."""
+        for kept in (self.measured, self.truth, self.estimate, self.delivery, self.clock_truth):
+            kept.pop(vue, None)
+
     def run(self, vue: str, network: str = "") -> Run:
         by = _key(vue, network)
         return Run(
-            truth=Trajectory.of(self.truth[vue]),
-            estimate=Trajectory.of(self.estimate[by]),
-            statuses=self.status[by],
-            clock=self.clock[by],
-            clock_truth=self.clock_truth[vue],
+            truth=self.truth[vue].trajectory(),
+            estimate=self.estimate[by].trajectory(),
+            statuses=self.status[by].kept,
+            clock=self.clock[by].offsets(),
+            clock_truth=self.clock_truth[vue].offsets(),
         )
 
 
@@ -207,56 +261,79 @@ def _networks(bag: BagReader, vues: list[str]) -> list[tuple[str, str]]:
     return [(net, vue) for net, vue, name in filled if name == topics.ODOMETRY and vue in vues]
 
 
+def _into(convert: Callable[[Any], Any], add: Callable[[Any], None]) -> Callable[[BagEntry], None]:
+    return lambda entry: add(convert(entry.message))
+
+
 def _output_sinks(recording: _Recording, vue: str, network: str) -> dict[str, _Sink]:
     """What becomes of what a tracker says of a device."""
     convert, by = codec(), _key(vue, network)
     of_vue: dict[str, _Sink] = {
-        topics.ODOMETRY: (_ODOMETRY, convert.odometry_from_msg, recording.estimate[by].append),
-        topics.CLOCK_STATE: (_CLOCK, convert.clock_state_from_msg, recording.clock[by].append),
+        topics.ODOMETRY: (
+            _ODOMETRY,
+            _into(convert.odometry_from_msg, recording.estimate[by].append),
+        ),
+        topics.CLOCK_STATE: (
+            _CLOCK,
+            _into(convert.clock_state_from_msg, recording.clock[by].append),
+        ),
         topics.TRACK_STATUS: (
             "netpos_msgs/msg/TrackStatus",
-            convert.track_status_from_msg,
-            recording.status[by].append,
+            _into(convert.track_status_from_msg, recording.status[by].append),
         ),
     }
     return {topics.of_vue(vue, name, network): sink for name, sink in of_vue.items()}
 
 
-def _sinks(
-    recording: _Recording, vues: list[str], networks: list[tuple[str, str]]
-) -> dict[str, _Sink]:
-    """What becomes of each topic: its type, the conversion to a value and where the value goes."""
+def _common_sinks(recording: _Recording) -> dict[str, _Sink]:
+    """What becomes of the topics of the RSUs."""
     convert = codec()
 
     def add_rsu(info: RsuInfo) -> None:
         recording.rsus[info.rsu_id] = info
 
-    def add_measurement(measurement: RsuMeasurement) -> None:
+    def add_measurement(entry: BagEntry) -> None:
+        measurement = convert.measurement_from_msg(entry.message)
         recording.delivery[measurement.vue_id].add(measurement)
-        recording.measured[measurement.vue_id].append(measurement)
+        recording.measured[measurement.vue_id].append(entry.cdr)
 
-    sinks: dict[str, _Sink] = {
-        topics.RSU_INFO: ("netpos_msgs/msg/RsuInfo", convert.rsu_info_from_msg, add_rsu),
-        topics.RSU_MEASUREMENTS: (
-            "netpos_msgs/msg/RsuMeasurement",
-            convert.measurement_from_msg,
-            add_measurement,
+    def add_errors(errors: RsuErrors) -> None:
+        recording.errors[errors.vue_id].append(errors)
+
+    return {
+        topics.RSU_INFO: (
+            "netpos_msgs/msg/RsuInfo",
+            _into(convert.rsu_info_from_msg, add_rsu),
         ),
+        topics.RSU_MEASUREMENTS: ("netpos_msgs/msg/RsuMeasurement", add_measurement),
         topics.RSU_LEARNED: (
             "netpos_msgs/msg/RsuErrors",
-            convert.rsu_errors_from_msg,
-            lambda errors: recording.errors[errors.vue_id].append(errors),
+            _into(convert.rsu_errors_from_msg, add_errors),
         ),
     }
+
+
+def _sinks(
+    recording: _Recording, vues: list[str], networks: list[tuple[str, str]]
+) -> dict[str, _Sink]:
+    """What becomes of each topic: its type, and what takes its messages."""
+    convert, sinks = codec(), _common_sinks(recording)
     for vue in vues:
-        truth, clock = recording.truth[vue], recording.clock_truth[vue]
         of_vue: dict[str, _Sink] = {
-            topics.GROUND_TRUTH: (_ODOMETRY, convert.odometry_from_msg, truth.append),
-            topics.GROUND_TRUTH_CLOCK: (_CLOCK, convert.clock_state_from_msg, clock.append),
+            topics.GROUND_TRUTH: (
+                _ODOMETRY,
+                _into(convert.odometry_from_msg, recording.truth[vue].append),
+            ),
+            topics.GROUND_TRUTH_CLOCK: (
+                _CLOCK,
+                _into(convert.clock_state_from_msg, recording.clock_truth[vue].append),
+            ),
             topics.INITIAL_POSE: (
                 "geometry_msgs/msg/PoseWithCovarianceStamped",
-                partial(convert.initial_pose_from_msg, vue_id=vue),
-                recording.poses[vue].append,
+                _into(
+                    partial(convert.initial_pose_from_msg, vue_id=vue),
+                    recording.poses[vue].append,
+                ),
             ),
         }
         sinks |= {topics.of_vue(vue, name): sink for name, sink in of_vue.items()}
@@ -265,17 +342,23 @@ def _sinks(
     return sinks
 
 
-def _read(bag: BagReader, vues: list[str], networks: list[tuple[str, str]]) -> _Recording:
-    recording = _Recording()
+def _read(
+    bag: BagReader, vues: list[str], networks: list[tuple[str, str]], progress: Progress | None
+) -> _Recording:
+    def decode(cdr: bytes) -> RsuMeasurement:
+        return codec().measurement_from_msg(bag.decode(topics.RSU_MEASUREMENTS, cdr))
+
+    recording = _Recording(measured=defaultdict(partial(_Measured, decode)))
     sinks = _sinks(recording, vues, networks)
     wanted = sinks.keys() & bag.topics.keys()
     for topic in sorted(wanted):
         expected, found = sinks[topic][0], bag.topics[topic].type_name
         if found != expected:
             raise ValueError(f"{bag.path}: {topic} must hold {expected}, it holds {found}")
-    for entry in bag.messages(wanted):
-        _, convert, add = sinks[entry.topic]
-        add(convert(entry.message))
+    for done, entry in enumerate(bag.messages(wanted)):
+        sinks[entry.topic][1](entry)
+        if progress is not None:
+            progress(done)
     return recording
 
 
@@ -298,7 +381,7 @@ def _with_bound(
         recording.measured[vue],
         recording.rsus,
         poses[0] if poses else None,
-        Trajectory.of(recording.truth[vue]),
+        recording.truth[vue].trajectory(),
         config,
         scored.counted.estimate.stamp_ns,
     )
@@ -315,10 +398,18 @@ def notes_of(bag: BagReader) -> tuple[str, ...]:
 
 
 def lost_of(bag: BagReader) -> list[str]:
-    """What recorders say they missed, a sentence each; none where nothing was lost."""
-    found = [load_yaml(text) or {} for text in bag.facts.get(LOST_METADATA, ())]
-    told = [", ".join(f"{n} of {topic}" for topic, n in sorted(lost.items())) for lost in found]
-    return [f"LOST while recording: {text}" for text in told if text]
+    """What recorders say they missed, as a sentence; none where nothing was lost."""
+    lost = lost_in(bag.facts)
+    told = ", ".join(f"{n} of {topic}" for topic, n in sorted(lost.items()))
+    return [f"LOST while recording: {told}"] if told else []
+
+
+def lost_in(facts: Mapping[str, tuple[str, ...]]) -> dict[str, int]:
+    """Messages that recorders missed, by topic."""
+    found: Counter[str] = Counter()
+    for text in facts.get(LOST_METADATA, ()):
+        found.update(load_yaml(text) or {})
+    return dict(found)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -333,14 +424,17 @@ class _Contents:
     buildings: Array
     config: TrackerConfig | None
     notes: tuple[str, ...]
+    facts: Mapping[str, tuple[str, ...]]
 
 
-def _contents(path: Path, choose: Callable[[BagReader], list[str]]) -> _Contents:
+def _contents(
+    path: Path, choose: Callable[[BagReader], list[str]], progress: Progress | None
+) -> _Contents:
     """Read a bag once, of the devices that ``choose`` names."""
     with BagReader(path) as bag:
         names = choose(bag)
         networks = _networks(bag, names)
-        recording = _read(bag, names, networks)
+        recording = _read(bag, names, networks, progress)
         return _Contents(
             names=names,
             networks=networks,
@@ -350,6 +444,7 @@ def _contents(path: Path, choose: Callable[[BagReader], list[str]]) -> _Contents
             buildings=buildings_of(bag),
             config=config_of(bag),
             notes=notes_of(bag),
+            facts=bag.facts,
         )
 
 
@@ -373,19 +468,26 @@ def assess_bag(
     skip: int = SKIP_EPOCHS,
     vue: str | None = None,
     truth: TruthOf | None = None,
+    residuals: bool = False,
+    progress: Progress | None = None,
 ) -> Evaluation | Survey:
-    """``evaluate_bag`` where there is ground truth, else ``survey_bag``; raises what they do."""
+    """``evaluate_bag`` where there is ground truth, else ``survey_bag``; raises what they do.
+    ``progress`` is called with the number of messages read."""
     if truth is not None:
-        return evaluate_bag(path, skip=skip, vue=vue, truth=truth)
+        return evaluate_bag(
+            path, skip=skip, vue=vue, truth=truth, residuals=residuals, progress=progress
+        )
     with BagReader(path) as bag:
         has_truth = any(
             info.count and topics.split(topic)[1] == topics.GROUND_TRUTH
             for topic, info in bag.topics.items()
         )
-    return evaluate_bag(path, skip=skip, vue=vue) if has_truth else survey_bag(path, vue=vue)
+    if has_truth:
+        return evaluate_bag(path, skip=skip, vue=vue, residuals=residuals, progress=progress)
+    return survey_bag(path, vue=vue, progress=progress)
 
 
-def survey_bag(path: Path, *, vue: str | None = None) -> Survey:
+def survey_bag(path: Path, *, vue: str | None = None, progress: Progress | None = None) -> Survey:
     """What a bag says of every device that a tracker reported of, or only of ``vue``, without
     ground truth.
 
@@ -393,14 +495,14 @@ def survey_bag(path: Path, *, vue: str | None = None) -> Survey:
     ------
     ValueError  not a readable bag, no tracker's output, or no such device
     """
-    held = _contents(path, lambda bag: _surveyed(bag, path, vue))
+    held = _contents(path, lambda bag: _surveyed(bag, path, vue), progress)
     recording, vues = held.recording, {}
     for name in held.names:
         record = VueRecord(
-            odometry=recording.estimate[name],
-            statuses=recording.status[name],
-            clock=recording.clock[name],
-            measurements=recording.measured[name],
+            track=recording.estimate[name].trajectory(),
+            statuses=recording.status[name].kept,
+            clock=recording.clock[name].offsets(),
+            measurements=list(recording.measured[name]),
             errors=recording.errors[name],
         )
         learns = held.config is not None and held.config.learn_errors
@@ -412,6 +514,7 @@ def survey_bag(path: Path, *, vue: str | None = None) -> Survey:
         buildings=held.buildings,
         topics=held.topics,
         notes=held.notes,
+        facts=held.facts,
     )
 
 
@@ -439,48 +542,94 @@ def evaluate_bag(
     skip: int = SKIP_EPOCHS,
     vue: str | None = None,
     truth: TruthOf | None = None,
+    residuals: bool = False,
+    progress: Progress | None = None,
 ) -> Evaluation:
     """Score every device of a bag that has ground truth, or only ``vue``; with ``truth`` one
     device against that.
 
     The first ``skip`` estimates of each device do not count (fokin2020 leaves out 20).
+    ``residuals``: with what each RSU measured against the truth. ``progress`` is called with the
+    number of messages read.
 
     Raises
     ------
-    ValueError  not a readable bag, no ground truth, no estimates, or no such device
+    ValueError  not a readable bag, no ground truth, no estimates, no such device, or no device has
+                more estimates than are skipped
     """
-    held = _contents(path, lambda bag: (_chosen if truth is None else _alone)(bag, path, vue))
+    choose = _chosen if truth is None else _alone
+    held = _contents(path, lambda bag: choose(bag, path, vue), progress)
     recording, notes = held.recording, held.notes
     if truth is not None:
         (name,) = held.names
-        recording.truth[name], sentence = truth(list(held.rsus), recording.measured[name], name)
+        poses, sentence = truth(list(held.rsus), list(recording.measured[name]), name)
+        for pose in poses:
+            recording.truth[name].append(pose)
         notes = (sentence, *notes)
+    _check_skip(held, path, skip)
     networks: dict[str, dict[str, Scored]] = {}
     for network, name in held.networks:
         scored = score(recording.run(name, network), skip=skip)
         networks.setdefault(network, {})[name] = scored
+    vues = {name: _evaluated(held, path, name, skip, residuals=residuals) for name in held.names}
+    covered = [text for name, vue in vues.items() for text in _covered(name, vue.scored.figures)]
     return Evaluation(
         path=path,
         skip=skip,
-        vues={name: _evaluated(held, path, name, skip) for name in held.names},
+        vues=vues,
         networks=networks,
         rsus=held.rsus,
         buildings=held.buildings,
         topics=held.topics,
-        notes=notes,
+        notes=(*notes, *covered),
+        facts=held.facts,
     )
 
 
-def _evaluated(held: _Contents, path: Path, name: str, skip: int) -> VueEvaluation:
-    """One device against its truth."""
-    run = held.recording.run(name)
+def _evaluated(
+    held: _Contents, path: Path, name: str, skip: int, *, residuals: bool
+) -> VueEvaluation:
+    """One device against its truth; what the recording holds of it is not needed after."""
+    recording = held.recording
+    run = recording.run(name)
     if not len(run.truth):
         raise ValueError(f"{path}: no message on /{name}/ground_truth has finite values")
-    scored = _with_bound(score(run, skip=skip), held.recording, name, held.config)
+    scored = _with_bound(score(run, skip=skip), recording, name, held.config)
+    series: list[Series] = []
+    if residuals:
+        clock = run.clock_truth if run.clock_truth.stamp_ns.size else run.clock
+        stamps = run.estimate.stamp_ns
+        there = at_stamps(run.truth, stamps)
+        series = series_of(recording.measured[name], recording.rsus, there, clock.at(stamps))
     _, beacons = held.topics.get(topics.of_vue(name, topics.BEACON), ("", None))
+    delivery = recording.delivery[name].result(beacons)
+    recording.forget(name)
     return VueEvaluation(
         run=run,
         scored=scored,
         verdicts=judge(scored.figures, scored.counted.horizontal_error),
-        delivery=held.recording.delivery[name].result(beacons),
+        delivery=delivery,
+        series=tuple(series),
     )
+
+
+def _check_skip(held: _Contents, path: Path, skip: int) -> None:
+    """A prefix that leaves nothing to score is a mistake, not a result."""
+    longest = max(len(held.recording.estimate[name]) for name in held.names)
+    if 0 < longest <= skip:
+        raise ValueError(
+            f"{path} has {longest} estimates and the first {skip} are skipped; "
+            f"give --skip {min(longest // 2, SKIP_EPOCHS)} to score the others"
+        )
+
+
+def _covered(name: str, figures: Figures) -> list[str]:
+    """A sentence where some of the estimates have no ground truth to be scored by."""
+    without = figures.outside_truth + figures.in_truth_gap
+    if not without:
+        return []
+    share = 100.0 * without / figures.estimates
+    return [
+        f"{name}: {without} of {figures.estimates} estimates ({share:.1f} %) are not scored: "
+        f"{figures.outside_truth} before or after the ground truth, {figures.in_truth_gap} in gaps"
+    ]

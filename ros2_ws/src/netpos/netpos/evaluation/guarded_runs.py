@@ -20,7 +20,7 @@ from netpos.bags.importers import import_ble_aoa, import_uwb_anchors, import_uwb
 from netpos.bags.importers.common import recordings
 from netpos.evaluation.availability import refusals
 from netpos.evaluation.metrics import Figures, Run, score
-from netpos.evaluation.pairing import Trajectory
+from netpos.evaluation.pairing import ClockOffsets, Trajectory
 from netpos.messages import topics
 from netpos.messages.values import (
     Beacon,
@@ -129,8 +129,8 @@ def _scored(material: Material, vue: str, outputs: Sequence[TrackOutput]) -> Tra
         truth=Trajectory.of(material.truth[vue]),
         estimate=Trajectory.of(o.odometry for o in mine if o.odometry is not None),
         statuses=statuses,
-        clock=[o.clock for o in mine if o.clock is not None],
-        clock_truth=material.clock_truth.get(vue, ()),
+        clock=ClockOffsets.of(o.clock for o in mine if o.clock is not None),
+        clock_truth=ClockOffsets.of(material.clock_truth.get(vue, ())),
     )
     figures = score(run).figures
     last = max(statuses, key=lambda status: status.stamp_ns, default=None)

@@ -18,14 +18,14 @@ from netpos.evaluation.availability import (
 from netpos.evaluation.consistency import nees_test, nis_test, whitened
 from netpos.evaluation.pairing import (
     MAX_TRUTH_GAP_S,
+    ClockOffsets,
     Pairs,
     Stamps,
     Trajectory,
-    bracket,
     pair,
     wrap_angle,
 )
-from netpos.messages.values import Array, ClockState, TrackStatus
+from netpos.messages.values import Array, TrackStatus
 
 SKIP_EPOCHS = 20
 LARGE_ERROR_M = 5.0
@@ -33,6 +33,7 @@ MIN_SPEED_FOR_HEADING_MPS = 0.5
 CONVERGED_ERROR_M = 1.0
 CONVERGED_FOR_S = 1.0
 NS = 1e9
+NO_CLOCK = ClockOffsets.of(())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,20 +55,21 @@ class Figures:
     """Accuracy, availability and consistency of one device, after the convergence prefix of
     ``skipped`` estimates and from the first one in state TRACKING on.
 
-    n: estimates scored. initialising: estimates before the first in state TRACKING, 0 where the
-    recording has no track status. duration_s: from the first to the last scored. availability:
-    share of the ground truth's span at which the newest ready estimate is at most 0.2 s old (5
-    Hz, fokin2020's priority passage), convergence included; an estimate is ready in state
-    TRACKING. rmse_m, p50..max: horizontal position error; mean_error_m: mean horizontal error,
-    which fokin2020:eq.34 calls RMSE; rmse_3d_m with the vertical; north, east, down: by axis, as
-    deng2022 does. velocity_rmse_mps: horizontal, map axes. heading_rmse_deg: where the true speed
-    exceeds 0.5 m/s. clock_offset_sd_ns: standard deviation of the clock offset error about its
-    mean; clock_offset_rmse_ns: about zero. nees_*: horizontal position, 2 degrees of freedom,
-    bounds as wide as those of nees_n_eff independent epochs. nis_mean: mean NIS of epochs with
-    measurements; nis_dof_mean: its expectation. rejected: all rejections counted up to the end;
-    rejected_share: of the measurements (no IMU samples, no events such as a lost track) that the
-    track accepted or refused, the share refused. lost_tracks: see ``lost_tracks``, None without
-    track status. unscored_s: seconds of the ground truth's span without a scored estimate
+    n: estimates scored. truth_share: share of the estimates at whose stamp there is ground truth;
+    nothing is known of the others. initialising: estimates before the first in state TRACKING, 0
+    where the recording has no track status. duration_s: from the first to the last scored.
+    availability: share of the ground truth's span at which the newest ready estimate is at most
+    0.2 s old (5 Hz, fokin2020's priority passage), convergence included; an estimate is ready in
+    state TRACKING. rmse_m, p50..max: horizontal position error; mean_error_m: mean horizontal
+    error, which fokin2020:eq.34 calls RMSE; rmse_3d_m with the vertical; north, east, down: by
+    axis, as deng2022 does. velocity_rmse_mps: horizontal, map axes. heading_rmse_deg: where the
+    true speed exceeds 0.5 m/s. clock_offset_sd_ns: standard deviation of the clock offset error
+    about its mean; clock_offset_rmse_ns: about zero. nees_*: horizontal position, 2 degrees of
+    freedom, bounds as wide as those of nees_n_eff independent epochs. nis_mean: mean NIS of epochs
+    with measurements; nis_dof_mean: its expectation. rejected: all rejections counted up to the
+    end; rejected_share: of the measurements (no IMU samples, no events such as a lost track) that
+    the track accepted or refused, the share refused. lost_tracks: see ``lost_tracks``, None
+    without track status. unscored_s: seconds of the ground truth's span without a scored estimate
     (``availability.unscored_s``): before the first one, after a loss, in gaps. share_above_5m:
     share of the estimates scored with an error above 5 m. protection_exceeded: share of the
     estimates with a horizontal error above the protection level told with them;
@@ -93,6 +95,7 @@ class Figures:
     nis_mean: float | None = None
     rejected: int | None = None
     bound_ratio: float | None = None
+    truth_share: float | None = None
     lost_tracks: int | None = None
     unscored_s: float | None = None
     share_above_5m: float | None = None
@@ -140,8 +143,8 @@ class Run:
     truth: Trajectory
     estimate: Trajectory
     statuses: Sequence[TrackStatus] = ()
-    clock: Sequence[ClockState] = ()
-    clock_truth: Sequence[ClockState] = ()
+    clock: ClockOffsets = NO_CLOCK
+    clock_truth: ClockOffsets = NO_CLOCK
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,18 +192,10 @@ def time_to_converge(
 
 
 def clock_error_series(run: Run, max_gap_s: float = MAX_TRUTH_GAP_S) -> tuple[Stamps, Array]:
-    """Stamps (k,) and clock offset errors (k,) [ns], estimate minus the interpolated truth;
-    finite values only.
-    """
-    estimate = {c.stamp_ns: c.offset_s for c in run.clock if np.isfinite(c.offset_s)}
-    known = {c.stamp_ns: c.offset_s for c in run.clock_truth if np.isfinite(c.offset_s)}
-    query = np.array(sorted(estimate), dtype=np.int64)
-    base = np.array(sorted(known), dtype=np.int64)
-    found = bracket(query, base, max_gap_s)
-    stamps = query[found.inside]
-    offsets = np.array([estimate[s] for s in stamps.tolist()], dtype=np.float64)
-    true = found.interpolate(np.array([known[s] for s in base.tolist()], dtype=np.float64))
-    return stamps, (offsets - true) * NS
+    """Stamps (k,) and clock offset errors (k,) [ns], estimate minus the interpolated truth."""
+    true = run.clock_truth.at(run.clock.stamp_ns, max_gap_s)
+    told = np.isin(run.clock.stamp_ns, true.stamp_ns)
+    return true.stamp_ns, (run.clock.offset_s[told] - true.offset_s) * NS
 
 
 def _initial(run: Run, pairs: Pairs, ready_ns: Stamps) -> Initial:
@@ -333,10 +328,11 @@ def score(
     initialising = int((stamps < ready_ns[0]).sum()) if ready_ns.size else len(stamps)
     left = stamps[max(skip, initialising) :]
     from_ns = int(left[0]) if left.size else int(np.iinfo(np.int64).max)
-    scored = pairs.take(pairs.estimate.stamp_ns >= from_ns)
+    scored = pairs.take(slice(int(np.searchsorted(pairs.estimate.stamp_ns, from_ns)), None))
     clock_ns, clock = clock_error_series(run, max_truth_gap_s)
     clock = clock[clock_ns >= from_ns]
     figures = Figures(
+        truth_share=len(pairs) / len(run.estimate) if len(run.estimate) else None,
         availability=availability(run.truth.stamp_ns, ready_ns),
         unscored_s=unscored_s(run.truth.stamp_ns, scored.estimate.stamp_ns, stamps),
         clock_offset_sd_ns=float(clock.std()) if clock.size else None,

@@ -7,6 +7,7 @@ Stamps are integer nanoseconds.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -14,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from netpos.messages.values import Array, Odometry
+from netpos.messages.values import Array, ClockState, Odometry
 
 Stamps = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 MAX_TRUTH_GAP_S = 1.0
+# Columns of a pose after its position.
+_QUATERNION, _VELOCITY, _COV, _POSE_VALUES = slice(3, 7), slice(7, 10), 10, 19
 
 
 def wrap_angle(angle: Array) -> Array:
@@ -59,43 +62,110 @@ class Trajectory:
 
     @classmethod
     def of(cls, poses: Iterable[Odometry]) -> Trajectory:
-        """Trajectory of odometry messages in the order they were recorded.
+        """Trajectory of odometry messages in the order they were recorded; see ``Poses``."""
+        columns = Poses()
+        for pose in poses:
+            columns.append(pose)
+        return columns.trajectory()
+
+
+class Poses:
+    """Odometry messages as they are read, in the order they were recorded: their numbers only."""
+
+    def __init__(self) -> None:
+        self._stamps = array("q")
+        self._values = array("d")
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def append(self, pose: Odometry) -> None:
+        """One message more."""
+        self._stamps.append(pose.stamp_ns)
+        for values in (pose.position, pose.quaternion, pose.linear_velocity):
+            self._values.extend(values.tolist())
+        self._values.extend(pose.pose_cov[:3, :3].ravel().tolist())
+
+    def trajectory(self) -> Trajectory:
+        """The poses in increasing time.
 
         The twist is turned from base_link into map axes. Of several messages with one stamp the
         last counts. A message with a value that is not finite, or without an orientation (zero
         quaternion), is left out and counted as invalid.
         """
-        poses = list(poses)
-        valid = [pose for pose in poses if _is_valid(pose)]
-        last = {pose.stamp_ns: pose for pose in valid}
-        kept = [last[stamp] for stamp in sorted(last)]
-        rotation = _rotations(kept)
-        return cls(
-            stamp_ns=np.array([pose.stamp_ns for pose in kept], dtype=np.int64),
-            position=_stack([pose.position for pose in kept], 3),
-            velocity=np.einsum(
-                "nij,nj->ni", rotation, _stack([pose.linear_velocity for pose in kept], 3)
-            ),
-            heading=np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]),
-            position_cov=_stack([pose.pose_cov[:3, :3] for pose in kept], 3, 3),
-            duplicates=len(valid) - len(kept),
-            invalid=len(poses) - len(valid),
+        stamps = np.array(self._stamps, dtype=np.int64)
+        values = np.array(self._values, dtype=np.float64).reshape(-1, _POSE_VALUES)
+        moving = values[:, :_COV]
+        valid = np.isfinite(moving).all(axis=1) & (moving[:, _QUATERNION] != 0.0).any(axis=1)
+        stamps, values = stamps[valid], values[valid]
+        kept = _last_of_each(stamps)
+        values = values[kept]
+        turn = _rotations(values[:, _QUATERNION])
+        return Trajectory(
+            stamp_ns=stamps[kept],
+            position=values[:, :3].copy(),
+            velocity=np.einsum("nij,nj->ni", turn, values[:, _VELOCITY]),
+            heading=np.arctan2(turn[:, 1, 0], turn[:, 0, 0]),
+            position_cov=values[:, _COV:].copy().reshape(-1, 3, 3),
+            duplicates=int(valid.sum()) - kept.size,
+            invalid=valid.size - int(valid.sum()),
         )
 
 
-def _stack(rows: list[Array], *shape: int) -> Array:
-    return np.array(rows, dtype=np.float64).reshape(len(rows), *shape)
-
-
-def _is_valid(pose: Odometry) -> bool:
-    values = (pose.position, pose.quaternion, pose.linear_velocity)
-    return all(np.isfinite(v).all() for v in values) and float(np.linalg.norm(pose.quaternion)) > 0
-
-
-def _rotations(poses: list[Odometry]) -> Array:
-    if not poses:
+def _rotations(quaternions: Array) -> Array:
+    """(n, 3, 3); SciPy takes no 0 of them."""
+    if not len(quaternions):
         return np.zeros((0, 3, 3))
-    return np.asarray(Rotation.from_quat([pose.quaternion for pose in poses]).as_matrix())
+    return np.asarray(Rotation.from_quat(quaternions).as_matrix())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockOffsets:
+    """Offsets of a device's clock: stamp_ns (n,) strictly increasing, offset_s (n,)."""
+
+    stamp_ns: Stamps
+    offset_s: Array
+
+    def at(self, stamp_ns: Stamps, max_gap_s: float = MAX_TRUTH_GAP_S) -> ClockOffsets:
+        """At those of the stamps that ``bracket`` finds a place for."""
+        found = bracket(stamp_ns, self.stamp_ns, max_gap_s)
+        return ClockOffsets(
+            stamp_ns=stamp_ns[found.inside], offset_s=found.interpolate(self.offset_s)
+        )
+
+    @classmethod
+    def of(cls, states: Iterable[ClockState]) -> ClockOffsets:
+        """Of clock states in the order they were recorded; see ``Clock``."""
+        columns = Clock()
+        for state in states:
+            columns.append(state)
+        return columns.offsets()
+
+
+class Clock:
+    """Clock states as they are read, in the order they were recorded: two numbers each."""
+
+    def __init__(self) -> None:
+        self._stamps = array("q")
+        self._offsets = array("d")
+
+    def append(self, state: ClockState) -> None:
+        """One message more."""
+        self._stamps.append(state.stamp_ns)
+        self._offsets.append(state.offset_s)
+
+    def offsets(self) -> ClockOffsets:
+        """Those that are finite, of several with one stamp the last, in increasing time."""
+        stamps, offsets = np.array(self._stamps, dtype=np.int64), np.array(self._offsets)
+        finite = np.isfinite(offsets)
+        kept = _last_of_each(stamps[finite])
+        return ClockOffsets(stamp_ns=stamps[finite][kept], offset_s=offsets[finite][kept])
+
+
+def _last_of_each(stamp_ns: Stamps) -> NDArray[np.int64]:
+    """Indices that sort the stamps, of equal ones the last: the first one from behind."""
+    _, from_behind = np.unique(stamp_ns[::-1], return_index=True)
+    return stamp_ns.size - 1 - from_behind
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -204,16 +274,26 @@ def pair(
     partner.
     """
     found = bracket(estimate.stamp_ns, truth.stamp_ns, max_truth_gap_s)
-    partner = estimate.take(found.inside)
     return Pairs(
-        estimate=partner,
-        truth=Trajectory(
-            stamp_ns=partner.stamp_ns,
-            position=found.interpolate(truth.position),
-            velocity=found.interpolate(truth.velocity),
-            heading=found.interpolate_angle(truth.heading),
-            position_cov=found.interpolate(truth.position_cov),
-        ),
+        estimate=estimate if found.inside.all() else estimate.take(found.inside),
+        truth=_between(truth, found, estimate.stamp_ns),
         outside=found.outside,
         in_gap=found.in_gap,
+    )
+
+
+def at_stamps(
+    track: Trajectory, stamp_ns: Stamps, max_gap_s: float = MAX_TRUTH_GAP_S
+) -> Trajectory:
+    """The track at those of the stamps that ``bracket`` finds a place for."""
+    return _between(track, bracket(stamp_ns, track.stamp_ns, max_gap_s), stamp_ns)
+
+
+def _between(track: Trajectory, found: Bracket, stamp_ns: Stamps) -> Trajectory:
+    return Trajectory(
+        stamp_ns=stamp_ns[found.inside],
+        position=found.interpolate(track.position),
+        velocity=found.interpolate(track.velocity),
+        heading=found.interpolate_angle(track.heading),
+        position_cov=found.interpolate(track.position_cov),
     )

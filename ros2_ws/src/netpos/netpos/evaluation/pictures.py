@@ -36,17 +36,22 @@ RSU_COLOUR = "#117733"
 BUILDING_COLOUR = "#E4E0D8"
 
 
+def check_format(path: Path) -> None:
+    """``ValueError`` for a file that is no picture by its suffix."""
+    if path.suffix.lower() not in FORMATS:
+        raise ValueError(
+            f"{path}: pictures are written as {', '.join(FORMATS)}; choose one of these"
+        )
+
+
 def save(figure: Figure, path: Path, description: str = "") -> None:
     """Write a figure as PNG, SVG or PDF, by the file's suffix; ValueError for another.
 
     Files are small (a PNG has a palette of 64 colours), and the same figure gives the same SVG. An
     SVG carries ``description`` as text.
     """
+    check_format(path)
     suffix = path.suffix.lower()
-    if suffix not in FORMATS:
-        raise ValueError(
-            f"{path}: pictures are written as {', '.join(FORMATS)}; choose one of these"
-        )
     path.parent.mkdir(parents=True, exist_ok=True)
     frame: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.15}
     if suffix == ".png":
@@ -287,28 +292,25 @@ def _explain(axes: Axes, handles: list[Line2D | Patch], title: str) -> None:
 def draw_survey(survey: Survey) -> Figure:
     """Plan view of a recording without ground truth: buildings, RSUs and estimated tracks, with
     dots where the track was not TRACKING."""
-    tracks = {name: vue.record.odometry for name, vue in survey.vues.items()}
-    points = [
-        np.array([pose.position[:2] for pose in track]) for track in tracks.values() if track
-    ]
+    points = [vue.record.track.position[:, :2] for vue in survey.vues.values()]
     points += [rsu.position[None, :2] for rsu in survey.rsus]
-    if not points:
+    if not sum(map(len, points)):
         raise ValueError(f"{survey.path} has neither RSUs nor estimates: there is nothing to draw")
     figure, axes = _plan(*_around(np.concatenate(points)))
     handles: list[Line2D | Patch] = []
     for index, (name, vue) in enumerate(survey.vues.items()):
         colour = TRACK_COLOURS[index % len(TRACK_COLOURS)]
-        xy = np.array([pose.position[:2] for pose in vue.record.odometry]).reshape(-1, 2)
+        track = vue.record.track
+        xy = track.position[:, :2]
         handles += axes.plot(*xy.T, color=colour, lw=1.4, label=name)
         states = {s.stamp_ns: s.state for s in vue.record.statuses}
         poor = [
-            pose.position[:2]
-            for pose in vue.record.odometry
-            if states.get(pose.stamp_ns, TrackState.TRACKING) is not TrackState.TRACKING
+            states.get(stamp, TrackState.TRACKING) is not TrackState.TRACKING
+            for stamp in track.stamp_ns.tolist()
         ]
-        if poor:
+        if any(poor):
             label = f"{name}, not TRACKING"
-            handles += axes.plot(*np.array(poor).T, "o", ms=3, mfc="none", mec="k", label=label)
+            handles += axes.plot(*xy[poor].T, "o", ms=3, mfc="none", mec="k", label=label)
     heard = {s for v in survey.vues.values() for st in v.record.statuses for s in st.sources}
     handles += _draw_rsus(axes, survey, heard)
     handles += _draw_buildings(axes, survey)

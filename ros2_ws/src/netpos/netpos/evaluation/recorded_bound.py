@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from netpos.tracking.rsus import BiasStates, Rsu
 
 
 def recorded_bound_m(
-    measurements: Sequence[RsuMeasurement],
+    measurements: Iterable[RsuMeasurement],
     rsus: Mapping[str, RsuInfo],
     pose: InitialPose | None,
     truth: Trajectory,
@@ -35,16 +36,16 @@ def recorded_bound_m(
     simple = config.motion_model == "constant_velocity" and len(truth) > 1
     if not simple or not all(rsu.plain for rsu in known.values()):
         return None
-    epochs: dict[int, list[RsuMeasurement]] = defaultdict(list)
-    first_ns, last_ns = int(truth.stamp_ns[0]), int(truth.stamp_ns[-1])
-    for m in measurements:
-        if m.rsu_id in known and first_ns <= m.stamp_ns <= last_ns:
-            epochs[m.stamp_ns].append(m)
-    if len(epochs) < 2:
-        return None
-    stamps = np.array(sorted(epochs), dtype=np.int64)
+    found: dict[int, list[Array]] = defaultdict(list)
     biases = BiasStates()  # of plain RSUs only what differences share
-    blocks = [epoch_rows_of(epochs[int(s)], known, biases, -1).rows for s in stamps]
+    first_ns, last_ns = int(truth.stamp_ns[0]), int(truth.stamp_ns[-1])
+    heard = (m for m in measurements if m.rsu_id in known and first_ns <= m.stamp_ns <= last_ns)
+    for stamp, together in itertools.groupby(heard, key=lambda m: m.stamp_ns):
+        found[stamp].append(epoch_rows_of(list(together), known, biases, -1).rows)
+    if len(found) < 2:
+        return None
+    stamps = np.array(sorted(found), dtype=np.int64)
+    blocks = [np.vstack(found[stamp]) for stamp in stamps.tolist()]
     prior = np.zeros((N_CORE + len(biases.sd),) * 2)
     prior[:N_CORE, :N_CORE] = _prior(config, pose)
     bounds = run_bound(

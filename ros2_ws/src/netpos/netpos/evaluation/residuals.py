@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from netpos.evaluation.pairing import ClockOffsets, Trajectory
 from netpos.filters.measurement import HEADING, KIND, LEVER, VALUE, VARIANCE, predict_row, wrap
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.filters.rows import rsu_axes, rsu_place, rsu_rows
@@ -21,9 +22,7 @@ from netpos.filters.sensors.table import BY_KIND
 from netpos.filters.state import N_CORE, POSITION, VELOCITY, X
 from netpos.messages.values import (
     Array,
-    ClockState,
     Field,
-    Odometry,
     RsuErrors,
     RsuInfo,
     RsuMeasurement,
@@ -69,13 +68,13 @@ class Series:
 def series_of(
     measurements: Iterable[RsuMeasurement],
     rsus: Mapping[str, RsuInfo],
-    odometry: Sequence[Odometry],
-    clock: Sequence[ClockState],
+    track: Trajectory,
+    clock: ClockOffsets,
 ) -> list[Series]:
-    """Residuals of the measurements that have an odometry of their stamp, by RSU and quantity;
+    """Residuals of the measurements at whose stamps the track has a pose, by RSU and quantity;
     times of arrival where the clock is known too."""
-    poses = {pose.stamp_ns: pose for pose in odometry}
-    clocks = {state.stamp_ns: state for state in clock}
+    poses = {stamp: index for index, stamp in enumerate(track.stamp_ns.tolist())}
+    clocks = dict(zip(clock.stamp_ns.tolist(), clock.offset_s.tolist(), strict=True))
     axes = {name: rsu_axes(info) for name, info in rsus.items()}
     places = {name: rsu_place(info, axes[name]) for name, info in rsus.items()}
     found: dict[tuple[str, str], list[tuple[int, float, float]]] = defaultdict(list)
@@ -88,7 +87,7 @@ def series_of(
         if Field.TDOA in m.fields and m.reference_rsu_id not in places:
             continue
         rows = rsu_rows(m, info, axes[m.rsu_id], 0, reference=places.get(m.reference_rsu_id))
-        state, height_m = _state(pose, clocks.get(m.stamp_ns), rows)
+        state, height_m = _state(track, pose, clocks.get(m.stamp_ns, 0.0), rows)
         name = f"{m.rsu_id}-{m.reference_rsu_id}" if m.reference_rsu_id else m.rsu_id
         for row in rows:
             sensor = BY_KIND[int(row[KIND])]
@@ -101,23 +100,22 @@ def series_of(
     return [_series(key, values) for key, values in sorted(found.items())]
 
 
-def _state(pose: Odometry, clock: ClockState | None, rows: Array) -> tuple[Array, float]:
+def _state(
+    track: Trajectory, index: int, clock_offset_s: float, rows: Array
+) -> tuple[Array, float]:
     """State (6,) of the antenna that the rows measured, and its height; their lever arms are taken
     out."""
     state = np.zeros(N_CORE)
-    x, y, z, w = pose.quaternion.tolist()
-    yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    cos, sin = math.cos(yaw), math.sin(yaw)
+    heading = float(track.heading[index])
+    cos, sin = math.cos(heading), math.sin(heading)
     ahead, left, up = rows[0, LEVER : LEVER + 3].tolist() if len(rows) else (0.0, 0.0, 0.0)
     arm = np.array([cos * ahead - sin * left, sin * ahead + cos * left])
-    state[POSITION] = pose.position[:2] + arm
-    u, v = pose.linear_velocity[:2].tolist()
-    state[VELOCITY] = cos * u - sin * v, sin * u + cos * v
-    if clock is not None:
-        state[X.CLOCK] = SPEED_OF_LIGHT_MPS * clock.offset_s
+    state[POSITION] = track.position[index, :2] + arm
+    state[VELOCITY] = track.velocity[index, :2]
+    state[X.CLOCK] = SPEED_OF_LIGHT_MPS * clock_offset_s
     rows[:, LEVER : LEVER + 3] = 0.0
     rows[:, HEADING] = -1
-    return state, float(pose.position[2]) + up
+    return state, float(track.position[index, 2]) + up
 
 
 def _series(key: tuple[str, str], values: list[tuple[int, float, float]]) -> Series:

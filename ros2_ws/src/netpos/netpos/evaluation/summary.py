@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from netpos.evaluation.evaluate import Evaluation
 from netpos.evaluation.metrics import Figures
 from netpos.evaluation.requirements import Row
-from netpos.evaluation.survey import Survey, SurveyedVue
+from netpos.evaluation.residuals import Residuals
+from netpos.evaluation.survey import Survey
 
 NOTHING = "–"
 
@@ -26,7 +29,8 @@ _ROWS = (
     ("estimates scored", "", "n", "d"),
     ("before the first TRACKING", "", "initialising", "d"),
     ("duration", "s", "duration_s", ".1f"),
-    ("availability", "%", "availability", ".1%"),
+    ("estimates with ground truth", "%", "truth_share", ".1%"),
+    ("available, of that time", "%", "availability", ".1%"),
     ("tracks lost", "", "lost_tracks", "d"),
     ("time without a scored estimate", "s", "unscored_s", ".1f"),
     ("measurements refused", "%", "rejected_share", ".2%"),
@@ -120,7 +124,7 @@ RESIDUAL_HEAD = (
 )  # fmt: skip
 
 
-def residual_rows(vue: SurveyedVue) -> list[list[str]]:
+def residual_rows(residuals: Iterable[Residuals]) -> list[list[str]]:
     """Rows under ``RESIDUAL_HEAD``: what each RSU measured against the track."""
     return [
         [
@@ -135,7 +139,7 @@ def residual_rows(vue: SurveyedVue) -> list[list[str]]:
             _text(row.far, ".1%"),
             row.learned,
         ]
-        for row in vue.figures.residuals
+        for row in residuals
     ]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,10 @@ import numpy as np
 
 from netpos.evaluation.availability import EVENTS
 from netpos.evaluation.consistency import MeanTest, nis_test
+from netpos.evaluation.pairing import ClockOffsets, Trajectory
 from netpos.evaluation.residuals import Residuals, Series, newest, series_of, summary
 from netpos.messages.values import (
     Array,
-    ClockState,
-    Odometry,
     RsuErrors,
     RsuInfo,
     RsuMeasurement,
@@ -65,9 +64,9 @@ class VueSurvey:
 class VueRecord:
     """What a recording holds of one device."""
 
-    odometry: Sequence[Odometry]
+    track: Trajectory
     statuses: Sequence[TrackStatus]
-    clock: Sequence[ClockState]
+    clock: ClockOffsets
     measurements: Sequence[RsuMeasurement]
     errors: Sequence[RsuErrors]
 
@@ -91,6 +90,7 @@ class Survey:
     buildings: Array
     topics: Mapping[str, tuple[str, int]]
     notes: tuple[str, ...] = ()
+    facts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Plain types in the form of ``netpos evaluate --json``."""
@@ -108,7 +108,7 @@ class Survey:
 
 def survey_vue(record: VueRecord, rsus: Mapping[str, RsuInfo], learns: bool) -> SurveyedVue:
     """Figures of one device. ``learns``: whether its tracker learned the errors of the RSUs."""
-    series = tuple(series_of(record.measurements, rsus, record.odometry, record.clock))
+    series = tuple(series_of(record.measurements, rsus, record.track, record.clock))
     errors = newest(record.errors)
     rows = tuple(
         summary(s, words(errors[s.rsu_id, s.quantity]) if (s.rsu_id, s.quantity) in errors else "")
@@ -124,9 +124,8 @@ def survey_vue(record: VueRecord, rsus: Mapping[str, RsuInfo], learns: bool) -> 
 def _figures(record: VueRecord, rows: tuple[Residuals, ...]) -> VueSurvey:
     stamps = [m.stamp_ns for m in record.measurements] + [s.stamp_ns for s in record.statuses]
     span_s = (max(stamps) - min(stamps)) * 1e-9 if stamps else 0.0
-    at = np.array(sorted({pose.stamp_ns for pose in record.odometry}), dtype=np.int64)
+    at, places = record.track.stamp_ns, record.track.position[:, :2]
     gaps = np.diff(at) * 1e-9
-    places = np.array([pose.position[:2] for pose in record.odometry]).reshape(-1, 2)
     evaluated = [s for s in record.statuses if s.nis_dof > 0]
     sds = [s.position_sd_m for s in record.statuses if s.state is TrackState.TRACKING]
     levels = [s.protection_level_m for s in record.statuses if s.protection_level_m >= 0.0]

@@ -3,7 +3,7 @@ output."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import yaml
@@ -24,10 +24,14 @@ DEFAULT_CLOCK_HZ = 100.0
 
 
 def simulate_to_bag(
-    scenario: Scenario, bag_path: Path, *, clock_hz: float = DEFAULT_CLOCK_HZ
+    scenario: Scenario,
+    bag_path: Path,
+    *,
+    clock_hz: float = DEFAULT_CLOCK_HZ,
+    progress: Callable[[int], None] | None = None,
 ) -> int:
     """Simulate a scenario into a new bag; log time is network time. Returns the number of
-    messages.
+    messages; ``progress`` is called with it after each.
 
     Raises
     ------
@@ -51,6 +55,8 @@ def simulate_to_bag(
             else:
                 bag.write(topic_of(item), to_message(convert, item), item.stamp_ns)
             count += 1
+            if progress is not None:
+                progress(count)
     return count
 
 

@@ -4,7 +4,7 @@ node."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from netpos.tracking.settings import (
     TrackerSettings,
     bag_settings,
     fusion_fact,
+    not_usual,
     tracker_fact,
 )
 from netpos.tracking.tracker import Tracker
@@ -68,7 +69,7 @@ def replay_bag(
     ``ValueError`` for a bad parameter, ``FileExistsError`` where ``bag_out`` exists.
     """
     with BagReader(bag_in) as source:
-        settings = _changed(settings or bag_settings(source), overrides or {})
+        settings = changed(settings or bag_settings(source), overrides or {})
         config = TrackerConfig.from_mapping(settings.parameters)
         if topics.RSU_MEASUREMENTS not in source.topics:
             raise BagError(
@@ -95,15 +96,10 @@ def replay_bag(
             for vue_id, odometry in tracker.smoothed().items() if smooth else ():
                 _write_smoothed(out, vue_id, odometry)
         rejected = {vue: dict(counts) for vue, counts in tracker.rejected().items()}
-        return ReplaySummary(_not_usual(config), epochs, estimates, rejected)
+        return ReplaySummary(not_usual(config), epochs, estimates, rejected)
 
 
-def _not_usual(config: TrackerConfig) -> dict[str, Any]:
-    usual = asdict(TrackerConfig())
-    return {name: value for name, value in asdict(config).items() if value != usual[name]}
-
-
-def _changed(settings: TrackerSettings, overrides: Mapping[str, Any]) -> TrackerSettings:
+def changed(settings: TrackerSettings, overrides: Mapping[str, Any]) -> TrackerSettings:
     """Settings with other values; names of parameters of the fusion begin with ``fusion.``."""
     fusion = {n.removeprefix(_FUSION): v for n, v in overrides.items() if n.startswith(_FUSION)}
     if fusion and not settings.networks:

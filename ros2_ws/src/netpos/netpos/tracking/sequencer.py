@@ -4,9 +4,10 @@ Messages of one channel (one topic) arrive in stamp order, those of different ch
 epoch, all items of one stamp, is
 released once nothing older or equal can be missing: its RSU measurements are complete and every
 live channel has reached its stamp.
-What is still missing is waited for until the newest stamp is ``hold`` ahead. What comes later
-than that belongs to an epoch already applied: it is kept apart, for the track to go back to that
-epoch, unless it is older than the history. The result depends on stamps alone, never on a clock.
+What is still missing is waited for until the newest stamp is ``hold`` ahead; from RSUs no longer
+than they have been late before. What comes later than that belongs to an epoch already applied: it
+is kept apart, for the track to go back to that epoch, unless it is older than the history. The
+result depends on stamps alone, never on a clock.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ _REASONS: dict[Verdict, str | None] = {
     Verdict.LATE: "late",
     Verdict.SET_BACK: "late",
 }
+_FORGETS = 8  # stamps after which an RSU that is no longer late is taken to be on time
 _SET_BACK_AFTER = 10  # stamps in a row from before the history: the device's time was set back
 
 
@@ -71,10 +73,17 @@ class Epoch:
             return iter(self.items.values())
         return map(self.items.__getitem__, sorted(self.items))
 
-    def rsu_complete(self) -> bool:
-        """Every RSU measurement announced by ``expected`` is here; False where the number is not
-        announced."""
-        return not self._measured or 0 < self._expected <= self._measured
+    @property
+    def measured(self) -> int:
+        """RSU measurements that are here."""
+        return self._measured
+
+    def rsu_complete(self, least: int = 0) -> bool:
+        """Every RSU measurement announced by ``expected`` is here, and at least as many as
+        ``least``; False where the number is not announced."""
+        if not self._measured:
+            return True
+        return 0 < self._expected <= self._measured and least <= self._measured
 
     def is_late_pose(self) -> bool:
         """Nothing but an initial pose of an older stamp: it came after what else is of this
@@ -84,6 +93,34 @@ class Epoch:
     def only_a_pose(self) -> bool:
         """Nothing but an initial pose: measurements of its stamp may be under way."""
         return self._poses == len(self.items)
+
+
+class _Delays:
+    """How the measurements of RSUs usually come: how late, and how many of one stamp where more
+    come than are announced."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        """As many as have come of late where too few were announced; 0 where that is right."""
+        self._late_ns: dict[str, int] = {}
+
+    def arrived(self, source: str, behind_ns: int) -> None:
+        """A stamp came when the newest of all RSUs was ``behind_ns`` ahead of it."""
+        late = self._late_ns.get(source, 0)
+        self._late_ns[source] = max(behind_ns, late - (late - behind_ns) // _FORGETS)
+
+    def late_ns(self) -> int:
+        """How late the latest RSU is."""
+        return max(self._late_ns.values(), default=0)
+
+    def announced_too_few(self, came: int) -> None:
+        """One more came after an epoch that was complete as announced."""
+        self.count = max(self.count, came)
+
+    def released(self, came: int) -> None:
+        """An epoch was applied with so many measurements."""
+        if 0 < came < self.count:
+            self.count = came if came > 1 else 0
 
 
 class Sequencer:
@@ -126,6 +163,7 @@ class Sequencer:
         self._last_of: dict[tuple[str, str], int] = {}
         self._waiting: list[Item] = []  # ahead of all others, until a second voice
         self._refused: list[tuple[Item, str]] = []
+        self._delays = _Delays()
         self._late_in_row = 0
         self.set_back = False
         """The device's time was set back: start anew."""
@@ -152,6 +190,8 @@ class Sequencer:
     def _admit(self, item: Item, stamp: int) -> str | None:
         """Put an item into its epoch."""
         key = channel_and_source(item)
+        if key[0] == RSU:
+            self._delays.arrived(key[1], max(self._watermark.get(RSU, stamp) - stamp, 0))
         in_past = stamp <= self._released_ns and not isinstance(item, InitialPose)
         if in_past and self._history_ns > 0:
             self.mark(key[0], stamp)  # first heard of late, it is waited for from now on
@@ -166,7 +206,8 @@ class Sequencer:
         epoch.put(key, item)
         self.mark(key[0], stamp)
         alone = len(self._pending) == 1 and stamp == self.newest_ns and self._max_delay_ns > 0
-        self.idle = alone and not epoch.rsu_complete() and not self._waiting
+        complete = epoch.rsu_complete(self._delays.count)
+        self.idle = alone and not complete and not self._waiting
         return None
 
     def mark(self, channel: str, stamp_ns: int) -> None:
@@ -232,6 +273,9 @@ class Sequencer:
         if waiting or (epoch is not None and key in epoch.items):
             return "duplicate"
         self._late.append((stamp, item))
+        if key[0] == RSU and epoch is not None and epoch.rsu_complete():
+            more = sum(s == stamp for s, _ in self._late)
+            self._delays.announced_too_few(epoch.measured + more)
         return None
 
     def release(self) -> list[Epoch]:
@@ -264,6 +308,7 @@ class Sequencer:
 
     def _take(self, stamp: int) -> Epoch:
         epoch = self._pending.pop(stamp)
+        self._delays.released(epoch.measured)
         self._released_ns = max(self._released_ns, stamp)
         if self._history_ns > 0:
             if not (stamp in self._applied and epoch.is_late_pose()):
@@ -285,9 +330,10 @@ class Sequencer:
             return True
         if self._needs_pose and POSE not in self._watermark:
             return False
-        if not epoch.rsu_complete() and self._watermark.get(RSU, 0) <= stamp:
+        reached = self._watermark.get(RSU, 0) > stamp + self._delays.late_ns()
+        if not reached and not epoch.rsu_complete(self._delays.count):
             return False
-        for channel, reached in self._watermark.items():
-            if reached < stamp and reached >= newest - self._live_ns and channel != POSE:
+        for channel, heard in self._watermark.items():
+            if heard < stamp and heard >= newest - self._live_ns and channel != POSE:
                 return False
         return newest > stamp or not epoch.only_a_pose()

@@ -17,6 +17,8 @@ from netpos.tracking.networks.config import FusionConfig
 
 # What a bag calls the parameters of the tracker of its measurements, as YAML.
 TRACKER_FACT = "tracker"
+# Its scenario, with the seed, where it was simulated, as YAML.
+SCENARIO_FACT = "scenario"
 # The same of the networks whose tracks are fused and the parameters of that.
 FUSION_FACT = "fusion"
 
@@ -61,6 +63,12 @@ def tracker_fact(config: TrackerConfig) -> dict[str, str]:
     """What a bag is told of the parameters of its tracker, every one of them; trackers of several
     networks say the same."""
     return {TRACKER_FACT: yaml.safe_dump(asdict(replace(config, network="")))}
+
+
+def not_usual(config: TrackerConfig) -> dict[str, Any]:
+    """The parameters that are not the default."""
+    usual = asdict(TrackerConfig())
+    return {name: value for name, value in asdict(config).items() if value != usual[name]}
 
 
 def fusion_fact(networks: tuple[str, ...], config: FusionConfig) -> dict[str, str]:

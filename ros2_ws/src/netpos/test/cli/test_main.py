@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from netpos.bags import BagReader
+from netpos.bags import BagReader, BagWriter
 from netpos.cli.runs import parse_setting
 from netpos.scenario.load import scenario_files
 from typer.testing import Result
@@ -219,7 +219,7 @@ def test_a_live_run_needs_the_workspace(
     [
         ("exit 7", 1, "the graph ended with status 7"),
         ("exit 0", 1, "without a recording"),
-        ('mkdir "$2"; echo "$@" > "$2/arguments"', 0, ""),
+        ('cp -r "$NETPOS_ROOT/recorded" "$2"; echo "$@" > "$2.arguments"', 0, ""),
     ],
 )
 def test_a_live_run_reports_how_the_graph_ended(
@@ -230,7 +230,9 @@ def test_a_live_run_reports_how_the_graph_ended(
     status: int,
     message: str,
 ) -> None:
-    """A stand-in for the shell script and for ros2 plays the graph."""
+    """A stand-in for the shell script and for ros2 plays the graph; losses are told."""
+    with BagWriter(tmp_path / "recorded") as recorded:
+        recorded.note("lost", "/clock: 3")
     for name, text in (("run_graph.sh", body), ("ros2", "exit 0")):
         file = tmp_path / "scripts" / name
         file.parent.mkdir(exist_ok=True)
@@ -243,7 +245,9 @@ def test_a_live_run_reports_how_the_graph_ended(
     assert result.exit_code == status
     assert message in result.stderr
     if status == 0:
-        assert (target / "arguments").read_text() == f"fast_pass {target} 4 9\n"
+        said = (tmp_path / "live.arguments").read_text()
+        assert said == f"fast_pass {target} 4 9\n"
+        assert "LOST while recording: 3 of /clock" in result.stderr
 
 
 @pytest.mark.parametrize("setting", ["hold_s", "=1", "hold_s=[1"])

@@ -10,7 +10,8 @@ from types import SimpleNamespace
 
 import pytest
 from netpos.evaluation.reproduce import frame
-from netpos.evaluation.reproduce.frame import Outcome, Work, at_most, shown
+from netpos.evaluation.reproduce.frame import Outcome, at_most, shown
+from netpos.evaluation.work import Work
 from typer.testing import Result
 
 Netpos = Callable[..., Result]

@@ -16,7 +16,7 @@ from netpos.evaluation.metrics import (
     score,
     time_to_converge,
 )
-from netpos.evaluation.pairing import Pairs, Trajectory
+from netpos.evaluation.pairing import ClockOffsets, Pairs, Trajectory
 from netpos.messages.values import Array, ClockState, Odometry, TrackState, TrackStatus
 
 S = 1_000_000_000
@@ -176,7 +176,10 @@ def test_clock_sd_is_about_the_mean_and_rmse_about_zero() -> None:
         replace(c, offset_s=c.offset_s + error * 1e-9)
         for c, error in zip(known, errors_ns, strict=True)
     ]
-    figures = score(run_of(truth, truth, clock=clock, clock_truth=known), skip=1).figures
+    figures = score(
+        run_of(truth, truth, clock=ClockOffsets.of(clock), clock_truth=ClockOffsets.of(known)),
+        skip=1,
+    ).figures
     kept = np.array(errors_ns[1:])
     assert figures.clock_offset_sd_ns == pytest.approx(kept.std(), rel=1e-6)
     assert figures.clock_offset_rmse_ns == pytest.approx(np.sqrt(np.mean(kept**2)), rel=1e-6)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from netpos.bags import BagWriter
 from netpos.bags.recording import write_bag
 from netpos.cli.main import app
 from netpos.evaluation import Survey, assess_bag, survey_bag
@@ -17,6 +18,7 @@ from netpos.evaluation.residuals import correlation_s
 from netpos.evaluation.survey import SurveyedVue
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.replay import replay_bag
+from rosbags.typesys import Stores, get_typestore
 from typer.testing import CliRunner
 
 S = 1_000_000_000
@@ -238,7 +240,7 @@ def test_a_truth_with_its_own_clock_and_axes_is_aligned_and_said_so(tmp_path: Pa
     bag = recorded(tmp_path)
     file = tum(tmp_path / "truth.tum", later_s=1000.0, turned_rad=0.7)
     options = ("--truth-time-offset", "auto", "--truth-align", "rigid")
-    figures, (note,) = figures_with(bag, "--truth", file, *options)
+    figures, (note, *_) = figures_with(bag, "--truth", file, *options)
     assert 0.01 < figures["rmse_m"] < 0.15
     turned, later = re.search(r"turned (\S+) deg, .* later by (\S+) s", note).groups()  # type: ignore[union-attr]
     assert float(turned) == pytest.approx(-math.degrees(0.7), abs=0.5)
@@ -250,6 +252,77 @@ def test_a_truth_from_a_topic_of_another_bag(tmp_path: Path) -> None:
     bag = recorded(tmp_path)
     own, _ = figures_with(bag, "--truth", bag, "--truth-topic", "/vue_1/odometry")
     assert own["rmse_m"] < 0.02  # against itself, thinned
+
+
+def on_earth(east: float, north: float, up: float) -> tuple[float, float, float]:
+    """Latitude, longitude [deg] and height [m] of a point near ``ORIGIN``: from the definition of
+    the ellipsoid, the inverse by Newton's method."""
+
+    def ecef(latitude: float, longitude: float, height: float) -> Array:
+        a, f = 6378137.0, 1 / 298.257223563
+        e2 = f * (2 - f)
+        n = a / math.sqrt(1 - e2 * math.sin(latitude) ** 2)
+        ring = (n + height) * math.cos(latitude)
+        polar = (n * (1 - e2) + height) * math.sin(latitude)
+        return np.array([ring * math.cos(longitude), ring * math.sin(longitude), polar])
+
+    lat, lon, h = math.radians(ORIGIN[0]), math.radians(ORIGIN[1]), ORIGIN[2]
+    axes = np.array(
+        [
+            [-math.sin(lon), math.cos(lon), 0.0],
+            [-math.sin(lat) * math.cos(lon), -math.sin(lat) * math.sin(lon), math.cos(lat)],
+            [math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)],
+        ]
+    )
+    wanted = ecef(lat, lon, h) + axes.T @ np.array([east, north, up])
+    at = np.array([lat, lon, h])
+    for _ in range(6):
+        steps = np.array([1e-6, 1e-6, 1.0])
+        slope = np.column_stack(
+            [(ecef(*(at + d)) - ecef(*(at - d))) / (2 * d.sum()) for d in np.diag(steps)]
+        )
+        at = at + np.linalg.solve(slope, wanted - ecef(*at))
+    return math.degrees(at[0]), math.degrees(at[1]), float(at[2])
+
+
+ORIGIN = (60.0, 30.25, 17.0)
+
+
+def fixes(folder: Path) -> Path:
+    """A ROS bag with the true places as NavSatFix."""
+    store, name = get_typestore(Stores.ROS2_JAZZY), "sensor_msgs/msg/NavSatFix"
+    types = store.types
+    with BagWriter(folder) as bag:
+        for k in range(int(SECONDS * RATE_HZ)):
+            t = k / RATE_HZ
+            latitude, longitude, height = on_earth(8.0 * math.cos(t / 8), 5.0 * math.sin(t / 8), 0)
+            stamp_ns = round((t + 1.0) * S)
+            stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // S, nanosec=stamp_ns % S)
+            message = types[name](
+                header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="gnss"),
+                status=types["sensor_msgs/msg/NavSatStatus"](status=0, service=1),
+                latitude=latitude,
+                longitude=longitude,
+                altitude=height,
+                position_covariance=np.zeros(9),
+                position_covariance_type=0,
+            )
+            bag.write_raw("/fix", name, bytes(store.serialize_cdr(message, name)), stamp_ns)
+    return folder
+
+
+def test_a_truth_of_latitudes_from_a_satellite_receiver(tmp_path: Path) -> None:
+    bag, truth = recorded(tmp_path), fixes(tmp_path / "gnss")
+    known, _ = figures_with(bag, "--truth", tum(tmp_path / "t.tum"))
+    there = ("--truth", truth, "--truth-topic", "/fix")
+    figures, _ = figures_with(bag, *there, "--truth-origin", ",".join(map(str, ORIGIN)))
+    assert figures["rmse_m"] == pytest.approx(known["rmse_m"], abs=2e-3)
+    figures, (note, *_) = figures_with(bag, *there, "--truth-align", "rigid")
+    assert figures["rmse_m"] < 0.15
+    assert "optimistic" in note
+    result = CliRunner().invoke(app, ["evaluate", str(bag), *map(str, there)])
+    assert result.exit_code == 2
+    assert "--truth-origin" in result.stderr
 
 
 def test_a_truth_that_cannot_be_used_is_one_sentence(tmp_path: Path) -> None:

@@ -377,3 +377,32 @@ def test_a_late_pose_outlives_a_late_measurement(world: Any) -> None:
     np.testing.assert_allclose(output.odometry.position, [60.0, 0.0, 0.0])
     assert output.status.accepted == 30
     assert tracker.add(batches[9][0]) == "duplicate"
+
+
+@pytest.mark.parametrize(
+    ("late_s", "expected"),
+    [(0.05, 3), (0.05, 0), (0.0, 1), (0.0, 9), (0.05, 1)],
+    ids=["late", "late, nobody says how many", "one said", "nine said", "late, one said"],
+)
+def test_a_late_rsu_or_a_wrong_number_does_not_multiply_the_odometry(
+    world: Any, late_s: float, expected: int
+) -> None:
+    """Three RSUs hear a beacon 50 times a second; what one sends comes late."""
+    sent = []
+    for k in range(200):
+        t = 0.02 * k
+        for name in "abc":
+            (found,) = world.measure(t, truth(t), Field.AZIMUTH | Field.TOA, [name])
+            delay = late_s if name == "c" else 0.0
+            sent.append((t + delay, len(sent), replace(found, expected=expected)))
+    tracker = Tracker(TrackerConfig())
+    for info in world.rsus.values():
+        tracker.add_rsu(info)
+    given_out: list[TrackOutput] = []
+    for _, _, item in sorted(sent, key=lambda entry: entry[:2]):
+        tracker.add(item)
+        given_out += tracker.process()
+    given_out += tracker.flush()
+    stamps = [out.odometry.stamp_ns for out in given_out if out.odometry is not None]
+    assert len(set(stamps)) >= 198
+    assert len(stamps) <= len(set(stamps)) + 6

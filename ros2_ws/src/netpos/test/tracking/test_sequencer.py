@@ -390,3 +390,72 @@ def test_ticks_are_epochs_once_an_rsu_was_heard_and_wait_for_it() -> None:
     assert [e.stamp_ns for e in released if e.items] == [second, 2 * second]
     ticks = [s for s in stamps if 1_100_000_000 < s < 2 * second]
     assert ticks == list(range(1_120_000_000, 2 * second, 20_000_000))
+
+
+def releases(sequencer: Sequencer, arrivals: list[Item]) -> tuple[list[int], int]:
+    """Stamps [ms] of the epochs applied, and how often a late item had one applied again."""
+    stamps, again = [], 0
+    for item in arrivals:
+        assert sequencer.add(item) is None
+        again += len({stamp for stamp, _ in sequencer.take_late()})
+        stamps += stamps_ms(sequencer.release())
+    stamps += stamps_ms(sequencer.flush())
+    return stamps, again
+
+
+def by_arrival(late_ms: dict[str, int], expected: int, n: int = 200) -> list[Item]:
+    """RSUs at 50 Hz, of each every message so much later than its stamp."""
+    sent = [
+        (k * 20 + late, k * 20, name) for k in range(1, n + 1) for name, late in late_ms.items()
+    ]
+    return [rsu(stamp, name, expected) for _, stamp, name in sorted(sent)]
+
+
+@pytest.mark.parametrize("expected", [0, 4])
+@pytest.mark.parametrize("late_ms", [50, 130])
+def test_an_rsu_that_is_always_late_is_waited_for(expected: int, late_ms: int) -> None:
+    """Stamps of the others pass by meanwhile; no epoch is applied, and published, twice."""
+    sequencer = Sequencer(HOLD, history_ns=1000 * MS)
+    arrivals = by_arrival({"a": 0, "b": 1, "c": 2, "d": late_ms}, expected)
+    stamps, again = releases(sequencer, arrivals)
+    assert stamps == [20 * k for k in range(1, 201)]
+    assert again <= late_ms // 20 + 1  # until it has been late once
+
+
+def test_one_that_becomes_punctual_is_waited_for_no_longer() -> None:
+    sequencer = Sequencer(HOLD, history_ns=1000 * MS)
+    releases(sequencer, by_arrival({"a": 0, "b": 100}, 0))
+    later = [
+        replace(item, stamp_ns=item.stamp_ns + 5000 * MS)
+        for item in by_arrival({"a": 0, "b": 1}, 0)
+    ]
+    for item in later[:200]:
+        sequencer.add(item)
+        sequencer.release()
+    newest = later[199].stamp_ns
+    sequencer.add(later[200])
+    assert newest in [epoch.stamp_ns for epoch in sequencer.release()]
+
+
+@pytest.mark.parametrize(("expected", "most"), [(1, 6), (2, 3), (4, 0), (9, 0)])
+def test_a_wrong_number_announced_is_noticed(expected: int, most: int) -> None:
+    """Of 200 epochs a few are applied again; here nobody puts late items into their epochs, so
+    that it takes one epoch for each RSU not announced."""
+    sequencer = Sequencer(HOLD, history_ns=1000 * MS)
+    arrivals = by_arrival({"a": 0, "b": 1, "c": 2, "d": 3}, expected)
+    stamps, again = releases(sequencer, arrivals)
+    assert stamps == [20 * k for k in range(1, 201)]
+    assert again <= most
+
+
+def test_of_too_few_announced_one_that_goes_away_is_waited_for_once() -> None:
+    sequencer = Sequencer(HOLD, history_ns=1000 * MS)
+    releases(sequencer, by_arrival({"a": 0, "b": 1, "c": 2}, 1, n=20))
+    left = [
+        replace(i, stamp_ns=i.stamp_ns + 400 * MS) for i in by_arrival({"a": 0, "b": 1}, 1, n=3)
+    ]
+    found = []
+    for item in left:
+        sequencer.add(item)
+        found.append(stamps_ms(sequencer.release()))
+    assert found == [[], [], [420], [440], [], [460]]

@@ -23,8 +23,8 @@ def run_routes(counts: Sequence[int]) -> tuple[list[float], float]:
     compared with their bound.
     """
     from netpos.evaluation.reproduce import fokin2020  # noqa: PLC0415 - only where it is measured
-    from netpos.evaluation.reproduce.frame import Work  # noqa: PLC0415
     from netpos.evaluation.reproduce.monte_carlo import monte_carlo  # noqa: PLC0415
+    from netpos.evaluation.work import Work  # noqa: PLC0415
 
     experiment = fokin2020.METIS[0][0]
     fokin2020.warm_up()

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from netpos.evaluation.reproduce import rectangle
-from netpos.evaluation.reproduce.frame import Row, Work, at_least, at_most, required, shown
+from netpos.evaluation.reproduce.frame import Row, at_least, at_most, required, shown
 from netpos.evaluation.reproduce.waist_chain import Chains, Variant, follow, run_chains, simulate
 from netpos.evaluation.reproduce.walk_figures import (
     FAR_M,
@@ -16,6 +16,7 @@ from netpos.evaluation.reproduce.walk_figures import (
     Figures,
     ratio_at_same_instants,
 )
+from netpos.evaluation.work import Work
 
 RUNS = 300  # at most: every run simulates an IMU and is followed by six trackers
 RMSE_M, RATIO, LIVE_RMSE_M = 0.03, 2.0, 0.12

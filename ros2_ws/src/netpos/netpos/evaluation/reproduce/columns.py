@@ -6,13 +6,14 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 from netpos.evaluation.reproduce.experiment import Estimator, Experiment
-from netpos.evaluation.reproduce.frame import Row, Work, shown
+from netpos.evaluation.reproduce.frame import Row, shown
 from netpos.evaluation.reproduce.monte_carlo import (
     NothingScoredError,
     Routes,
     Summary,
     monte_carlo,
 )
+from netpos.evaluation.work import Work
 
 DEFAULTS_RUNS = 200
 """At most as many routes are run with default parameters: one RSU then loses many tracks, and a

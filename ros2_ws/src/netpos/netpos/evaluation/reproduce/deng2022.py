@@ -45,15 +45,8 @@ from netpos.evaluation.reproduce.drive_rows import (
     troubles,
 )
 from netpos.evaluation.reproduce.drive_tally import NO_DRIVE, Tally, added, over_seeds
-from netpos.evaluation.reproduce.frame import (
-    Outcome,
-    Row,
-    Work,
-    at_least,
-    at_most,
-    required,
-    shown,
-)
+from netpos.evaluation.reproduce.frame import Outcome, Row, at_least, at_most, required, shown
+from netpos.evaluation.work import Work
 
 RUNS = 100
 """Drives of each case where the caller asks for no other number."""

@@ -28,7 +28,7 @@ from netpos.evaluation.reproduce.blocked_drive import (
     started,
     with_silence_ends,
 )
-from netpos.evaluation.reproduce.frame import Work
+from netpos.evaluation.work import Work
 from netpos.filters.error_state import UNCONSTRAINED, Sensors
 from netpos.filters.measurement import ORIGIN, VALUE
 from netpos.filters.space import linearise_in_space

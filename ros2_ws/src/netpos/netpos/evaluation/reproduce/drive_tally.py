@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from netpos.evaluation.consistency import MeanTest, nees, nees_over_runs
 from netpos.evaluation.reproduce.blocked_drive import Case, Run, ned, run
-from netpos.evaluation.reproduce.frame import Work
+from netpos.evaluation.work import Work
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.filters.position_fix import FixStatus
 from netpos.filters.state import NAV_POSITION, NAV_QUATERNION, NAV_VELOCITY, Err, Nav

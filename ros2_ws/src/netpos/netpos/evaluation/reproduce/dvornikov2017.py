@@ -15,14 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from netpos.evaluation.reproduce import network_pictures
-from netpos.evaluation.reproduce.frame import (
-    Outcome,
-    Row,
-    Work,
-    at_least,
-    required,
-    shown,
-)
+from netpos.evaluation.reproduce.frame import Outcome, Row, at_least, required, shown
 from netpos.evaluation.reproduce.network_claims import (
     FUSED,
     LIMIT_FROM_S,
@@ -42,6 +35,7 @@ from netpos.evaluation.reproduce.network_defaults import FUSION, TRACKER, summar
 from netpos.evaluation.reproduce.network_stages import CENTRAL, FixNetwork, Setting, stages_of
 from netpos.evaluation.reproduce.network_summary import NetworkSummary, summarise
 from netpos.evaluation.reproduce.network_truth import Jerky, Quadratic
+from netpos.evaluation.work import Work
 from netpos.filters.intersection import METHODS
 from netpos.filters.kf import DVORNIKOV_FLOOR
 from netpos.tracking.config import TrackerConfig

@@ -20,8 +20,9 @@ from netpos.evaluation.reproduce import fokin_rows as rows_of
 from netpos.evaluation.reproduce import pictures
 from netpos.evaluation.reproduce.columns import Columns, beside, in_columns
 from netpos.evaluation.reproduce.experiment import VUE, Experiment, setup_of
-from netpos.evaluation.reproduce.frame import Outcome, Row, Work
+from netpos.evaluation.reproduce.frame import Outcome, Row
 from netpos.evaluation.reproduce.monte_carlo import Summary, monte_carlo
+from netpos.evaluation.work import Work
 from netpos.scenario.build import buildings_of
 
 FRAME_S = 167.3e-6

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 from netpos.evaluation.reproduce.experiment import Estimator, Experiment
 from netpos.evaluation.reproduce.fokin2020 import METIS
-from netpos.evaluation.reproduce.frame import Work
 from netpos.evaluation.reproduce.monte_carlo import Summary, monte_carlo
+from netpos.evaluation.work import Work
 
 FIRST_SEED = 100_000
 

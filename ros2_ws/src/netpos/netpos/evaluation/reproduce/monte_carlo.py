@@ -12,7 +12,7 @@ import numpy.typing as npt
 from netpos.evaluation.consistency import MeanTest, nees_over_runs
 from netpos.evaluation.metrics import MIN_SPEED_FOR_HEADING_MPS, NS, SKIP_EPOCHS
 from netpos.evaluation.reproduce.experiment import Experiment, Track, setup_of
-from netpos.evaluation.reproduce.frame import Work
+from netpos.evaluation.work import Work
 from netpos.filters.compile import kernel
 from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.filters.state import X

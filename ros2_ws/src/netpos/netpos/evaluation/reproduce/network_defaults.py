@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from netpos.evaluation.reproduce.frame import Work
 from netpos.evaluation.reproduce.network_stages import (
     VUE,
     FixNetwork,
@@ -21,6 +20,7 @@ from netpos.evaluation.reproduce.network_stages import (
 )
 from netpos.evaluation.reproduce.network_summary import NetworkSummary
 from netpos.evaluation.reproduce.network_truth import START_NS
+from netpos.evaluation.work import Work
 from netpos.filters.state import POSITION
 from netpos.messages.values import Array, Field, NetworkTrack, RsuInfo, RsuMeasurement
 from netpos.scenario.networks import fix_errors

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from netpos.evaluation.consistency import MeanTest, nees_over_runs
-from netpos.evaluation.reproduce.frame import Work
 from netpos.evaluation.reproduce.network_stages import Setting, errors_of_seeds, stages_of
+from netpos.evaluation.work import Work
 from netpos.messages.values import Array
 
 LOST_M = 30.0  # three standard deviations of the worse network's fixes

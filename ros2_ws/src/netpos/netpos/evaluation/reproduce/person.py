@@ -17,11 +17,12 @@ import numpy as np
 from netpos.evaluation.consistency import MeanTest, nees, nees_over_runs
 from netpos.evaluation.reproduce.chain_rows import SCHEME
 from netpos.evaluation.reproduce.experiment import VUE
-from netpos.evaluation.reproduce.frame import Row, Work, required, shown
+from netpos.evaluation.reproduce.frame import Row, required, shown
 from netpos.evaluation.reproduce.rectangle import ERRORS, Case, setup_of
 from netpos.evaluation.reproduce.steps import Person, reported_velocity, velocity_rows
 from netpos.evaluation.reproduce.waist_chain import Variant
 from netpos.evaluation.reproduce.walk_figures import FAR_M
+from netpos.evaluation.work import Work
 from netpos.filters.measurement import ORIGIN
 from netpos.messages.values import Array, Beacon, TrackState, Velocity
 from netpos.radio.noise import generator

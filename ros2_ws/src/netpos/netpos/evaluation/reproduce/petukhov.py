@@ -20,15 +20,7 @@ import numpy as np
 from netpos.evaluation.reproduce import chain_rows, person, rectangle
 from netpos.evaluation.reproduce import petukhov_pictures as pictures
 from netpos.evaluation.reproduce.chain_rows import PAPER, RATIO, RMSE_M
-from netpos.evaluation.reproduce.frame import (
-    Outcome,
-    Row,
-    Work,
-    at_least,
-    at_most,
-    required,
-    shown,
-)
+from netpos.evaluation.reproduce.frame import Outcome, Row, at_least, at_most, required, shown
 from netpos.evaluation.reproduce.rectangle import Case, Walked
 from netpos.evaluation.reproduce.sector_choice import Conditions, Found, sector_choice
 from netpos.evaluation.reproduce.troubles import Trouble
@@ -40,6 +32,7 @@ from netpos.evaluation.reproduce.walk_figures import (
     Scores,
     ratio_at_same_instants,
 )
+from netpos.evaluation.work import Work
 from netpos.filters.state import POSITION
 from netpos.messages.values import Array
 

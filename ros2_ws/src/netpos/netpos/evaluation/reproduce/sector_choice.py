@@ -10,7 +10,6 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from netpos.evaluation.reproduce.frame import Work
 from netpos.evaluation.reproduce.steps import (
     StepErrors,
     Steps,
@@ -19,6 +18,7 @@ from netpos.evaluation.reproduce.steps import (
     velocity_rows,
 )
 from netpos.evaluation.reproduce.waist_chain import SCENARIO, config_of
+from netpos.evaluation.work import Work
 from netpos.filters.measurement import GATE_VARIANCE, VALUE, VARIANCE
 from netpos.filters.motion import NO_BIAS
 from netpos.filters.rows import rsu_axes, rsu_rows

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netpos.evaluation.reproduce.frame import Work
 from netpos.evaluation.reproduce.walk_figures import Figures, Scores
+from netpos.evaluation.work import Work
 from netpos.messages.values import (
     Array,
     ImuSample,

@@ -9,8 +9,9 @@ import pytest
 from netpos.evaluation.reproduce import columns as columns_module
 from netpos.evaluation.reproduce.columns import beside, in_columns, track_rows
 from netpos.evaluation.reproduce.experiment import Experiment
-from netpos.evaluation.reproduce.frame import Row, Work, at_most
+from netpos.evaluation.reproduce.frame import Row, at_most
 from netpos.evaluation.reproduce.monte_carlo import Routes, Summary, monte_carlo
+from netpos.evaluation.work import Work
 
 SHORT = Experiment(name="short", scenario="metis_madrid", changes=(("max_duration_s", 5.0),))
 

@@ -24,7 +24,7 @@ from netpos.evaluation.reproduce.blocked_drive import (
     run,
 )
 from netpos.evaluation.reproduce.drive_tally import Tally, tally_seeds
-from netpos.evaluation.reproduce.frame import Work
+from netpos.evaluation.work import Work
 from netpos.filters.measurement import ORIGIN, ROW_WIDTH
 from netpos.filters.position_fix import FixStatus
 from netpos.filters.state import Err, Nav

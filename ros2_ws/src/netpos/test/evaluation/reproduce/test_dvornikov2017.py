@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from netpos.evaluation.reproduce import PAPERS
 from netpos.evaluation.reproduce import dvornikov2017 as paper
-from netpos.evaluation.reproduce.frame import Outcome, Work
+from netpos.evaluation.reproduce.frame import Outcome
 from netpos.evaluation.reproduce.network_claims import Sides, claims
 from netpos.evaluation.reproduce.network_crossing import run_crossing
 from netpos.evaluation.reproduce.network_defaults import run_defaults
 from netpos.evaluation.reproduce.network_stages import stages_of
 from netpos.evaluation.reproduce.network_summary import LOST_M, NetworkSummary
+from netpos.evaluation.work import Work
 
 
 @pytest.fixture(scope="module")

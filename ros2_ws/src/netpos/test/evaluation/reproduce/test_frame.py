@@ -13,13 +13,13 @@ from netpos.evaluation.reproduce.frame import (
     PAPERS,
     Outcome,
     Row,
-    Work,
     at_least,
     at_most,
     reproduce,
     required,
     shown,
 )
+from netpos.evaluation.work import Work
 from threadpoolctl import threadpool_info, threadpool_limits
 
 

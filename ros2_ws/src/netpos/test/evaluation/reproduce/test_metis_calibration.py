@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from netpos.evaluation.reproduce.fokin2020 import METIS
-from netpos.evaluation.reproduce.frame import DEFAULT_RUNS, Work
+from netpos.evaluation.reproduce.frame import DEFAULT_RUNS
 from netpos.evaluation.reproduce.metis_calibration import CANDIDATES, FIRST_SEED, Candidate, table
+from netpos.evaluation.work import Work
 from netpos.radio.waveform import received_snr
 from netpos.scenario import load_scenario
 from netpos.scenario.build import errors_of

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from netpos.evaluation.consistency import nees
 from netpos.evaluation.reproduce.experiment import Experiment, Setup, Track
-from netpos.evaluation.reproduce.frame import Work
 from netpos.evaluation.reproduce.monte_carlo import (
     BINS,
     Batch,
@@ -17,6 +16,7 @@ from netpos.evaluation.reproduce.monte_carlo import (
     monte_carlo,
     tally,
 )
+from netpos.evaluation.work import Work
 from netpos.filters.state import POSITION, VELOCITY, X
 from netpos.messages.values import Beacon, ImuSample, InitialPose
 from netpos.tracking import Tracker

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from netpos.evaluation.reproduce import person
-from netpos.evaluation.reproduce.frame import Work
+from netpos.evaluation.work import Work
 
 SEEDS = range(5000, 5004)
 

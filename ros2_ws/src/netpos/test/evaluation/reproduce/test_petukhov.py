@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from netpos.evaluation.consistency import MeanTest
 from netpos.evaluation.reproduce import petukhov, rectangle
-from netpos.evaluation.reproduce.frame import Row, Work, shown
+from netpos.evaluation.reproduce.frame import Row, shown
 from netpos.evaluation.reproduce.sector_choice import (
     AREA_M,
     STEPS,
@@ -19,6 +19,7 @@ from netpos.evaluation.reproduce.sector_choice import (
 )
 from netpos.evaluation.reproduce.walk_bound import known_instants_rmse_m
 from netpos.evaluation.reproduce.walk_figures import Figures
+from netpos.evaluation.work import Work
 from netpos.tracking.config import TrackerConfig
 
 SEED = 7000

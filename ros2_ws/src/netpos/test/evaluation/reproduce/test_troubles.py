@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 from netpos.evaluation.reproduce import petukhov, rectangle
-from netpos.evaluation.reproduce.frame import Work
 from netpos.evaluation.reproduce.rectangle import Case
 from netpos.evaluation.reproduce.troubles import NO_TROUBLE, Trouble
 from netpos.evaluation.reproduce.walk_figures import Figures
+from netpos.evaluation.work import Work
 from netpos.filters.measurement import ROW_WIDTH, VALUE, VARIANCE
 from netpos.messages.values import Array
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from netpos.evaluation.reproduce import chain_rows
 from netpos.evaluation.reproduce.chain_rows import FILTER, LOOSE, SCHEME, TIGHT, VARIANTS
-from netpos.evaluation.reproduce.frame import Row, Work
+from netpos.evaluation.reproduce.frame import Row
 from netpos.evaluation.reproduce.rectangle import STEPS
 from netpos.evaluation.reproduce.waist_chain import Walk, follow, simulate
+from netpos.evaluation.work import Work
 from netpos.messages.values import Velocity
 from netpos.radio.anchor import uwb_wavelength_m
 from netpos.scenario import Simulation

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from netpos.bags.errors import BagError
 from netpos.bags.importers.own.alignment import Way, align, plain_track
 from netpos.bags.importers.own.columns import Columns
 from netpos.bags.importers.own.records import Message, Record, Skipped, lines, messages
-from netpos.bags.importers.own.truth import Poses, TruthColumns, poses_of
+from netpos.bags.importers.own.truth import Pose, Poses, TruthColumns, local, poses_of
 from netpos.bags.recording import SKIPPED, TRUTH_ALIGNMENT, write_bag
 from netpos.messages.values import Odometry, RsuInfo, RsuMeasurement
 
@@ -26,15 +27,40 @@ class Truth:
     """Where the truth is and how it is brought to the measurements.
 
     source : a text file, or the topic of the bag
+    columns : where a pose stands; None: as in an Odometry, a pose or a NavSatFix, of a topic only
     offset_s : added to its times; None: found
     """
 
     source: Path | str
-    columns: TruthColumns
+    columns: TruthColumns | None
     offset_s: float | None = 0.0
     align: Way = "none"
     height_m: float = 0.0
     """Of the device; the plain track that the truth is aligned with needs it."""
+    origin: tuple[float, float, float] | None = None
+    """Latitude, longitude [deg] and height [m] of the origin of ``map``, for a truth on earth."""
+
+    def of_topic(self, records: Iterator[Message], skipped: Skipped) -> Poses:
+        """The poses of messages."""
+        if self.columns is not None:
+            return self.placed(self.columns, map(self.columns.pose, records), skipped)
+        first = next(records, None)
+        if first is None:
+            raise BagError(f"{self.source} has no messages")
+        columns = TruthColumns.of_kind(first)
+        return self.placed(columns, map(columns.pose, itertools.chain([first], records)), skipped)
+
+    def placed(
+        self, columns: TruthColumns, found: Iterable[Pose | None], skipped: Skipped
+    ) -> Poses:
+        """Poses as they were read, in ``map`` as far as that is known."""
+        if columns.on_earth and self.origin is None and self.align == "none":
+            raise BagError(
+                f"{self.source} has latitudes: say with --truth-origin LATITUDE,LONGITUDE,HEIGHT "
+                "where the origin of map is, or move it there with --truth-align shift or rigid"
+            )
+        poses = poses_of(found, skipped)
+        return local(poses, self.origin) if columns.on_earth else poses
 
 
 def import_csv(
@@ -130,8 +156,7 @@ def import_ros(
         found += measured
     poses = None
     if truth is not None:
-        read = (truth.columns.pose(m) for m in messages(Path(source), str(truth.source)))
-        poses = poses_of(read, skipped)
+        poses = truth.of_topic(messages(Path(source), str(truth.source)), skipped)
     name = f"ros {Path(source).name} {topic}"
     return _write(bag, name, list(known.values()), found, _aligned(truth, poses), skipped, tracker)
 
@@ -191,12 +216,15 @@ class _Reading:
                 self.skipped[CUT if edge else "lines that cannot be understood"] += 1
 
     def truth(self, truth: Truth) -> Poses:
-        found: list[tuple[int, float, float, float, float] | None] = []
-        sources = list(truth.columns.sources.values())
+        columns = truth.columns
+        assert columns is not None, "a text file has no kind"
+        found: list[Pose | None] = []
         self.lines(
-            Path(truth.source), sources, lambda line: found.append(truth.columns.pose(line))
+            Path(truth.source),
+            list(columns.sources.values()),
+            lambda line: found.append(columns.pose(line)),
         )
-        return poses_of(found, self.skipped)
+        return truth.placed(columns, found, self.skipped)
 
 
 def truth_of(
@@ -217,8 +245,7 @@ def truth_of(
     if within is None:
         poses = _Reading(None, False, skipped).truth(truth)
     else:
-        read = (truth.columns.pose(m) for m in messages(within, str(truth.source)))
-        poses = poses_of(read, skipped)
+        poses = truth.of_topic(messages(within, str(truth.source)), skipped)
     found, sentence = _aligned(truth, poses)(infos, measurements)
     return found or poses, sentence
 

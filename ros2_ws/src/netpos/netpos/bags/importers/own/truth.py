@@ -8,15 +8,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pyproj import Transformer
 
 from netpos.bags.errors import BagError
 from netpos.bags.importers.common import truth_of_poses
 from netpos.bags.importers.own.columns import ANGLE, CLOCK_NS, LENGTH, pairs, time_ns
-from netpos.bags.importers.own.records import Record, Skipped, number
+from netpos.bags.importers.own.records import Record, Skipped, number, problem
 from netpos.common.parameters import nearest
 from netpos.messages.values import Array, Odometry
 
 Stamps = NDArray[np.int64]
+Pose = tuple[int, float, float, float, float]
 
 QUATERNION = ("qx", "qy", "qz", "qw")
 TUM = {name: str(column) for column, name in enumerate(("time", "x", "y", "z", *QUATERNION), 1)}
@@ -28,12 +30,24 @@ ODOMETRY = {
 INTERVAL_NS = 50_000_000
 """Poses closer than this are left out: their stamps jitter, and velocities are differences."""
 _STANDING_MPS = 0.2
-_WORDS = ("time", "x", "y", "z", "yaw", *QUATERNION)
+_PLACE, _ON_EARTH = ("x", "y", "z"), ("latitude", "longitude", "height")
+_WORDS = ("time", *_PLACE, *_ON_EARTH, "yaw", *QUATERNION)
+POSE = {name: place.removeprefix("pose.") for name, place in ODOMETRY.items()}
+NAV_SAT_FIX = {
+    "time": "header.stamp",
+    "latitude": "latitude",
+    "longitude": "longitude",
+    "height": "altitude",
+}
+# What a message of a kind has, and where the pose of that kind stands.
+_KINDS = (("pose.pose", ODOMETRY), ("pose.position", POSE), ("latitude", NAV_SAT_FIX))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TruthColumns:
-    """Where a pose stands: time, x, y and, where known, z and yaw or a quaternion."""
+    """Where a pose stands: time, x, y and, where known, z and yaw or a quaternion; or latitude,
+    longitude (deg, WGS84) and height above the ellipsoid (m) in place of x, y, z.
+    """
 
     sources: Mapping[str, str]
     units: Mapping[str, str] = field(default_factory=dict)
@@ -45,7 +59,9 @@ class TruthColumns:
                     f"--truth-map knows no {name!r}{nearest(name, _WORDS)}; it knows "
                     f"{', '.join(_WORDS)}"
                 )
-        missing = [name for name in ("time", "x", "y") if name not in self.sources]
+        if set(_PLACE) & set(self.sources) and self.on_earth:
+            raise ValueError("--truth-map takes x, y, z or latitude, longitude, height, not both")
+        missing = [name for name in ("time", *self._place[:2]) if name not in self.sources]
         if missing:
             raise ValueError(f"--truth-map must name {', '.join(missing)}")
         known: dict[str, Iterable[str]] = {
@@ -60,22 +76,43 @@ class TruthColumns:
                     f"{', '.join([*CLOCK_NS, 'iso', *LENGTH, *ANGLE])}"
                 )
 
+    @property
+    def on_earth(self) -> bool:
+        """Whether places are latitudes and longitudes."""
+        return bool(set(_ON_EARTH) & set(self.sources))
+
+    @property
+    def _place(self) -> tuple[str, str, str]:
+        return _ON_EARTH if self.on_earth else _PLACE
+
+    @classmethod
+    def of_kind(cls, message: Record) -> TruthColumns:
+        """Those of an Odometry, a pose, or a NavSatFix. ``BagError`` for another kind."""
+        for has, sources in _KINDS:
+            try:
+                message.value(has)
+            except BagError:
+                continue
+            return cls(sources=sources)
+        raise problem(message, "no Odometry, PoseStamped or NavSatFix; name --truth-map")
+
     @classmethod
     def parse(cls, mapping: str, units: str = "") -> TruthColumns:
         """From the text of the options; ValueError for what it does not know."""
         return cls(sources=pairs(mapping, "--truth-map"), units=pairs(units, "--truth-units"))
 
-    def pose(self, record: Record) -> tuple[int, float, float, float, float] | None:
-        """Stamp [ns], x, y, z [m] and yaw [rad] (NaN: not known); None where values are empty."""
-        if any(number(record, self.sources[name], name) is None for name in ("x", "y")):
-            return None
-        factor = LENGTH[self.units.get("position", "m")]
-        place = [
-            factor * (number(record, self.sources[name], name) or 0.0)
+    def pose(self, record: Record) -> Pose | None:
+        """Stamp [ns], x, y, z [m] (or latitude, longitude [deg] and height [m]) and yaw
+        [rad] (NaN: not known); None where values are empty."""
+        read = {
+            name: number(record, self.sources[name], name)
+            for name in self._place
             if name in self.sources
-            else 0.0
-            for name in "xyz"
-        ]
+        }
+        if any(read[name] is None for name in self._place[:2]):
+            return None
+        factor = 1.0 if self.on_earth else LENGTH[self.units.get("position", "m")]
+        place = [factor * (read.get(name) or 0.0) for name in self._place]
         stamp = time_ns(record, self.sources["time"], self.units.get("time", "s"))
         return stamp, place[0], place[1], place[2], self._yaw(record)
 
@@ -119,21 +156,19 @@ class Poses:
         return truth_of_poses(self.stamps_ns.tolist(), values, vue_id)
 
 
-def poses_of(
-    found: Iterable[tuple[int, float, float, float, float] | None], skipped: Skipped
-) -> Poses:
+def poses_of(found: Iterable[Pose | None], skipped: Skipped) -> Poses:
     """Poses in the order of time, none closer than 0.05 s.
 
     Raises ``BagError`` where fewer than two are left.
     """
-    kept: list[tuple[int, float, float, float, float]] = []
+    kept: list[Pose] = []
     for pose in found:
         if pose is None:
             skipped["empty poses of the truth"] += 1
         else:
             kept.append(pose)
     kept.sort(key=lambda pose: pose[0])
-    thinned: list[tuple[int, float, float, float, float]] = []
+    thinned: list[Pose] = []
     for pose in kept:
         if not thinned or pose[0] - thinned[-1][0] >= INTERVAL_NS:
             thinned.append(pose)
@@ -143,6 +178,20 @@ def poses_of(
         np.array([pose[0] for pose in thinned], dtype=np.int64),
         np.array([pose[1:] for pose in thinned]),
     )
+
+
+def local(poses: Poses, origin: tuple[float, float, float] | None) -> Poses:
+    """Poses of latitude, longitude [deg, WGS84] and height [m] as metres east, north and up of
+    ``origin``; None: of the first pose."""
+    latitude, longitude, height = origin or poses.values[0, :3].tolist()
+    to_local = Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
+        "+step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 "
+        f"+lat_0={latitude!r} +lon_0={longitude!r} +h_0={height!r}"
+    )
+    latitudes, longitudes, heights = poses.values[:, :3].T
+    places = np.column_stack(to_local.transform(longitudes, latitudes, heights))
+    return replace(poses, values=np.column_stack([places, poses.values[:, 3]]))
 
 
 def _course(stamps_ns: Stamps, places: Array) -> Array:

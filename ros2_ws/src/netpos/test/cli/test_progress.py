@@ -1,0 +1,73 @@
+"""What long work tells, and how it ends when interrupted."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from netpos.cli import progress
+from netpos.cli.errors import Commands
+from typer import Exit
+
+# A shell's background jobs, and so their children, ignore SIGINT.
+MAIN = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+MAIN += "from netpos.cli.main import main; main()"
+
+
+def test_a_log_gets_a_sentence_now_and_then(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(progress, "SENTENCE_EVERY_S", 0.05)
+    with progress.doing("reading") as tell:
+        tell(40)
+        time.sleep(0.12)
+        tell(90)
+        time.sleep(0.12)
+    told = capsys.readouterr().err.splitlines()
+    assert told[0] == "netpos: reading: 0 s, 40 messages"
+    assert told[-1].endswith("90 messages")
+
+
+def test_bars_in_a_log_tell_the_end_of_each(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    bars = progress.Bars()
+    for done in range(1, 4):
+        bars.show("runs", done, 3)
+    bars.stop()
+    assert capsys.readouterr().err == "netpos: runs: 3 of 3\n"
+
+
+@pytest.mark.parametrize("caused", [True, False])
+def test_an_interrupt_inside_compiled_code_is_an_interrupt(
+    caused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python tells of it as a SystemError; any other is an error of the program and stays loud."""
+
+    def invoke(*_: object) -> None:
+        error = SystemError("returned a result with an exception set")
+        raise error from (KeyboardInterrupt() if caused else None)
+
+    monkeypatch.setattr(Commands.__mro__[1], "invoke", invoke)
+    with pytest.raises(Exit if caused else SystemError) as raised:
+        Commands(name="netpos").invoke(None)
+    assert getattr(raised.value, "exit_code", 130) == 130
+
+
+@pytest.mark.parametrize(("workers", "after_s"), [(1, 2.0), (1, 3.5), (2, 3.5)])
+def test_ctrl_c_ends_with_130_and_one_line(workers: int, after_s: float, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", MAIN, "reproduce", "fokin2020", "--workers", str(workers)]
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    time.sleep(after_s)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "Traceback" not in out + err
+    assert err.splitlines()[-1] == "netpos: interrupted"
