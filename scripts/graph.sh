@@ -29,6 +29,10 @@ start() { # NAME PACKAGE EXECUTABLE [ARGUMENT...]
   pid_of[$name]=$!
 }
 
+tell_progress() { # NAME WORD: what it logs of its progress, as it goes
+  tail --lines=+1 --follow --pid="${pid_of[$1]}" "$graph_logs/$1.log" | sed --unbuffered --quiet "s/.*\($2 .*\)/netpos: \1/p" >&2 &
+}
+
 start_up() { # NAME...: wait until the nodes of these names are in the graph
   python "$NETPOS_ROOT/scripts/wait_for_nodes.py" "$@" &
   pid_of[wait]=$!

@@ -33,6 +33,7 @@ for vue in $walkers; do # who walks is dead-reckoned
 done
 [ "${#pdr_nodes[@]}" = 0 ] || start_up "${pdr_nodes[@]}"
 start vue_sim vue_sim vue_sim --ros-args -p scenario:="$scenario" -p seed:="$seed" -p rate:="$(LC_ALL=C printf '%.6f' "$rate")" -p subscribers:=2
+tell_progress vue_sim simulated
 await vue_sim || give_up
 sleep 1 # the last messages are under way
 [ "${#pdr_nodes[@]}" = 0 ] || stop "${pdr_nodes[@]}"

@@ -11,7 +11,7 @@ import yaml
 from graph import Graph
 from nav_msgs.msg import Odometry
 from netpos.bags import LOST_METADATA, BagReader, BagWriter
-from netpos.evaluation.evaluate import notes_of
+from netpos.evaluation.contents import notes_of
 from netpos.scenario import load_scenario
 from netpos.scenario.load import scenario_of_text
 from netpos.tracking.settings import bag_settings

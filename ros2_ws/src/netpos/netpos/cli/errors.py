@@ -7,6 +7,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
+from netpos.cli.interrupts import INTERRUPTED
 from netpos.common.parameters import FaultsError
 
 _BAD_INPUT = (
@@ -59,7 +60,7 @@ class Commands(TyperGroup):
             if not _is_interrupt(error):
                 raise
             typer.echo("netpos: interrupted", err=True)
-            raise typer.Exit(130) from None
+            raise typer.Exit(INTERRUPTED) from None
         except BrokenPipeError:  # the reader of our output has gone, as in `netpos ... | head`
             raise
         except _BAD_INPUT as error:

@@ -6,6 +6,7 @@ import typer
 
 from netpos.cli import recordings, reproduce, results, rsus, runs, sweep
 from netpos.cli.errors import Commands
+from netpos.cli.interrupts import INTERRUPTED, answer_ctrl_c, leave
 
 app = typer.Typer(
     cls=Commands,
@@ -33,4 +34,10 @@ app.add_typer(rsus.rsus, name="rsus")
 
 def main() -> None:
     """Run the command line."""
-    app(prog_name="netpos")
+    answer_ctrl_c()
+    try:
+        app(prog_name="netpos")
+    except SystemExit as end:
+        if end.code == INTERRUPTED:
+            leave()
+        raise

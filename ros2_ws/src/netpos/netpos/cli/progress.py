@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from netpos.cli.interrupts import CTRL_C
+
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
@@ -18,7 +20,7 @@ SENTENCE_EVERY_S = 10.0
 _SHOWN_EVERY_S = 0.1
 
 Counted = Callable[[int], None]
-"""Called with the number of what is done."""
+"""Called with the number of what is done; raises ``KeyboardInterrupt`` where that is wanted."""
 
 
 @contextmanager
@@ -36,6 +38,7 @@ def doing(text: str, of: str = "messages") -> Iterator[Counted]:
 
         def show(done: int) -> None:
             nonlocal due_s
+            CTRL_C.check()
             now_s = time.monotonic()
             if now_s > due_s:
                 due_s = now_s + _SHOWN_EVERY_S
@@ -54,10 +57,14 @@ def _sentences(text: str, of: str) -> Iterator[Counted]:
             counted = f", {count[0]} {of}" if count[0] else ""
             typer.echo(f"netpos: {text}: {time.monotonic() - start_s:.0f} s{counted}", err=True)
 
+    def counted_to(done: int) -> None:
+        CTRL_C.check()
+        count[0] = done
+
     teller = threading.Thread(target=tell, daemon=True)
     teller.start()
     try:
-        yield lambda done: count.__setitem__(0, done)
+        yield counted_to
     finally:
         over.set()
         teller.join()

@@ -115,7 +115,7 @@ def _truth_from(
     from netpos.bags import BagReader  # noqa: PLC0415
     from netpos.bags.importers.own import truth_of  # noqa: PLC0415
     from netpos.cli.own_recordings import truth_option  # noqa: PLC0415
-    from netpos.evaluation.evaluate import config_of  # noqa: PLC0415
+    from netpos.evaluation.contents import config_of  # noqa: PLC0415
     from netpos.tracking.config import TrackerConfig  # noqa: PLC0415
 
     with BagReader(bag) as reader:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from netpos.cli.errors import WorkFailedError
+from netpos.cli.interrupts import INTERRUPTED
 from netpos.cli.progress import Bars, doing
 from netpos.cli.work import ClusterAddress, Workers, worked
 
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
     from netpos.evaluation.replays import Replays
     from netpos.scenario import Scenario
     from netpos.tracking.settings import TrackerSettings
-
-_INTERRUPTED = 130
 
 
 def scenarios() -> None:
@@ -153,7 +152,7 @@ def _replay_all(bags: list[Path], plan: Replays, workers: int | None, cluster: s
         raise NotADirectoryError(f"--out {plan.out}: several bags need a folder to go to")
     bars, refused, done = Bars(), 0, 0
     try:
-        with worked(), Work(1, 0, workers, bars.show, cluster=cluster) as work:
+        with worked(), Work(1, 0, workers, bars.show, cluster=cluster, apart=True) as work:
             for bag, summary in replay_bags(bags, plan, work):
                 if isinstance(summary, str):
                     refused += 1
@@ -274,7 +273,7 @@ def _run_live(scenario: str, target: Path, rate: float, seed: int) -> None:
     command = [str(script), name, str(target.absolute()), f"{rate:g}", str(seed)]
     with subprocess.Popen(command) as graph:
         status = _wait(graph)
-    if status == _INTERRUPTED:
+    if status == INTERRUPTED:
         raise KeyboardInterrupt
     if status != 0:
         raise WorkFailedError(f"the graph ended with status {status}; its messages are above")
@@ -286,7 +285,7 @@ def _run_live(scenario: str, target: Path, rate: float, seed: int) -> None:
 def _tell_losses(bag: Path) -> None:
     """What the recorder missed."""
     from netpos.bags import BagReader  # noqa: PLC0415
-    from netpos.evaluation.evaluate import lost_of  # noqa: PLC0415
+    from netpos.evaluation.contents import lost_of  # noqa: PLC0415
 
     with BagReader(bag) as reader:
         for sentence in lost_of(reader):

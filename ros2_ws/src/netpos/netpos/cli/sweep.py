@@ -66,7 +66,10 @@ def sweep(
     bars = Bars()
     kept = None if resume is None else Kept(resume)
     try:
-        with worked(), Work(runs, seed, workers, bars.show, cluster=cluster, kept=kept) as work:
+        with (
+            worked(),
+            Work(runs, seed, workers, bars.show, cluster=cluster, kept=kept, apart=True) as work,
+        ):
             table = run(Plan(scenario, values, skip), work)
     finally:
         bars.stop()

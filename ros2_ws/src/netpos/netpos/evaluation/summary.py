@@ -77,7 +77,7 @@ def _interval(figures: Figures) -> str:
         return NOTHING
     low, high = figures.nees_bounds
     verdict = "consistent" if figures.nees_consistent else "not consistent"
-    return f"{low:.2f}…{high:.2f}, {verdict}"
+    return f"{low:.2f} to {high:.2f}, {verdict}"
 
 
 def figure_rows(evaluation: Evaluation) -> list[list[str]]:

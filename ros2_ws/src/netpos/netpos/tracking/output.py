@@ -14,14 +14,15 @@ from netpos.messages.values import Array, ClockState, Odometry, TrackState
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.protection import radius_of
 
-# What a planar tracker does not estimate (height, roll, pitch and their rates) is reported with
-# this variance.
-UNOBSERVED_VAR = 1e6
+# What a planar tracker takes for granted and does not estimate: that the device is at the height
+# it was told, upright, and neither climbs nor tips nor (without a heading of its own) turns.
+HEIGHT_SD_M, TILT_SD_RAD = 1.0, 0.2
+CLIMB_SD_MPS, TURN_SD_RADPS = 1.0, 1.0
 _YAW_VAR_MAX = math.pi**2 / 3.0  # of a heading about which nothing is known
 _COVS = np.array(  # of pose and twist
     [
-        np.diag([0.0, 0.0, UNOBSERVED_VAR, UNOBSERVED_VAR, UNOBSERVED_VAR, 0.0]),
-        np.diag([0.0, 0.0, *([UNOBSERVED_VAR] * 4)]),
+        np.diag(np.square([0.0, 0.0, HEIGHT_SD_M, TILT_SD_RAD, TILT_SD_RAD, 0.0])),
+        np.diag(np.square([0.0, 0.0, CLIMB_SD_MPS, *[TURN_SD_RADPS] * 3])),
     ]
 )
 _POSITION, _QUATERNION, _VELOCITY, _RATE, _VECTORS = 0, 3, 7, 10, 13

@@ -8,10 +8,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from netpos.cli import progress
 from netpos.cli.errors import Commands
+from netpos.cli.interrupts import answer_ctrl_c
 from typer import Exit
 
 # A shell's background jobs, and so their children, ignore SIGINT.
@@ -57,6 +59,84 @@ def test_an_interrupt_inside_compiled_code_is_an_interrupt(
     with pytest.raises(Exit if caused else SystemError) as raised:
         Commands(name="netpos").invoke(None)
     assert getattr(raised.value, "exit_code", 130) == 130
+
+
+def test_an_interrupt_waits_for_the_compiler() -> None:
+    """Which an exception in its middle would break; it comes right afterwards."""
+    text = "def compile(first, then):\n    first()\n    then()\n"
+    compiler: dict[str, Any] = {"__name__": "numba.core.compiler"}
+    exec(text, compiler)
+    finished: list[str] = []
+
+    def stop() -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+    def finish() -> None:
+        time.sleep(0.5)
+        finished.append("compiled")
+
+    class Dying:
+        def __del__(self) -> None:
+            stop()
+
+    def throw_away() -> None:
+        """An exception in ``__del__`` is thrown away."""
+        Dying()
+        time.sleep(5.0)
+
+    hook = sys.unraisablehook
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGALRM)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        answer_ctrl_c()
+        with pytest.raises(KeyboardInterrupt):
+            _ = [compiler["compile"](stop, finish), time.sleep(5.0)]
+        with pytest.raises(KeyboardInterrupt):
+            _ = [stop(), time.sleep(5.0)]
+        with pytest.raises(KeyboardInterrupt):
+            throw_away()
+    finally:
+        sys.unraisablehook = hook
+        signal.signal(signal.SIGINT, before[0])
+        signal.signal(signal.SIGALRM, before[1])
+    assert finished == ["compiled"]
+
+
+def test_work_that_counts_is_interrupted_between_two_messages() -> None:
+    """Never within one, where compiled code may be called."""
+    begun, ended = [], []
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGALRM)
+    hook = sys.unraisablehook
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def work() -> None:
+        with progress.doing("tracking") as tell:
+            for done in range(10):
+                tell(done)
+                begun.append(done)
+                if done == 3:
+                    os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(0.02)
+                ended.append(done)
+
+    try:
+        answer_ctrl_c()
+        with pytest.raises(KeyboardInterrupt):
+            work()
+    finally:
+        sys.unraisablehook = hook
+        signal.signal(signal.SIGINT, before[0])
+        signal.signal(signal.SIGALRM, before[1])
+    assert begun == ended == [0, 1, 2, 3]
+
+
+def test_where_interrupts_are_ignored_they_stay_so() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        answer_ctrl_c()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize(("workers", "after_s"), [(1, 2.0), (1, 3.5), (2, 3.5)])

@@ -8,7 +8,8 @@ from typing import Any
 import yaml
 
 from netpos.bags.single_file import load_yaml
-from netpos.evaluation.evaluate import Evaluation, lost_in
+from netpos.evaluation.contents import lost_in
+from netpos.evaluation.evaluate import Evaluation
 from netpos.evaluation.metrics import Figures
 from netpos.evaluation.residuals import Residuals
 from netpos.evaluation.summary import (

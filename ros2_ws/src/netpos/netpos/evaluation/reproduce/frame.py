@@ -134,7 +134,7 @@ def reproduce(
         raise ValueError(f"no paper {paper!r}; known: {', '.join(sorted(PAPERS))}")
     module = import_module(PAPERS[paper])
     runs = getattr(module, "RUNS", DEFAULT_RUNS) if runs is None else runs
-    work = Work(runs, seed, workers, progress, cluster=cluster, kept=kept)
+    work = Work(runs, seed, workers, progress, cluster=cluster, kept=kept, apart=True)
     module.warm_up()
     start = time.perf_counter()
     with work:

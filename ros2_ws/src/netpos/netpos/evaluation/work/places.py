@@ -48,8 +48,16 @@ class Processes:
 
     def __init__(self, workers: int) -> None:
         fork = multiprocessing.get_context("fork")
-        self._pool = ProcessPoolExecutor(workers, mp_context=fork, initializer=_leave_interrupts)
-        self._pool.submit(int).result()  # fork now, before a progress display starts a thread
+        self._pool = ProcessPoolExecutor(workers, mp_context=fork)
+        # A Ctrl-C reaches every process of a terminal. The one that starts the others answers, and
+        # not before all are there; they keep it blocked.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._pool.submit(int).result()  # fork now, before a progress display starts a thread
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        except BaseException:
+            self.close(abandon=True)
+            raise
 
     def submit(self, job: Callable[[Any, Any], Any], *arguments: Any) -> Callable[[], Any]:
         """See ``Place``."""
@@ -68,12 +76,8 @@ class Processes:
         if abandon:
             for process in multiprocessing.active_children():
                 process.terminate()
-        self._pool.shutdown(cancel_futures=True)
-
-
-def _leave_interrupts() -> None:
-    """A Ctrl-C reaches every process of a terminal; the one that started the others answers."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+        # The pool would wait for the rest of a result that was being sent.
+        self._pool.shutdown(wait=not abandon, cancel_futures=True)
 
 
 class Cluster:

@@ -39,9 +39,11 @@ class Work:
         *,
         cluster: str | None = None,
         kept: Kept | None = None,
+        apart: bool = False,
     ) -> None:
-        """``workers``: processes, None: one per processor, 1: this process. ``cluster``: address
-        of a Ray cluster in their place. ``kept``: finished jobs are kept there and not run again.
+        """``workers``: processes, None: one per processor, 1: this process, or with ``apart`` one
+        of its own, so that nothing interrupts compiled code. ``cluster``: address of a Ray cluster
+        in their place. ``kept``: finished jobs are kept there and not run again.
 
         Raises
         ------
@@ -54,6 +56,7 @@ class Work:
         self.runs = runs
         self.seed = seed
         self._workers = workers
+        self._apart = apart
         self._cluster = cluster
         self._progress = progress
         self._kept = kept
@@ -63,7 +66,7 @@ class Work:
         self._threads = threadpool_limits(1)  # which forked processes inherit
         if self._cluster is not None:
             self._place = Cluster(self._cluster)
-        elif self._workers > 1:
+        elif self._workers > 1 or self._apart:
             self._place = Processes(self._workers)
         return self
 
