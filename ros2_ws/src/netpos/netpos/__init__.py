@@ -27,23 +27,37 @@ from netpos import kernel_cache
 
 __version__ = "0.1.0"
 
-# What a program that uses netpos imports from here; loaded when it is asked for.
+# What a program that uses netpos imports from here, and nothing else is promised to stay; loaded
+# when it is asked for.
 _PUBLIC = {
+    "ClockState": "netpos.messages.values",
     "Field": "netpos.messages.values",
+    "ImuSample": "netpos.messages.values",
+    "InitialPose": "netpos.messages.values",
     "Odometry": "netpos.messages.values",
+    "Recording": "netpos.bags.recording",
     "RsuInfo": "netpos.messages.values",
     "RsuMeasurement": "netpos.messages.values",
+    "Scenario": "netpos.scenario",
+    "TrackStatus": "netpos.messages.values",
     "Tracker": "netpos.tracking.tracker",
     "TrackerConfig": "netpos.tracking.config",
+    "evaluate": "netpos.evaluation.evaluate",
+    "load_scenario": "netpos.scenario",
+    "read_bag": "netpos.bags.recording",
+    "simulate": "netpos.scenario.offline",
+    "track": "netpos.tracking.replay",
     "write_bag": "netpos.bags.recording",
 }
+# Under other names inside.
+_INSIDE = {"evaluate": "assess_bag", "simulate": "simulate_to_bag", "track": "replay_bag"}
 __all__ = list(_PUBLIC)
 
 
 def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"netpos has no {name!r}; it offers {', '.join(_PUBLIC)}")
-    return getattr(import_module(_PUBLIC[name]), name)
+    return getattr(import_module(_PUBLIC[name]), _INSIDE.get(name, name))
 
 
 kernel_cache.select(Path(__file__).resolve().parent)

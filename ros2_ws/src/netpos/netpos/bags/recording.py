@@ -1,20 +1,40 @@
-"""A recording made in Python becomes a bag: RSUs, measurements, truth, IMU."""
+"""A recording made in Python becomes a bag, and a bag becomes values in Python."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 import netpos
 from netpos.bags.errors import BagError
+from netpos.bags.reader import BagReader
 from netpos.bags.types import codec
 from netpos.bags.writer import whole_bag
-from netpos.messages.topics import GROUND_TRUTH, IMU, RSU_INFO, RSU_MEASUREMENTS, of_vue
-from netpos.messages.values import ImuSample, Odometry, RsuInfo, RsuMeasurement
+from netpos.messages.topics import (
+    CLOCK_STATE,
+    GROUND_TRUTH,
+    IMU,
+    ODOMETRY,
+    RSU_INFO,
+    RSU_MEASUREMENTS,
+    TRACK_STATUS,
+    of_vue,
+    split,
+)
+from netpos.messages.values import (
+    ClockState,
+    ImuSample,
+    Odometry,
+    RsuInfo,
+    RsuMeasurement,
+    TrackStatus,
+)
 
 # Metadata of an import that whoever reads the figures must know.
 TRUTH_ALIGNMENT = "truth_alignment"
@@ -39,7 +59,7 @@ def write_bag(
     Parameters
     ----------
     rsus : every RSU of the measurements
-    tracker : parameters of the tracker that a replay takes, such as ``device_height_m``
+    tracker : parameters that a replay takes, such as ``device_height_m``; the others are defaults
     metadata : what made the recording; kept in the bag
 
     Returns
@@ -64,8 +84,7 @@ def write_bag(
     merged += [(s.stamp_ns, of_vue(s.vue_id, IMU), messages.imu_to_msg(s)) for s in imu]
     merged.sort(key=lambda item: item[0])
     kept = {"netpos_version": netpos.__version__, **(metadata or {})}
-    if tracker:
-        kept["tracker"] = yaml.safe_dump(dict(tracker))
+    kept["tracker"] = yaml.safe_dump(dict(tracker or {}))
     with whole_bag(Path(path), metadata=kept) as writer:
         for info in rsus:
             message = messages.rsu_info_to_msg(replace(info, stamp_ns=start_ns))
@@ -73,6 +92,67 @@ def write_bag(
         for stamp_ns, topic, message in merged:
             writer.write(topic, message, stamp_ns)
         return writer.counts
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recording:
+    """What a bag holds, in recorded order; truth, odometry, status and clock by device.
+
+    facts : what the bag says of how it was made, by name (``scenario``, ``tracker``, ``lost``);
+    several values where they do not agree
+    """
+
+    rsus: tuple[RsuInfo, ...]
+    measurements: tuple[RsuMeasurement, ...]
+    imu: tuple[ImuSample, ...]
+    truth: Mapping[str, tuple[Odometry, ...]]
+    odometry: Mapping[str, tuple[Odometry, ...]]
+    clock: Mapping[str, tuple[ClockState, ...]]
+    status: Mapping[str, tuple[TrackStatus, ...]]
+    facts: Mapping[str, tuple[str, ...]]
+
+
+def read_bag(path: Path | str) -> Recording:
+    """Everything of a bag as values; for a bag that fits into memory (about 1 KB a message).
+
+    Raises ``BagError`` for what is no bag, or holds other types under these names.
+    """
+    convert = codec()
+    read = {
+        RSU_INFO: convert.rsu_info_from_msg,
+        RSU_MEASUREMENTS: convert.measurement_from_msg,
+        IMU: convert.imu_from_msg,
+        GROUND_TRUTH: convert.odometry_from_msg,
+        ODOMETRY: convert.odometry_from_msg,
+        CLOCK_STATE: convert.clock_state_from_msg,
+        TRACK_STATUS: convert.track_status_from_msg,
+    }
+    found: dict[tuple[str, str], list[Any]] = defaultdict(list)
+    with BagReader(Path(path)) as bag:
+        names = {topic: split(topic) if split(topic)[0] else ("", topic) for topic in bag.topics}
+        wanted = [topic for topic, (_, name) in names.items() if name in read]
+        for entry in bag.messages(wanted):
+            vue, name = names[entry.topic]
+            try:
+                value = read[name](entry.message)
+            except (AttributeError, TypeError) as error:
+                raise BagError(f"{path}: {entry.topic} holds {entry.type_name}") from error
+            found[name, vue].append(value)
+        facts = bag.facts
+
+    def of(name: str) -> dict[str, tuple[Any, ...]]:
+        return {vue: tuple(v) for (kind, vue), v in sorted(found.items()) if kind == name}
+
+    return Recording(
+        rsus=tuple(found[RSU_INFO, ""]),
+        measurements=tuple(found[RSU_MEASUREMENTS, ""]),
+        imu=tuple(sample for samples in of(IMU).values() for sample in samples),
+        truth=of(GROUND_TRUTH),
+        odometry=of(ODOMETRY),
+        clock=of(CLOCK_STATE),
+        status=of(TRACK_STATUS),
+        facts=facts,
+    )
 
 
 def _check(rsus: Sequence[RsuInfo], measurements: Sequence[RsuMeasurement]) -> None:

@@ -1,7 +1,7 @@
 """Message types without ROS: definitions, the rosbags type store and the codec on its classes.
 
 Definitions are the ``.msg`` files of the ROS installation (``AMENT_PREFIX_PATH``) or, for
-``netpos_msgs``, of the source tree beside the library; rosbags brings the standard Jazzy types.
+``netpos_msgs``, those that the library brings; rosbags brings the standard Jazzy types.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def _message_folders(package: str) -> list[Path]:
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     folders = [Path(prefix) / "share" / package / "msg" for prefix in prefixes if prefix]
     if package == _OWN_PACKAGE:
-        folders.append(Path(__file__).resolve().parents[3] / _OWN_PACKAGE / "msg")
+        folders.append(Path(__file__).parent / "msg")
     return folders
 
 
@@ -82,6 +82,20 @@ def _parse(text: str, type_name: str) -> Any:
         raise BagError(f"the definition of {type_name} cannot be parsed: {error}") from error
 
 
+def _text_of(type_name: str) -> str:
+    """The text of one type's .msg."""
+    file = _message_file(type_name)
+    if file is not None:
+        return file.read_text(encoding="utf-8")
+    standard = get_typestore(Stores.ROS2_JAZZY)
+    if type_name not in standard.types:
+        raise BagError(
+            f"no definition of {type_name} found; install its package and source the ROS "
+            "environment (AMENT_PREFIX_PATH)"
+        )
+    return standard.generate_msgdef(type_name, ros_version=2)[0].partition(SEPARATOR)[0]
+
+
 @cache
 def _gather(type_name: str) -> tuple[tuple[str, str], ...]:
     """(type name, text of its .msg) of a type and all it is made of, the type itself first."""
@@ -91,13 +105,7 @@ def _gather(type_name: str) -> tuple[tuple[str, str], ...]:
         name = waiting.pop(0)
         if name in found:
             continue
-        file = _message_file(name)
-        if file is None:
-            raise BagError(
-                f"no definition of {name} found; install its package and source the ROS "
-                "environment (AMENT_PREFIX_PATH)"
-            )
-        found[name] = file.read_text(encoding="utf-8")
+        found[name] = _text_of(name)
         parsed = _parse(found[name], name)
         waiting.extend(_nested_types(parsed[name][1]))
     return tuple(found.items())
@@ -112,13 +120,7 @@ def definition(type_name: str) -> str:
     BagError  no definition is known
     """
     check_type_name(type_name)
-    try:
-        parts = _gather(type_name)
-    except BagError:
-        standard = get_typestore(Stores.ROS2_JAZZY)
-        if type_name not in standard.types:
-            raise
-        return standard.generate_msgdef(type_name, ros_version=2)[0]
+    parts = _gather(type_name)
     texts = [parts[0][1].rstrip("\n") + "\n"]
     for name, text in parts[1:]:
         short = name.replace("/msg/", "/")

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import typer
 
+import netpos
 from netpos.cli import recordings, reproduce, results, rsus, runs, sweep
 from netpos.cli.errors import Commands
 from netpos.cli.interrupts import INTERRUPTED, answer_ctrl_c, leave
 
+EXAMPLES = """
+Position vehicles and pedestrians from the network side.
+
+Begin with: netpos run fast_pass --offline --bag my_run, netpos evaluate my_run,
+netpos report my_run --out report.html
+"""
+
 app = typer.Typer(
     cls=Commands,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
-    help="Position vehicles and pedestrians from the network side.",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help=EXAMPLES,
 )
 for command in (
     runs.scenarios,
@@ -30,6 +40,24 @@ for command in (
     app.command()(command)
 app.add_typer(recordings.importers, name="import")
 app.add_typer(rsus.rsus, name="rsus")
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"netpos {netpos.__version__}")
+        raise typer.Exit
+
+
+@app.callback(help=EXAMPLES)
+def options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_version, is_eager=True, help="Show the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """What holds for every command."""
 
 
 def main() -> None:

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from netpos.cli.progress import doing
+
 rsus = typer.Typer(
     no_args_is_help=True, help="Keep RSUs and their learned errors as a file, and use them again."
 )
@@ -20,7 +22,8 @@ def save(
     """Write the RSUs of a bag as a file, with their errors as learned."""
     from netpos.bags.rsus_file import save_rsus  # noqa: PLC0415
 
-    found = save_rsus(bag, file)
+    with doing("reading"):
+        found = save_rsus(bag, file)
     typer.echo(f"wrote {file}: {len(found)} RSUs")
 
 
@@ -35,5 +38,6 @@ def load(
     from netpos.cli.runs import refuse_existing  # noqa: PLC0415
 
     refuse_existing(out)
-    names = load_rsus(file, bag, out)
+    with doing("copying"):
+        names = load_rsus(file, bag, out)
     typer.echo(f"wrote {out}: {', '.join(names)} as in {file}")

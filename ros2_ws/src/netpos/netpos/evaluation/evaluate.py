@@ -145,7 +145,7 @@ def _surveyed(bag: BagReader, path: Path, vue: str | None) -> list[str]:
 
 
 def assess_bag(
-    path: Path,
+    path: Path | str,
     *,
     skip: int = SKIP_EPOCHS,
     vue: str | None = None,
@@ -155,6 +155,7 @@ def assess_bag(
 ) -> Evaluation | Survey:
     """``evaluate_bag`` where there is ground truth, else ``survey_bag``; raises what they do.
     ``progress`` is called with the number of messages read."""
+    path = Path(path)
     if truth is not None:
         return evaluate_bag(
             path, skip=skip, vue=vue, truth=truth, residuals=residuals, progress=progress

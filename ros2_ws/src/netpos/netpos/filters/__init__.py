@@ -15,3 +15,7 @@
 ``smooth``       Rauch-Tung-Striebel smoothing
 ``filterpy_backend``  the reference
 """
+
+from netpos.filters.first_compilation import tell_first_compilation
+
+tell_first_compilation()

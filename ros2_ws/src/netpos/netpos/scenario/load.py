@@ -15,7 +15,7 @@ from netpos.common.parameters import FaultsError
 from netpos.scenario.schema import Scenario
 
 _SHARED = Path("share/netpos_bringup/scenarios")
-_SOURCE = Path(__file__).resolve().parents[3] / "netpos_bringup" / "scenarios"
+_OWN = Path(__file__).parent / "scenarios"
 _YAML_1_2_FLOAT = re.compile(r"^[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$")
 
 
@@ -32,11 +32,11 @@ _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _YAML_1_2_FLOAT, list("
 
 def _folders() -> list[Path]:
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    return [Path(p) / _SHARED for p in prefixes if p] + [_SOURCE]
+    return [Path(p) / _SHARED for p in prefixes if p] + [_OWN]
 
 
 def scenario_files() -> dict[str, Path]:
-    """Installed scenarios by name; those of the source tree fill in what is not installed."""
+    """Installed scenarios by name; those of the library fill in what is not installed."""
     found: dict[str, Path] = {}
     for folder in _folders():
         for path in sorted(folder.glob("*.yaml")):

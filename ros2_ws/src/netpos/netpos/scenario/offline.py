@@ -25,7 +25,7 @@ DEFAULT_CLOCK_HZ = 100.0
 
 def simulate_to_bag(
     scenario: Scenario,
-    bag_path: Path,
+    bag_path: Path | str,
     *,
     clock_hz: float = DEFAULT_CLOCK_HZ,
     progress: Callable[[int], None] | None = None,
@@ -48,7 +48,7 @@ def simulate_to_bag(
     if scenario.networks:
         names = [network.name for network in scenario.networks]
         metadata["fusion"] = yaml.safe_dump({"networks": names, **scenario.fusion})
-    with BagWriter(bag_path, metadata=metadata) as bag:
+    with BagWriter(Path(bag_path), metadata=metadata) as bag:
         for item in timeline(Simulation(scenario), clock_hz, measured=True):
             if isinstance(item, int):
                 bag.write(CLOCK, convert.clock_to_msg(item), item)

@@ -52,8 +52,8 @@ class ReplaySummary:
 
 
 def replay_bag(
-    bag_in: Path,
-    bag_out: Path,
+    bag_in: Path | str,
+    bag_out: Path | str,
     overrides: Mapping[str, Any] | None = None,
     progress: Callable[[int], None] | None = None,
     *,
@@ -68,6 +68,7 @@ def replay_bag(
     all measurements. Raises ``BagError`` for a bag without measurements or parameters,
     ``ValueError`` for a bad parameter, ``FileExistsError`` where ``bag_out`` exists.
     """
+    bag_in, bag_out = Path(bag_in), Path(bag_out)
     with BagReader(bag_in) as source:
         settings = changed(settings or bag_settings(source), overrides or {})
         config = TrackerConfig.from_mapping(settings.parameters)

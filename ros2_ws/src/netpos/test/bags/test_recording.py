@@ -94,9 +94,3 @@ def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
     netpos.write_bag(tmp_path / "bag", rsus=RSUS, measurements=[measured(10, "a")])
     with pytest.raises(FileExistsError):
         netpos.write_bag(tmp_path / "bag", rsus=RSUS, measurements=[replace(measured(10, "a"))])
-
-
-def test_the_library_names_what_it_offers() -> None:
-    with pytest.raises(AttributeError, match="no 'write_bags'; it offers Field"):
-        _ = netpos.write_bags
-    assert all(hasattr(netpos, name) for name in netpos.__all__)
