@@ -8,8 +8,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
-import yaml
 from netpos.common.parameters import nearest
+from netpos.common.yaml_text import YamlError, load_yaml
 from rclpy.utilities import remove_ros_args
 
 _OF_ROS = ("use_sim_time", "start_type_description_service")
@@ -63,7 +63,10 @@ def _check_files(node: Any, arguments: Sequence[str]) -> None:
     for flag, value in pairwise(arguments):
         if flag != "--params-file":
             continue
-        content = yaml.safe_load(Path(value).read_text(encoding="utf-8"))
+        try:
+            content = load_yaml(Path(value).read_text(encoding="utf-8"))
+        except YamlError as error:
+            refuse(f"{value}: {error}")
         names = [str(name) for name in content] if isinstance(content, dict) else []
         mine = node.get_name()
         if not any("*" in name or name.rsplit("/", 1)[-1] == mine for name in names):

@@ -20,6 +20,7 @@ from netpos.bags.errors import BagError
 from netpos.bags.scan import summary_is_sound
 from netpos.bags.single_file import open_single_file
 from netpos.bags.types import require_type, store_of_definition
+from netpos.common.yaml_text import YamlError, check_limits
 from netpos.messages.topics import RUN_TOPICS
 
 
@@ -131,7 +132,18 @@ class BagReader:
             raise BagError(
                 f"{self.path} is not a bag: it holds no {layout.METADATA_FILE} and no .mcap file"
             )
+        self._check_metadata()
         self._check_summaries()
+
+    def _check_metadata(self) -> None:
+        """Before anybody reads it."""
+        file = self.path / layout.METADATA_FILE
+        if not self.path.is_dir():
+            return
+        try:
+            check_limits(file.read_text(encoding="utf-8"))
+        except (YamlError, UnicodeDecodeError) as error:
+            raise self._damaged(f"{layout.METADATA_FILE}: {error}") from error
 
     def _open(self) -> Reader:
         try:

@@ -10,19 +10,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import yaml
 from mcap.reader import make_reader
 from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import parse_qos
 
 from netpos.bags import layout
-
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
-
-def load_yaml(text: str) -> Any:
-    """What a YAML document says, by libyaml where there is one; raises ``yaml.YAMLError``."""
-    return yaml.load(text, Loader=_LOADER)
+from netpos.common.yaml_text import load_yaml
 
 
 class SingleFile:

@@ -186,14 +186,14 @@ def parse_setting(text: str) -> tuple[str, object]:
     ------
     ValueError  there is no ``=``, no key or no YAML scalar
     """
-    import yaml  # noqa: PLC0415
+    from netpos.common.yaml_text import YamlError, load_yaml  # noqa: PLC0415
 
     key, equals, value = text.partition("=")
     if not (equals and key.strip()):
         raise ValueError(f"--set takes KEY=VALUE, got {text!r}")
     try:
-        return key.strip(), yaml.safe_load(value)
-    except yaml.YAMLError as error:
+        return key.strip(), load_yaml(value)
+    except YamlError as error:
         raise ValueError(f"--set {key}: {value!r} is not a YAML value") from error
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from netpos.bags import LOST_METADATA, BagEntry, BagReader, codec
 from netpos.bags.recording import SKIPPED, TRUTH_ALIGNMENT
-from netpos.bags.single_file import load_yaml
+from netpos.common.yaml_text import load_yaml
 from netpos.evaluation.metrics import Run
 from netpos.evaluation.pairing import Clock, Poses
 from netpos.evaluation.scene import buildings_of

@@ -12,6 +12,7 @@ import yaml
 from pydantic import ValidationError
 
 from netpos.common.parameters import FaultsError
+from netpos.common.yaml_text import YamlError, compose_yaml
 from netpos.scenario.schema import Scenario
 
 _SHARED = Path("share/netpos_bringup/scenarios")
@@ -84,7 +85,10 @@ def _parse(
     path: Path, text: str, given: Mapping[str, object], changes: Mapping[str, object]
 ) -> Scenario:
     node = _compose(path, text)
-    content: dict[str, Any] = yaml.load(text, _Loader)
+    try:
+        content: dict[str, Any] = yaml.load(text, _Loader)
+    except (yaml.YAMLError, ValueError, OverflowError) as error:
+        raise ScenarioError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
     content.setdefault("name", path.stem)
     content.update(given)
     for key, value in changes.items():
@@ -119,13 +123,9 @@ def _find(name_or_path: str) -> Path:
 
 def _compose(path: Path, text: str) -> yaml.MappingNode:
     try:
-        node = yaml.compose(text, _Loader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" line {mark.line + 1}:" if mark else ""
-        raise ScenarioError(
-            f"{path}:{where} not valid YAML: {getattr(error, 'problem', error)}"
-        ) from error
+        node = compose_yaml(text, _Loader)
+    except YamlError as error:
+        raise ScenarioError(f"{path}: {error}") from error
     if not isinstance(node, yaml.MappingNode):
         raise ScenarioError(f"{path}: a scenario is a mapping of keys to values")
     _refuse_repeated_keys(path, node)

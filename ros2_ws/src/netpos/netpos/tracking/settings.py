@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from netpos.bags import BagError, BagReader
-from netpos.bags.single_file import load_yaml
+from netpos.common.yaml_text import YamlError, load_yaml
 from netpos.messages import topics
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.networks.config import FusionConfig
@@ -79,7 +79,10 @@ def fusion_fact(networks: tuple[str, ...], config: FusionConfig) -> dict[str, st
 def _mapping(bag: BagReader, name: str) -> dict[str, Any] | None:
     """The one value of a fact, None where nothing is said."""
     texts = bag.facts.get(name, ())
-    values = [load_yaml(text) or {} for text in texts]
+    try:
+        values = [load_yaml(text) or {} for text in texts]
+    except YamlError as error:
+        raise BagError(f"{bag.path}: what it says of its {name}: {error}") from error
     if not all(isinstance(value, dict) for value in values):
         raise BagError(f"{bag.path}: {name!r} is not a mapping of parameters")
     if len(values) > 1:

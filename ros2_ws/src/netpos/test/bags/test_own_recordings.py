@@ -180,7 +180,7 @@ def test_rsus_of_files(tmp_path: Path) -> None:
         ("r.yaml", "a: {position: [1, 2, 3], networks: x}\n", "did you mean network?"),
         ("r.yaml", "a: here\n", "give .x, y, z. or fields"),
         ("r.yaml", "- 1\n", "names no RSU"),
-        ("r.yaml", "a: [", "is not YAML"),
+        ("r.yaml", "a: [", "line 2: not valid YAML"),
         ("r.csv", "rsu,x,y\na,1,2\na,3,4\n", "names a twice"),
         ("r.csv", "rsu,x\na,1\n", "no column 'y'"),
     ],

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 from netpos.bags import BagError, BagReader, BagWriter, codec
-from netpos.bags.single_file import load_yaml, open_single_file
+from netpos.bags.single_file import open_single_file
 from rosbags.rosbag2 import Reader
 
 
@@ -85,10 +85,3 @@ def test_broken_metadata(tmp_path: Path) -> None:
     assert open_single_file(folder) is None
     with pytest.raises(BagError, match="metadata"):
         BagReader(folder)
-
-
-def test_yaml_is_read_as_by_the_safe_loader() -> None:
-    text = "a: [1, 2.5, null, true, '1', 2026-01-01]\nb: {c: .inf}"
-    assert load_yaml(text) == yaml.safe_load(text)
-    with pytest.raises(yaml.YAMLError):
-        load_yaml("!!python/object/apply:os.getcwd []")

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from netpos.common.yaml_text import load_yaml
 from netpos.evaluation.pages.charts import Chart, Series
 from netpos.evaluation.pages.tables import SOURCES, Column, Table, TableError, checked
 
@@ -30,7 +29,7 @@ def read_layout(path: Path) -> Layout:
     ------
     TableError  a key is unknown or missing; the text says where
     """
-    data = checked(_File, yaml.safe_load(path.read_text(encoding="utf-8")), path.name)
+    data = checked(_File, load_yaml(path.read_text(encoding="utf-8")), path.name)
     tables = {
         (recorded, name): _table(spec, f"{path.name}: {recorded} {name}")
         for recorded, specs in data.tables.items()

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import yaml
-
-from netpos.bags.single_file import load_yaml
+from netpos.common.yaml_text import load_yaml
 from netpos.evaluation.contents import lost_in
 from netpos.evaluation.evaluate import Evaluation
 from netpos.evaluation.metrics import Figures
@@ -121,7 +119,7 @@ def _first(facts: Mapping[str, tuple[str, ...]], name: str) -> Mapping[str, Any]
     """The first value of a fact, empty where it cannot be read."""
     try:
         value = load_yaml(facts.get(name, ("",))[0])
-    except (ValueError, yaml.YAMLError):
+    except ValueError:
         value = None
     return value if isinstance(value, dict) else {}
 

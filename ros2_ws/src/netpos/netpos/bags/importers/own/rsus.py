@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from netpos.bags.errors import BagError
 from netpos.bags.importers.common import yaw_quaternion
 from netpos.bags.importers.own.records import label, lines, number, problem
 from netpos.common.parameters import nearest
+from netpos.common.yaml_text import YamlError, load_yaml
 from netpos.messages.values import AngleConvention, RsuInfo
 
 _FIELDS = [f.name for f in dataclasses.fields(RsuInfo) if f.name not in ("rsu_id", "stamp_ns")]
@@ -57,9 +57,9 @@ def _from_csv(file: Path) -> list[RsuInfo]:
 
 def _from_yaml(file: Path) -> list[RsuInfo]:
     try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise BagError(f"{file} is not YAML: {error}") from error
+        content = load_yaml(file.read_text(encoding="utf-8"))
+    except (YamlError, UnicodeDecodeError) as error:
+        raise BagError(f"{file}: {error}") from error
     entries = content.get("rsus", content) if isinstance(content, dict) else None
     if not isinstance(entries, dict) or not entries:
         raise BagError(f"{file} names no RSU; write it as rsus: {{a0: [x, y, z]}}")
