@@ -208,3 +208,23 @@ def test_a_device_that_nobody_hears_is_coasting(graph: Graph) -> None:
     assert last.reason.startswith("nothing taken for ")
     assert last.position_sd > 1.5 * status.messages[19].position_sd
     network.wait_for("vue_1", "s; was tracking", DiagnosticStatus.STALE)
+
+
+def test_invented_devices_take_no_room_from_an_honest_one(graph: Graph) -> None:
+    """Two hundred names nobody knows, twenty places: the tracker stays small and says so."""
+    network = Network(graph)
+    odometry = graph.collect(topics.of_vue("honest", "odometry"), Odometry)
+    start(graph, vues=["honest"], max_devices=20)
+    graph.wait_for_subscribers(MEASUREMENTS)
+    network.describe()
+    network.wait_for("rsus", "4 RSUs known", DiagnosticStatus.OK)
+    for k in range(200):
+        network.send(epoch(f"made_up_{k}", 0.0, range_var=0.0))
+        if k % 10 == 0:
+            network.send(epoch("honest", 0.01 * k))
+    words = "devices not admitted (too_many_devices; the last: 'made_up_199'): max_devices is 20"
+    network.wait_for("rsus", words, DiagnosticStatus.WARN)
+    assert len(odometry.wait_for(10)) >= 10
+    listed = {name for name, _ in graph.node.get_topic_names_and_types()}
+    of_strangers = {name.split("/")[1] for name in listed if name.startswith("/made_up_")}
+    assert 0 < len(of_strangers) < 20

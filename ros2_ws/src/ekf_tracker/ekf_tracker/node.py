@@ -11,6 +11,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStam
 from netpos.messages import topics
 from netpos.messages.values import RsuMeasurement as Measurement
 from netpos.tracking import Tracker, TrackOutput
+from netpos.tracking.admission import NOT_ALLOWED, TOO_MANY
 from netpos.tracking.settings import tracker_fact
 from netpos.tracking.validation import explanation
 from netpos.tracking.warm_up import warm_up, warm_up_anchors, warm_up_components
@@ -89,11 +90,15 @@ class EkfTrackerNode(EstimatingNode):
             measurement = CODEC.measurement_from_msg(message)
         if not self._tracker.concerns(measurement):
             return
-        if measurement.vue_id not in self._outputs and topics.is_vue_id(measurement.vue_id):
+        refused = self._add(measurement)
+        for vue_id in self._tracker.take_left():
+            self._remove_device(vue_id)
+        new = measurement.vue_id not in self._outputs and topics.is_vue_id(measurement.vue_id)
+        if new and refused not in (NOT_ALLOWED, TOO_MANY):
             self._add_device(measurement.vue_id)
-        self._add(measurement)
 
-    def _add(self, item: Any) -> None:
+    def _add(self, item: Any) -> str | None:
+        """Hand it to the tracker; the reason where it is refused."""
         reason = self._tracker.add(item)
         if reason is not None:
             source = ""
@@ -104,6 +109,7 @@ class EkfTrackerNode(EstimatingNode):
                 f"{item.vue_id}: refused a {type(item).__name__}: {reason}{source}",
                 throttle_duration_sec=2.0,
             )
+        return reason
 
     def _add_device(self, vue_id: str) -> None:
         def topic(name: str) -> str:

@@ -195,6 +195,17 @@ class EstimatingNode(Node):
             for kind, name in outputs
         )
 
+    def _remove_device(self, vue_id: str) -> None:
+        """Give back the topics of a device that is no longer tracked."""
+        for publisher in self._outputs.pop(vue_id, ()):
+            self.destroy_publisher(publisher)
+        mine = [s for s, _ in self._inputs if topics.split(s.topic_name)[0] == vue_id]
+        self._inputs = [entry for entry in self._inputs if entry[0] not in mine]
+        for subscription in mine:
+            self.destroy_subscription(subscription)
+        for told in (self._statuses, self._told_s, self._seen_ns):
+            told.pop(vue_id, None)
+
     def _publish(self, outputs: list[TrackOutput]) -> None:
         for output in outputs:
             self._publish_one(output)

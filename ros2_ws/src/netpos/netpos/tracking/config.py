@@ -3,6 +3,7 @@ here."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -251,12 +252,24 @@ class TrackerConfig:
         1e-4, 1e-12, 0.5, "probability with which the error may exceed the protection level"
     )
     network: str = described("", "the network whose RSUs count, one of several; empty: all")
+    max_devices: int = count(
+        200, "devices tracked at once; one that is silent or never sound makes room"
+    )
+    allowed_devices: str = described(
+        "", "regular expression that names of devices match as a whole; empty: any name"
+    )
 
     def __post_init__(self) -> None:
         check_fields(self)
         self._check_combination()
 
     def _check_combination(self) -> None:
+        try:
+            re.compile(self.allowed_devices)
+        except re.error as error:
+            raise ValueError(
+                f"allowed_devices {self.allowed_devices!r} is no regular expression: {error}"
+            ) from error
         if self.motion_model == "strapdown":
             self._check_strapdown()
         if self.backend == "filterpy" and self.filter not in ("ekf", "ukf"):

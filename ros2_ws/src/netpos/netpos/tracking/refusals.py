@@ -110,6 +110,10 @@ class Refusals:
             if door is not None:
                 door.refused.append(False)
 
+    def forget(self, vue_id: str) -> None:
+        """Of a device that is no longer tracked."""
+        self._devices.pop(vue_id, None)
+
     def refuse_description(self, rsu_id: str, fault: str) -> None:
         """Note that the description of an RSU is refused, and why."""
         if len(self._descriptions) < SOURCES_MAX:

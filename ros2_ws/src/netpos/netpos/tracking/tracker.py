@@ -22,6 +22,7 @@ from netpos.messages.values import (
     Velocity,
 )
 from netpos.tracking import diagnosis, validation
+from netpos.tracking.admission import Admission
 from netpos.tracking.clocks import Clocks, Stranger
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.diagnosis import Finding
@@ -72,6 +73,12 @@ class Tracker:
         self.refusals = Refusals()
         """What was refused at the door, by device and RSU."""
         self.enabled = True
+        self._admission = Admission(
+            self._config.max_devices,
+            self._config.allowed_devices,
+            round(1e9 * self._config.max_gap_s),
+        )
+        self._left: list[str] = []
 
     @property
     def config(self) -> TrackerConfig:
@@ -101,6 +108,9 @@ class Tracker:
         elif isinstance(item, ImuSample):
             return self._add_imu(item)
         reason = self._fault(item)
+        shut = self._admits(item, reason is None)
+        if shut is not None:
+            return shut
         if reason is None:
             sequencer = self._sequencers.get(item.vue_id) or self._sequencer(item.vue_id)
             reason = sequencer.add(item)
@@ -116,6 +126,22 @@ class Tracker:
         if reason is not None:
             self._refuse(item, reason)
         return reason
+
+    def _admits(self, item: Item | ImuSample, sound: bool) -> str | None:
+        """Why the device of an item is not tracked, None where it is."""
+        shut, leaves = self._admission.admit(item.vue_id, item.stamp_ns, sound=sound)
+        if leaves is not None:
+            for kept in (self._sequencers, self._tracks, self._clocks, self._untold):
+                kept.pop(leaves, None)
+            self._touched.discard(leaves)
+            self.refusals.forget(leaves)
+            self._left.append(leaves)
+        return shut
+
+    def take_left(self) -> list[str]:
+        """Devices that made room for others since the last call."""
+        left, self._left = self._left, []
+        return left
 
     def _refuse(self, item: Item | ImuSample, reason: str) -> None:
         """Count what is refused, and tell of it where nothing else is told of the device."""
@@ -142,6 +168,9 @@ class Tracker:
         if not self._config.use_imu:
             return None
         reason = validation.imu_fault(sample) if self.enabled else "disabled"
+        shut = self._admits(sample, reason is None)
+        if shut is not None:
+            return shut
         track = self.track(sample.vue_id)
         if reason is None:
             reason = track.imu.add(sample)
@@ -204,7 +233,9 @@ class Tracker:
         reports = self.rsu_reports(unheard_s)
         return [
             *devices,
-            diagnosis.of_network(self.rsu_count, descriptions, warnings),
+            diagnosis.of_network(
+                self.rsu_count, descriptions, [*warnings, *self._admission.warnings()]
+            ),
             *diagnosis.of_rsus(reports, refused.rsus(), descriptions, strangers, self._errors),
         ]
 
