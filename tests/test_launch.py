@@ -37,8 +37,11 @@ class OpaqueFunction(Entity):
 
 
 @pytest.fixture
-def launch_file(repository: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    path = repository / "ros2_ws/src/netpos_bringup/launch/netpos.launch.py"
+def launch_file(
+    repository: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> ModuleType:
+    name = getattr(request, "param", "netpos")
+    path = repository / f"ros2_ws/src/netpos_bringup/launch/{name}.launch.py"
     names = re.findall(
         r"^from (launch[\w.]*) import (?:\(([^)]*)\)|(.*))$", path.read_text(), re.MULTILINE
     )
@@ -59,7 +62,7 @@ def launch_file(repository: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType
 
 def nodes(launch_file: ModuleType, scenario: str, bag: str = "") -> Iterator[dict[str, Any]]:
     """What is started, with the launch's arguments in place."""
-    context = {"scenario": scenario, "bag": bag}
+    context = {"scenario": scenario, "bag": bag, "params": scenario}
     entities = list(launch_file.generate_launch_description().args[0])
     while entities:
         entity = entities.pop(0)
@@ -109,3 +112,19 @@ def test_launch_file_and_script_start_the_same_kinds_of_nodes(
         for node in nodes(launch_file, name, "a_bag")
     }
     assert by_launch == by_script
+
+
+@pytest.mark.parametrize("launch_file", ["tracker"], indirect=True)
+def test_the_tracker_alone(launch_file: ModuleType, repository: Path) -> None:
+    """With a file of parameters and without; the same nodes as the script."""
+    started = list(nodes(launch_file, "mine.yaml", "a_bag"))
+    assert {n["package"]: n.get("parameters") for n in started} == {
+        "ekf_tracker": ["mine.yaml"],
+        "netpos_bag": None,
+    }
+    (tracker,) = [n for n in nodes(launch_file, "") if n["package"] == "ekf_tracker"]
+    assert tracker["parameters"] == []
+    script = (repository / "scripts" / "run_tracker.sh").read_text()
+    assert set(re.findall(r"^ *start \S+ (\w+) (\w+)", script, re.MULTILINE)) == {
+        (n["package"], n["executable"]) for n in started
+    }

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 import netpos
-from netpos.cli import recordings, reproduce, results, rsus, runs, sweep
+from netpos.cli import params, recordings, reproduce, results, rsus, runs, sweep
 from netpos.cli.errors import Commands
 from netpos.cli.interrupts import INTERRUPTED, answer_ctrl_c, leave
 
@@ -36,6 +36,7 @@ for command in (
     results.bench,
     reproduce.reproduce,
     recordings.recover,
+    params.params,
 ):
     app.command()(command)
 app.add_typer(recordings.importers, name="import")

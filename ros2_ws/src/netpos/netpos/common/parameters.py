@@ -48,6 +48,25 @@ def choice(default: str, choices: tuple[str, ...], text: str) -> Any:
     return field(default=default, metadata={"choices": choices, "text": text})
 
 
+def described_fields(config: type[Any]) -> list[tuple[str, str, str]]:
+    """Name, range or choices, and meaning of each parameter of a configuration; no choices where
+    the meaning names them."""
+    found = []
+    for entry in fields(config):
+        about = entry.metadata
+        if "choices" in about:
+            named = all(choice in about["text"] for choice in about["choices"])
+            limits = "" if named else "one of " + ", ".join(about["choices"])
+        elif "low" in about:
+            limits = f"{about['low']:g} to {about['high']:g}"
+        elif isinstance(entry.default, bool):
+            limits = "true or false"
+        else:
+            limits = "text" if isinstance(entry.default, str) else "numbers"
+        found.append((entry.name, limits, about["text"]))
+    return found
+
+
 def check_fields(config: Any, prefix: str = "") -> None:
     """Raises ``ValueError`` naming, after ``prefix``, the first field out of its range or
     words."""
