@@ -1,7 +1,7 @@
-"""Start the tracker alone, for RSUs of your own: ``ros2 launch netpos_bringup tracker.launch.py``.
+"""Start the tracker alone, for your own RSUs: ``ros2 launch netpos_bringup tracker.launch.py``.
 
-``params:=FILE`` is what ``netpos params --dump FILE`` writes; with ``bag:=DIR`` all that is heard is
-recorded. scripts/run_tracker.sh does the same with `ros2 run` alone.
+``params:=FILE`` is what ``netpos params --dump FILE`` writes; with ``bag:=DIR`` all that is heard
+is recorded. scripts/run_tracker.sh does the same with `ros2 run` alone.
 """
 
 from launch import LaunchDescription
