@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from netpos.cli.results import refuse_recording
+
 _WIDTH = 78
 
 
@@ -39,6 +41,7 @@ def params(
                 shown = f"  ({limits})" if limits else ""
                 typer.echo(f"{name}: {values[name]!r}{shown}\n    {text}")
         return
+    refuse_recording(dump)
     if dump.exists():
         raise FileExistsError(f"{dump} exists; choose another name")
     dump.write_text(params_file(values, settings.vue_ids), encoding="utf-8")

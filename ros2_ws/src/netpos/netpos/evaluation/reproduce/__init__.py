@@ -1,6 +1,6 @@
 """Papers reproduced: ``reproduce`` runs one, ``PAPERS`` names them.
 
-``frame``        rows, result, worker processes, registry: what every paper plugs into
+``frame``        rows, result, registry: what every paper plugs into
 ``experiment``   one seed of a scenario through simulator, filter and bound
 ``monte_carlo``  many seeds of it
 ``rows``         filter rows of a whole simulated run
