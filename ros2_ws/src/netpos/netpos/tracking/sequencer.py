@@ -102,16 +102,18 @@ class _Delays:
     def __init__(self) -> None:
         self.count = 0
         """As many as have come of late where too few were announced; 0 where that is right."""
-        self._late_ns: dict[str, int] = {}
+        self._late: dict[str, tuple[int, int]] = {}  # how late, newest stamp; of late RSUs only
 
-    def arrived(self, source: str, behind_ns: int) -> None:
+    def arrived(self, source: str, stamp_ns: int, behind_ns: int) -> None:
         """A stamp came when the newest of all RSUs was ``behind_ns`` ahead of it."""
-        late = self._late_ns.get(source, 0)
-        self._late_ns[source] = max(behind_ns, late - (late - behind_ns) // _FORGETS)
+        late, _ = self._late.pop(source, (0, 0))
+        late = max(behind_ns, late - (late - behind_ns) // _FORGETS)
+        if late > 0:
+            self._late[source] = late, stamp_ns
 
-    def late_ns(self) -> int:
-        """How late the latest RSU is."""
-        return max(self._late_ns.values(), default=0)
+    def late_ns(self, since_ns: int) -> int:
+        """How late the latest RSU is, of those heard since a stamp."""
+        return max((late for late, at in self._late.values() if at >= since_ns), default=0)
 
     def announced_too_few(self, came: int) -> None:
         """One more came after an epoch that was complete as announced."""
@@ -191,7 +193,8 @@ class Sequencer:
         """Put an item into its epoch."""
         key = channel_and_source(item)
         if key[0] == RSU:
-            self._delays.arrived(key[1], max(self._watermark.get(RSU, stamp) - stamp, 0))
+            behind = max(self._watermark.get(RSU, stamp) - stamp, 0)
+            self._delays.arrived(key[1], stamp, behind)
         in_past = stamp <= self._released_ns and not isinstance(item, InitialPose)
         if in_past and self._history_ns > 0:
             self.mark(key[0], stamp)  # first heard of late, it is waited for from now on
@@ -330,7 +333,8 @@ class Sequencer:
             return True
         if self._needs_pose and POSE not in self._watermark:
             return False
-        reached = self._watermark.get(RSU, 0) > stamp + self._delays.late_ns()
+        late_ns = self._delays.late_ns(newest - self._live_ns)
+        reached = self._watermark.get(RSU, 0) > stamp + late_ns
         if not reached and not epoch.rsu_complete(self._delays.count):
             return False
         for channel, heard in self._watermark.items():

@@ -403,6 +403,10 @@ def releases(sequencer: Sequencer, arrivals: list[Item]) -> tuple[list[int], int
     return stamps, again
 
 
+def moved(items: list[Item], by_ms: int) -> list[Item]:
+    return [replace(item, stamp_ns=item.stamp_ns + by_ms * MS) for item in items]
+
+
 def by_arrival(late_ms: dict[str, int], expected: int, n: int = 200) -> list[Item]:
     """RSUs at 50 Hz, of each every message so much later than its stamp."""
     sent = [
@@ -425,15 +429,24 @@ def test_an_rsu_that_is_always_late_is_waited_for(expected: int, late_ms: int) -
 def test_one_that_becomes_punctual_is_waited_for_no_longer() -> None:
     sequencer = Sequencer(HOLD, history_ns=1000 * MS)
     releases(sequencer, by_arrival({"a": 0, "b": 100}, 0))
-    later = [
-        replace(item, stamp_ns=item.stamp_ns + 5000 * MS)
-        for item in by_arrival({"a": 0, "b": 1}, 0)
-    ]
+    later = moved(by_arrival({"a": 0, "b": 1}, 0), 5000)
     for item in later[:200]:
         sequencer.add(item)
         sequencer.release()
     newest = later[199].stamp_ns
     sequencer.add(later[200])
+    assert newest in [epoch.stamp_ns for epoch in sequencer.release()]
+
+
+def test_a_late_one_that_has_gone_is_waited_for_no_longer() -> None:
+    sequencer = Sequencer(HOLD, history_ns=1000 * MS)
+    releases(sequencer, by_arrival({"a": 0, "b": 100}, 0))
+    later = moved(by_arrival({"a": 0, "c": 1}, 0), 6000)
+    for item in later[:120]:
+        sequencer.add(item)
+        sequencer.release()
+    newest = later[119].stamp_ns
+    sequencer.add(later[120])
     assert newest in [epoch.stamp_ns for epoch in sequencer.release()]
 
 
@@ -451,9 +464,7 @@ def test_a_wrong_number_announced_is_noticed(expected: int, most: int) -> None:
 def test_of_too_few_announced_one_that_goes_away_is_waited_for_once() -> None:
     sequencer = Sequencer(HOLD, history_ns=1000 * MS)
     releases(sequencer, by_arrival({"a": 0, "b": 1, "c": 2}, 1, n=20))
-    left = [
-        replace(i, stamp_ns=i.stamp_ns + 400 * MS) for i in by_arrival({"a": 0, "b": 1}, 1, n=3)
-    ]
+    left = moved(by_arrival({"a": 0, "b": 1}, 1, n=3), 400)
     found = []
     for item in left:
         sequencer.add(item)
