@@ -1,9 +1,9 @@
-# netpos: make setup | demo | test | lint | baselines | bench | clean
+# netpos: make setup | demo | test | lint | docs | baselines | bench | clean
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 SHELL_FILES := env.sh $(wildcard scripts/*.sh) scripts/ros2_standin/ros2 $(wildcard docker/*.sh) .ci/run
 
-.PHONY: help setup demo test test-unit test-integration baselines lint bench clean
+.PHONY: help setup demo test test-unit test-integration baselines lint docs bench clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 20
@@ -25,6 +25,9 @@ test-integration: setup ## the real processes, started with ros2 run
 
 lint: setup ## ruff, mypy, shellcheck
 	@. ./env.sh && ruff check . && ruff format --check . && mypy && shellcheck -x $(SHELL_FILES)
+
+docs: setup ## the site of the documents into out/site; a warning is an error
+	@. ./env.sh && NO_MKDOCS_2_WARNING=1 mkdocs build --strict --quiet && echo "wrote out/site/index.html"
 
 baselines: setup ## rewrite the figures the tests hold scenarios and recordings to; read the diff before committing it
 	@. ./env.sh && python scripts/baselines.py

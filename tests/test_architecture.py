@@ -22,9 +22,10 @@ MAY_IMPORT: dict[str, set[str]] = {
     "radio": {"messages", "world"},
     "inertial": {"messages", "common", "world", "radio"},
     "filters": {"messages", "inertial"},
-    "bags": {"messages", "common", "inertial"},
+    "bags": {"messages", "common", "world", "inertial"},
     # The sensors say what a simulator sends.
     "scenario": {"messages", "common", "world", "radio", "inertial", "filters", "bags"},
+    "live": {"messages", "world", "bags"},
     "tracking": {"messages", "common", "filters", "inertial", "bags", "scenario"},
     "evaluation": {
         *("messages", "common", "world", "radio", "inertial", "filters", "bags", "scenario"),

@@ -21,6 +21,7 @@ setup(
         "netpos.bags": ["msg/*.msg"],
         "netpos.scenario": ["scenarios/*.yaml"],
         "netpos.evaluation.bench": ["*.c"],
+        "netpos.evaluation.faults": ["*.yaml"],
         "netpos.evaluation.report": ["*.html", "*.js"],
     },
     data_files=[
@@ -47,6 +48,7 @@ setup(
         "threadpoolctl>=3.4",
         "typer>=0.12",
         "vqf>=2.0",
+        "websockets>=13.0",
         "zstandard>=0.22",
     ],
     extras_require={

@@ -11,15 +11,19 @@ setup(
         ("share/netpos_bringup", ["package.xml"]),
         ("share/netpos_bringup/launch", sorted(glob("launch/*.launch.py"))),
         ("share/netpos_bringup/scenarios", sorted(glob("scenarios/*.yaml"))),
+        ("share/netpos_bringup/rviz", ["rviz/netpos.rviz"]),
+        ("share/netpos_bringup/foxglove", ["foxglove/netpos.json"]),
     ],
     install_requires=["setuptools"],
     zip_safe=True,
-    description="Scenarios, launch files, and the processes that measure the live node.",
+    description="Scenarios, launch files, the live view, the processes that measure the node.",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
             "bench_probe = netpos_bringup.bench_probe:main",
             "bench_relay = netpos_bringup.bench_relay:main",
+            "live = netpos_bringup.live:main",
+            "viz = netpos_bringup.viz:main",
         ],
     },
 )

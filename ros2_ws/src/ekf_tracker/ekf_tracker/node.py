@@ -12,6 +12,7 @@ from netpos.messages import topics
 from netpos.messages.values import RsuMeasurement as Measurement
 from netpos.tracking import Tracker, TrackOutput
 from netpos.tracking.admission import NOT_ALLOWED, TOO_MANY
+from netpos.tracking.rate_limit import RATE
 from netpos.tracking.settings import tracker_fact
 from netpos.tracking.validation import explanation
 from netpos.tracking.warm_up import warm_up, warm_up_anchors, warm_up_components
@@ -29,11 +30,13 @@ from netpos_node import (
 )
 from netpos_node.estimating import EstimatingNode
 from sensor_msgs.msg import Imu
+from std_srvs.srv import Trigger
 
 from ekf_tracker.conversions import diagnostics_to_msg, network_track_to_msg
 from ekf_tracker.parameters import declare_parameters
 
 _COPY_S = 2.0
+_TELL_S = 2.0  # a word in the log about what is refused
 
 
 class EkfTrackerNode(EstimatingNode):
@@ -46,10 +49,11 @@ class EkfTrackerNode(EstimatingNode):
         parameters = declare_parameters(self)
         if parameters.config.network:
             warm_up(parameters.config.network)
-        if parameters.config.manoeuvre_speed_sd_mps > 0.0:
+        if parameters.config.manoeuvre_sd_mps > 0.0:
             warm_up_components()
-        self._tracker = Tracker(parameters.config)
+        self._tracker = Tracker(parameters.config, parameters.settings.rsu_list)
         self._network = parameters.config.network
+        self._told_refusal_s = -_TELL_S
         self._poses: dict[str, tuple[Any, float]] = {}
         self._begin(self._tracker, publish_tf=parameters.publish_tf)
         self._diagnostics_pub = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
@@ -66,21 +70,32 @@ class EkfTrackerNode(EstimatingNode):
         extra = [self._track_pub] if self._track_pub is not None else []
         self._wait_for_subscribers(parameters.subscribers, extra)
         self._listen(RsuMeasurement, topics.RSU_MEASUREMENTS, self._on_measurement, raw=True)
-        say_of_run(self, topics.RUN_ESTIMATOR, tracker_fact(parameters.config))
+        facts = tracker_fact(parameters.config, parameters.settings.rsus)
+        say_of_run(self, topics.RUN_ESTIMATOR, facts)
+        self.create_service(Trigger, "~/accept_rsus", self._on_accept_rsus)
         self._be_ready()
         self.get_logger().info(f"tracking {', '.join(parameters.vue_ids)}")
+
+    def _on_accept_rsus(self, _: Any, response: Any) -> Any:
+        names = self._tracker.accept_rsus()
+        response.success = bool(names)
+        response.message = f"accepted: {', '.join(names)}" if names else "no RsuInfo is waiting"
+        return response
 
     def _on_rsu_info(self, msg: Any) -> None:
         try:
             info = CODEC.rsu_info_from_msg(msg)
             self._tracker.add_rsu(info)
         except ValueError as error:
-            self.get_logger().error(str(error))
+            self.get_logger().error(str(error), throttle_duration_sec=2.0)
             return
         if info.baseline_m > 0.0:
             warm_up_anchors()
 
     def _on_measurement(self, cdr: bytes) -> None:
+        source = CDR.source(cdr)
+        if source is not None and self._tracker.floods(*source):
+            return
         take_waiting(*self._inputs[0])  # descriptions of RSUs come first
         measurement = CDR.measurement(cdr)
         if measurement is None:
@@ -94,20 +109,20 @@ class EkfTrackerNode(EstimatingNode):
         for vue_id in self._tracker.take_left():
             self._remove_device(vue_id)
         new = measurement.vue_id not in self._outputs and topics.is_vue_id(measurement.vue_id)
-        if new and refused not in (NOT_ALLOWED, TOO_MANY):
+        if new and refused not in (NOT_ALLOWED, TOO_MANY, RATE):
             self._add_device(measurement.vue_id)
 
     def _add(self, item: Any) -> str | None:
         """Hand it to the tracker; the reason where it is refused."""
         reason = self._tracker.add(item)
-        if reason is not None:
+        if reason is not None and time.monotonic() - self._told_refusal_s >= _TELL_S:
+            self._told_refusal_s = time.monotonic()
             source = ""
             if isinstance(item, Measurement):
                 why = explanation(item, reason)
                 source = f", from {item.rsu_id}" + (f": {why}" if why else "")
             self.get_logger().warning(
-                f"{item.vue_id}: refused a {type(item).__name__}: {reason}{source}",
-                throttle_duration_sec=2.0,
+                f"{item.vue_id}: refused a {type(item).__name__}: {reason}{source}"
             )
         return reason
 

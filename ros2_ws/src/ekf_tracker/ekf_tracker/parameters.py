@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 from netpos.messages.topics import is_vue_id
 from netpos.tracking import TrackerConfig
-from netpos.tracking.settings import settings_from
+from netpos.tracking.settings import TrackerSettings, list_of, settings_from
 from netpos_node import declare, declare_config
 from rclpy.node import Node
 
@@ -16,6 +16,7 @@ class TrackerParameters:
     """Everything the node reads at start."""
 
     config: TrackerConfig
+    settings: TrackerSettings
     vue_ids: tuple[str, ...]
     publish_tf: bool
     subscribers: int
@@ -36,8 +37,12 @@ def declare_parameters(node: Node) -> TrackerParameters:
         raise ValueError(
             f"network: {config.network!r} is no name of a network; use letters, digits and _"
         )
+    text = "YAML or CSV file with the network's own RSUs; default: the list of the bag, if any"
+    rsus = list_of(declare(node, "rsus_file", "", text)) or settings.rsus
+    settings = replace(settings, rsus=rsus)
     text = "publish map -> base_link on /tf; a tracker of one network among several never does"
     return TrackerParameters(
+        settings=settings,
         vue_ids=vue_ids,
         publish_tf=declare(node, "publish_tf", True, text) and not config.network,
         subscribers=declare(

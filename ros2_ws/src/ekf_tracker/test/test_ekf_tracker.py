@@ -16,6 +16,7 @@ from netpos.messages.values import (
     Field,
     ImuSample,
     InitialPose,
+    RsuInfo,
     TrackState,
     Velocity,
 )
@@ -234,6 +235,43 @@ def test_reset_service(make: Any) -> None:
     assert status.messages[-1].state == TrackState.WAITING
     assert len(odometry.messages) == 3
     assert node._tracker.rsu_count == 3
+
+
+def test_accept_rsus_service(make: Any) -> None:
+    """An RSU that says it has moved is refused until an operator accepts it."""
+    node = make()
+    odometry, *_ = keep(node)
+    know_rsus(node)
+    drive(node, range(10))
+    for name, (x, y) in PLACES.items():
+        info = RsuInfo(rsu_id=name, position=np.array([x + 50.0, y, 0.0]))
+        arrive(node, "/rsu/info", CODEC.rsu_info_to_msg(info))
+    drive(node, range(10, 20))
+    assert odometry.messages[-1].pose.pose.position.x == pytest.approx(15.2, abs=0.5)
+    response = node._on_accept_rsus(Trigger.Request(), Trigger.Response())
+    assert (response.success, response.message) == (True, "accepted: a, b, c")
+    node._on_reset(Trigger.Request(), Trigger.Response())
+    drive(node, range(20, 30))
+    assert odometry.messages[-1].pose.pose.position.x == pytest.approx(73.2, abs=0.5)
+    response = node._on_accept_rsus(Trigger.Request(), Trigger.Response())
+    assert (response.success, response.message) == (False, "no RsuInfo is waiting")
+
+
+def test_rsus_file(make: Any, tmp_path: Path) -> None:
+    """Listed RSUs are known without an RsuInfo; a file that is missing is named."""
+    file = tmp_path / "rsus.yaml"
+    file.write_text(f"rsus: {{{', '.join(f'{k}: [{x}, {y}]' for k, (x, y) in PLACES.items())}}}")
+    node = make(trust="listed", rsus_file=str(file))
+    odometry, *_ = keep(node)
+    stranger = RsuInfo(rsu_id="x", position=np.zeros(3))
+    arrive(node, "/rsu/info", CODEC.rsu_info_to_msg(stranger))
+    drive(node, range(10))
+    assert odometry.messages[-1].pose.pose.position.x == pytest.approx(7.2, abs=0.5)
+    assert node._tracker.rsu_count == 3
+    with pytest.raises(ValueError, match="set rsus_file"):
+        make(trust="listed")
+    with pytest.raises(ValueError, match="does not exist"):
+        make(rsus_file=str(tmp_path / "none.yaml"))
 
 
 def test_enable_service(make: Any) -> None:

@@ -30,6 +30,7 @@ class RecordConfig:
     topics: tuple[str, ...] = ()  # empty: all
     log_time: LogTime = LogTime.AUTO
     metadata: tuple[str, ...] = ()  # KEY=VALUE, kept in the bag
+    min_free_mb: float = 100.0  # free on the disk: with less the recording ends
 
     def __post_init__(self) -> None:
         if str(self.output) in ("", "."):
@@ -39,6 +40,8 @@ class RecordConfig:
                 f"{self.output} exists and is never overwritten; choose another --output"
             )
         _require_absolute(self.topics)
+        if not 0.0 <= self.min_free_mb < math.inf:
+            raise ValueError(f"--min-free-mb must be >= 0, got {self.min_free_mb}")
         for item in self.metadata:
             if not item.partition("=")[1]:
                 raise ValueError(f"--metadata {item!r} is not KEY=VALUE")
@@ -104,6 +107,9 @@ def record_flags(arguments: Sequence[str]) -> dict[str, Any]:
         help="auto: /clock where one is published, else system time",
     )
     parser.add_argument("--metadata", nargs="+", help="KEY=VALUE pairs kept in the bag")
+    parser.add_argument(
+        "--min-free-mb", type=float, help="end the recording when the disk has less room (100)"
+    )
     flags = vars(parser.parse_args(arguments))
     if flags.pop("all", False):
         if "topics" in flags:

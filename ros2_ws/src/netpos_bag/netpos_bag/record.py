@@ -15,11 +15,13 @@ from typing import Any
 
 import rclpy
 import yaml
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from netpos import __version__
 from netpos.bags import LOST_METADATA, BagError, BagWriter
-from netpos.messages.topics import CLOCK, RUN_TOPICS
+from netpos.messages.topics import CLOCK, DIAGNOSTICS, RUN_TOPICS
 from netpos_node import init, message_class, waiting
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
@@ -29,10 +31,12 @@ from netpos_bag.conversions import clock_ns, profile_to_bag, profile_to_record, 
 from netpos_bag.losses import Losses
 from netpos_bag.parameters import RecordConfig, record_config, record_flags
 from netpos_bag.recording import Recording
+from netpos_bag.room import Level, Room
 
 _TAKE_S = 0.01
 _LOOK_S = 0.05
 _FLUSH_S = 0.25
+_DISK_S = 0.5
 _WARN_S = 2.0
 _DRAIN_S = 0.3  # after the signal to stop, what is on its way still arrives
 
@@ -45,17 +49,23 @@ class RecordNode(Node):
         self.config: RecordConfig = record_config(self, flags)
         pairs = (item.partition("=") for item in self.config.metadata)
         run = {"netpos_version": __version__} | {key: value for key, _, value in pairs}
+        parent = next(p for p in self.config.output.absolute().parents if p.exists())
+        self.room = Room(parent, self.config.min_free_mb)
+        if self.room.look(time.monotonic()) is Level.ERROR:
+            raise ValueError(self.room.sentence)
         self.writer = BagWriter(self.config.output, metadata=run)
         self.recording = Recording(self.writer, self.config.log_time)
         self._topics: dict[str, _Topic] = {}
         self._left_out: set[str] = set()
-        self._due_s = dict.fromkeys((self._look_for_topics, self._tick), 0.0)
+        self._due_s = dict.fromkeys((self._look_for_topics, self._tick, self._look_at_disk), 0.0)
+        self._diagnostics: Publisher | None = None
 
     def run(self, stopping: list[int], seconds: float = float("inf")) -> None:
-        """Record until ``stopping`` holds a signal, at most ``seconds``."""
+        """Record until ``stopping`` holds a signal or the disk is full, at most ``seconds``."""
         end_s = time.monotonic() + seconds
-        while not stopping and (now_s := time.monotonic()) < end_s:
-            for task, period_s in ((self._look_for_topics, _LOOK_S), (self._tick, _FLUSH_S)):
+        periods_s = (_LOOK_S, _FLUSH_S, _DISK_S)
+        while not stopping and not self.full and (now_s := time.monotonic()) < end_s:
+            for task, period_s in zip(self._due_s, periods_s, strict=True):
                 if now_s >= self._due_s[task]:
                     self._due_s[task] = now_s + period_s
                     task()
@@ -139,13 +149,42 @@ class RecordNode(Node):
             )
 
     @property
+    def full(self) -> bool:
+        """Whether so little room is left that the recording has to end."""
+        return self.room.level is Level.ERROR
+
+    def _look_at_disk(self) -> None:
+        """Warn before the disk is full, in the log and on /diagnostics."""
+        before = self.room.level
+        level = self.room.look(time.monotonic())
+        if level is Level.OK and before is Level.OK:
+            return
+        if level is not Level.OK:
+            self.get_logger().warning(self.room.sentence, throttle_duration_sec=10.0)
+        if self._diagnostics is None:
+            self._diagnostics = self.create_publisher(DiagnosticArray, DIAGNOSTICS, 10)
+        said = DiagnosticArray()
+        said.header.stamp = self.get_clock().now().to_msg()
+        said.status.append(
+            DiagnosticStatus(
+                level=bytes([level]),
+                name="netpos_record: disk",
+                message=self.room.sentence or "room again",
+                hardware_id=str(self.config.output),
+            )
+        )
+        self._diagnostics.publish(said)
+
+    @property
     def lost(self) -> dict[str, int]:
         """Messages that were published and did not arrive, by topic."""
         topics = sorted(self._topics.values(), key=lambda topic: topic.name)
         return {topic.name: topic.losses.count for topic in topics if topic.losses.count}
 
     def close(self) -> None:
-        """Note what was lost, and finish the bag."""
+        """Note what was lost, and finish the bag, unless it could not be written any more."""
+        if self.writer.closed:
+            return
         self.writer.note(LOST_METADATA, yaml.safe_dump(self.lost))
         self.recording.close()
 
@@ -183,7 +222,8 @@ class _Topic:
 
 
 def main() -> None:
-    """Record until SIGINT or SIGTERM; exit 0, or 2 where the options are wrong."""
+    """Record until SIGINT or SIGTERM; exit 0, 1 where the disk is full, 2 where the options are
+    wrong."""
     stopping: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: stopping.append(number))
@@ -197,12 +237,21 @@ def main() -> None:
         sys.exit(2)
     try:
         print(f"recording to {node.config.output}", flush=True)
-        node.run(stopping)
-        node.run([], _DRAIN_S)
+        try:
+            node.run(stopping)
+            node.run([], _DRAIN_S)
+        finally:
+            node.close()
+    except OSError as error:
+        sys.exit(
+            f"record: {error.filename or node.config.output}: {error.strerror or error}; the "
+            f"recording ended. Make room, then: netpos recover {node.config.output}"
+        )
     finally:
-        node.close()
         rclpy.try_shutdown()
     print(node.report(), flush=True)
+    if node.full:
+        sys.exit(f"record: the recording ended and is whole: {node.room.sentence}")
 
 
 if __name__ == "__main__":

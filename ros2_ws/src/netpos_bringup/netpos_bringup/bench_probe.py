@@ -2,6 +2,7 @@
 
 ``latency``  measurement to odometry, tracker and relay in turns
 ``load``     many devices: messages handled, processor time, lag, memory
+``flood``    the same while one RSU sends far more than it measures
 ``ready``    time from the start of the process until it takes measurements, and to the first
              odometry
 """
@@ -37,7 +38,7 @@ from rclpy.subscription import Subscription
 
 from netpos_bringup import bench_relay
 from netpos_bringup.bench_process import Measured
-from netpos_bringup.bench_traffic import PERIOD_S, RSUS, Device
+from netpos_bringup.bench_traffic import FLOODER, PERIOD_S, RSUS, Device
 
 _START_S = 60.0
 _ANSWER_S = 1.0
@@ -183,8 +184,11 @@ def latency(tracker: str, epochs: int) -> dict[str, Any]:
 # load
 
 
-def load(tracker: str, count: int, seconds: float, idle_s: float) -> dict[str, Any]:
-    """Feed ``count`` devices at 10 Hz with two RSUs each in real time."""
+def load(
+    tracker: str, count: int, seconds: float, idle_s: float, flood_hz: float = 0.0
+) -> dict[str, Any]:
+    """Feed ``count`` devices at 10 Hz with two RSUs each in real time; a third RSU repeats itself
+    ``flood_hz`` times a second."""
     devices = [Device.draw(f"vue_{i + 1}", i) for i in range(count)]
     epochs = round(seconds / PERIOD_S)
     probe = Probe()
@@ -213,8 +217,10 @@ def load(tracker: str, count: int, seconds: float, idle_s: float) -> dict[str, A
             pub.publish(device.pose(0))
         time.sleep(_SETTLE_S)
         traffic = Traffic(probe, script, answers)
-        cost = _cost(process, traffic, seconds, idle_s)
+        with flooded(probe, flood_hz):
+            cost = _cost(process, traffic, seconds, idle_s)
         handled = handled_messages(diagnostics, 2 * len(script))
+        refused = refused_of(diagnostics, FLOODER) if flood_hz else 0
         memory = process.memory_mb()
     return {
         "devices": count,
@@ -226,8 +232,41 @@ def load(tracker: str, count: int, seconds: float, idle_s: float) -> dict[str, A
         "fewest_odometry": min(traffic.received),
         **cost,
         **traffic.lags(),
+        "flood_hz": flood_hz,
+        "refused_of_flood": refused,
         "memory_mb": memory,
     }
+
+
+@contextmanager
+def flooded(probe: Probe, rate_hz: float) -> Iterator[None]:
+    """While the block runs another process sends ``rate_hz`` messages a second; 0: nobody does."""
+    if not rate_hz:
+        yield
+        return
+    topic = probe.tracker.topic_name
+    publishers = probe.node.count_publishers(topic)
+    code = "from netpos_bringup.bench_flood import main; main()"
+    with started([sys.executable, "-c", code, f"{rate_hz:g}"]) as processes:
+        wait_for(lambda: probe.node.count_publishers(topic) > publishers, "the flooder", processes)
+        yield
+
+
+def refused_of(diagnostics: Subscription, rsu_id: str) -> int:
+    """How many measurements of an RSU the newest diagnostics say were refused; 0 where it is not
+    named."""
+    refused, end = 0, time.monotonic() + 1.5
+    while time.monotonic() < end:
+        for message in taken(diagnostics):
+            refused = sum(
+                int(value.value)
+                for status in deserialize_message(message, DiagnosticArray).status
+                if status.hardware_id == rsu_id
+                for value in status.values
+                if value.key.startswith("refused")
+            )
+        time.sleep(0.05)
+    return refused
 
 
 def _cost(process: Measured, traffic: Traffic, seconds: float, idle_s: float) -> dict[str, float]:
@@ -277,6 +316,9 @@ class Traffic:
                     next_poll = time.perf_counter() - start + _POLL_S
                 else:
                     time.sleep(min(wait, 0.0005))
+            if start + next_poll <= time.perf_counter():  # also when it is late
+                self._hear()
+                next_poll = time.perf_counter() - start + _POLL_S
             self._late_s = max(self._late_s, -wait)
             publish(messages[0])
             self._sent_at[device, stamp_of(messages[1])] = time.perf_counter()
@@ -376,6 +418,10 @@ def main() -> int:
     loading.add_argument("--devices", type=int, default=100)
     loading.add_argument("--seconds", type=float, default=20.0)
     loading.add_argument("--idle", type=float, default=2.0)
+    flooding_ = commands.add_parser("flood")
+    flooding_.add_argument("--devices", type=int, default=10)
+    flooding_.add_argument("--seconds", type=float, default=10.0)
+    flooding_.add_argument("--rate", type=float, default=20_000.0)
     commands.add_parser("ready").add_argument("--starts", type=int, default=3)
     given = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # ends what it has started
@@ -386,6 +432,8 @@ def main() -> int:
                 figures = latency(given.tracker, given.epochs)
             case "load":
                 figures = load(given.tracker, given.devices, given.seconds, given.idle)
+            case "flood":
+                figures = load(given.tracker, given.devices, given.seconds, 2.0, given.rate)
             case _:
                 figures = ready(given.tracker, given.starts)
     finally:

@@ -17,10 +17,25 @@ RSUS = (
     RsuInfo(rsu_id="west", position=np.array([0.0, 0.0, 10.0])),
     RsuInfo(rsu_id="east", position=np.array([120.0, 40.0, 10.0])),
 )
+"""The honest ones."""
+FLOODER = "flooder"
 _SPEED_MPS = 5.0
 _AZIMUTH_SD = math.radians(2.0)
 _RANGE_SD_M = 1.0
 _SPEED_OF_LIGHT_MPS = 299_792_458.0
+
+
+def flooding(time_s: float) -> bytes:
+    """What the flooder sends of the first device at a time; it never told where it is."""
+    measurement = RsuMeasurement(
+        stamp_ns=START_NS + round(time_s * 1e9),
+        rsu_id=FLOODER,
+        vue_id="vue_1",
+        fields=Field.RANGE,
+        range_m=10.0,
+        range_var=1.0,
+    )
+    return bytes(serialize_message(CODEC.measurement_to_msg(measurement)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,9 +10,11 @@ from typing import Any
 import yaml
 import zstandard
 from mcap.data_stream import RecordBuilder
-from mcap.records import Channel, Schema
+from mcap.records import Channel, Metadata, Schema
 from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import dump_qos_v9
+
+from netpos.common.files import write_text
 
 VERSION = 9
 ROS_DISTRO = "jazzy"
@@ -21,6 +23,7 @@ LIBRARY = "netpos"  # first word of the library in the MCAP header
 RUN_RECORD = "netpos"  # MCAP metadata record of the run; custom_data in metadata.yaml
 LOST_METADATA = "lost"  # messages that a recorder missed, by topic, as YAML
 DEFINITION_ATTACHMENT = "netpos/definition"  # schema and channel record of one topic
+RUN_ATTACHMENT = "netpos/run"  # the same as RUN_RECORD, under the checksum of an attachment
 ROSBAG2_RECORD = "rosbag2"  # MCAP metadata record in which rosbag2 repeats metadata.yaml
 
 
@@ -57,6 +60,13 @@ def definition_records(topic: Topic, schema_id: int) -> bytes:
         metadata=channel_metadata(topic),
         schema_id=schema_id,
     ).write(records)
+    return bytes(zstandard.compress(records.end()))
+
+
+def run_records(run: Mapping[str, str]) -> bytes:
+    """Metadata record of the run, zstd-compressed."""
+    records = RecordBuilder()
+    Metadata(name=RUN_RECORD, metadata=dict(run)).write(records)
     return bytes(zstandard.compress(records.end()))
 
 
@@ -122,6 +132,4 @@ def dump(information: Mapping[str, Any]) -> str:
 
 def write_metadata(folder: Path, information: Mapping[str, Any]) -> None:
     """Write metadata.yaml in one step: it exists only when it is whole."""
-    draft = folder / f"{METADATA_FILE}.tmp"
-    draft.write_text(dump({"rosbag2_bagfile_information": information}), encoding="utf-8")
-    draft.replace(folder / METADATA_FILE)
+    write_text(folder / METADATA_FILE, dump({"rosbag2_bagfile_information": information}))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+import struct
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,11 +17,12 @@ from rosbags.serde import SerdeError
 
 from netpos.bags import layout
 from netpos.bags.chunks import Found, messages_in_order
-from netpos.bags.errors import BagError
-from netpos.bags.scan import summary_is_sound
+from netpos.bags.errors import BagError, require_file
+from netpos.bags.run_facts import run_of_description, run_of_records, texts
+from netpos.bags.scan import run_of_attachments, summary_is_sound
 from netpos.bags.single_file import open_single_file
 from netpos.bags.types import require_type, store_of_definition
-from netpos.common.yaml_text import YamlError, check_limits
+from netpos.common.yaml_text import YamlError, check_limits, read_text
 from netpos.messages.topics import RUN_TOPICS
 
 
@@ -36,10 +38,6 @@ class TopicInfo:
 
 def _info(type_name: str, count: int, qos: list[Qos], definition: str) -> TopicInfo:
     return TopicInfo(type_name=type_name, count=count, qos=qos, definition=definition)
-
-
-def _texts(custom: Mapping[Any, Any]) -> dict[str, str]:
-    return {str(key): str(value) for key, value in custom.items()}
 
 
 class BagEntry:
@@ -81,23 +79,35 @@ class BagReader:
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
+        self._described: dict[str, str] | None = None
         self._check_path()
         self._file = open_single_file(self.path) if self.path.is_dir() else None
+        if self._file is None:
+            self._reader = self._open()
+        try:
+            self._describe()
+        except BagError:
+            self.close()
+            raise
+        except Exception as error:  # damaged bytes raise nearly anything
+            self.close()
+            raise self._damaged(error) from error
+
+    def _describe(self) -> None:
         if self._file is not None:
             self.topics = {name: _info(*told) for name, told in self._file.topics.items()}
             self.start_ns, self.end_ns = self._file.start_ns, self._file.end_ns
-            self.metadata = _texts(self._file.custom)
+            self.metadata = texts(self._file.custom)
+            self._compare([self._file.file])
             return
-        self._reader = self._open()
-        try:
-            self.topics = self._describe_topics()
-        except BaseException:
-            self._reader.close()
-            raise
+        self.topics = self._describe_topics()
         empty = self._reader.message_count == 0
         self.start_ns = 0 if empty else int(self._reader.start_time)
         self.end_ns = 0 if empty else int(self._reader.end_time) - 1
         self.metadata = self._run_metadata()
+        storages = getattr(self._reader.storage, "storages", [self._reader.storage])
+        paths = [Path(getattr(storage, "path", "")) for storage in storages]
+        self._compare([path for path in paths if path.suffix == ".mcap"])
 
     def __enter__(self) -> Self:
         return self
@@ -141,9 +151,11 @@ class BagReader:
         if not self.path.is_dir():
             return
         try:
-            check_limits(file.read_text(encoding="utf-8"))
-        except (YamlError, UnicodeDecodeError) as error:
+            text = read_text(file)
+            check_limits(text)
+        except YamlError as error:
             raise self._damaged(f"{layout.METADATA_FILE}: {error}") from error
+        self._described = run_of_description(text)
 
     def _open(self) -> Reader:
         try:
@@ -152,6 +164,8 @@ class BagReader:
             raise BagError(
                 f"{self.path} is not a bag ({error}); give a bag folder or an .mcap file"
             ) from error
+        except Exception as error:  # as below
+            raise self._damaged(error) from error
         try:
             reader.open()
         except Exception as error:  # damaged bytes raise nearly anything
@@ -162,8 +176,33 @@ class BagReader:
         """rosbags checks the chunks but not the index that names their topics and types."""
         files = sorted(self.path.glob("*.mcap")) if self.path.is_dir() else [self.path]
         for file in files:
+            require_file(file)
             if file.suffix == ".mcap" and not summary_is_sound(file):
                 raise self._damaged(f"{file.name} has no sound index")
+
+    def _compare(self, files: list[Path]) -> None:
+        """metadata.yaml and the records of the file have no checksum: all copies must agree."""
+        for file in files:
+            with file.open("rb") as stream:
+                reader = make_reader(stream)
+                index = reader.get_summary()
+                ours = reader.get_header().library.startswith(layout.LIBRARY)
+                records: dict[str, dict[str, str]] = {}
+                for record in reader.iter_metadata() if ours else ():
+                    records.setdefault(record.name, {}).update(record.metadata)
+                known = index.attachment_indexes if index is not None and ours else ()
+                attached = run_of_attachments(stream, known)
+            copies = [*([attached] if attached else []), *run_of_records(records)]
+            if ours and self._described is not None:
+                copies.append(self._described)
+            if len(files) == 1 and any(copy != copies[0] for copy in copies):
+                raise self._damaged("its copies of the run's metadata differ")
+            for channel in index.channels.values() if index is not None else ():
+                told, schema = self.topics.get(channel.topic), index.schemas[channel.schema_id]
+                if told is None or told.type_name != schema.name:
+                    raise self._damaged(
+                        f"{layout.METADATA_FILE} does not know {channel.topic} as {schema.name}"
+                    )
 
     def _describe_topics(self) -> dict[str, TopicInfo]:
         topics: dict[str, TopicInfo] = {}
@@ -189,7 +228,7 @@ class BagReader:
 
     def _run_metadata(self) -> dict[str, str]:
         if self.path.is_dir():
-            return _texts(getattr(self._reader.storage.metadata, "custom", None) or {})
+            return texts(getattr(self._reader.storage.metadata, "custom", None) or {})
         with self.path.open("rb") as stream:
             records = [
                 record.metadata
@@ -223,6 +262,10 @@ class BagReader:
             return store.deserialize_cdr(cdr, info.type_name)
         except SerdeError as error:
             raise BagError(f"{self.path}: {topic}: {error}; was its type changed?") from error
+        except (ValueError, KeyError, IndexError, struct.error, MemoryError) as error:
+            raise BagError(
+                f"{self.path}: {topic}: {len(cdr)} bytes are no {info.type_name} ({error})"
+            ) from error
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagEntry]:
         """Messages of ``topics`` (default: all) in log-time order, ties in the order of recording.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from netpos.bags.importers.own.rsus import read_rsus
 from netpos.bags.reader import BagReader
 from netpos.bags.types import codec
 from netpos.bags.writer import whole_bag
+from netpos.common.files import write_text
 from netpos.messages.topics import RSU_INFO, RSU_LEARNED, is_tracker_output
 from netpos.messages.values import RsuErrors, RsuInfo
 
@@ -66,9 +68,14 @@ def save_rsus(bag: Path, file: Path) -> list[RsuInfo]:
         entry = yaml.safe_dump(_entry(info), default_flow_style=True, width=10_000).strip()
         name = yaml.safe_dump(info.rsu_id).splitlines()[0]  # in quotes where it must be
         lines.append(f"  {name}: {entry}")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(file, "\n".join(lines) + "\n")
     return found
+
+
+def rsus_text(infos: Iterable[RsuInfo]) -> str:
+    """RSUs as the YAML of such a file, every digit kept."""
+    entries = {info.rsu_id: _entry(info, None) for info in infos}
+    return str(yaml.safe_dump({"rsus": entries}, width=10_000))
 
 
 def load_rsus(file: Path, bag: Path, out: Path) -> list[str]:
@@ -123,25 +130,25 @@ def _declaring(info: RsuInfo, errors: RsuErrors) -> RsuInfo:
     return replace(info, **changes)  # type: ignore[arg-type]
 
 
-def _entry(info: RsuInfo) -> dict[str, Any]:
-    """The fields that are not as by default, as plain values."""
+def _entry(info: RsuInfo, digits: int | None = _DIGITS) -> dict[str, Any]:
+    """The fields that are not as by default, as plain values; ``digits`` None: unrounded."""
     plain = RsuInfo(rsu_id=info.rsu_id, position=info.position)
-    found: dict[str, Any] = {"position": _rounded(info.position)}
+    found: dict[str, Any] = {"position": _rounded(info.position, digits)}
     for entry in fields(RsuInfo):
         value, default = getattr(info, entry.name), getattr(plain, entry.name)
         if entry.name in ("rsu_id", "position", "stamp_ns", "frame_id"):
             continue
         if isinstance(value, np.ndarray):
             if not np.array_equal(value, default):
-                found[entry.name] = _rounded(value, 9)
+                found[entry.name] = _rounded(value, digits and 9)
         elif value != default:
-            found[entry.name] = _rounded(value) if isinstance(value, float) else value
+            found[entry.name] = _rounded(value, digits) if isinstance(value, float) else value
     if "angle_convention" in found:
         found["angle_convention"] = info.angle_convention.name
     return found
 
 
-def _rounded(value: Any, digits: int = _DIGITS) -> Any:
+def _rounded(value: Any, digits: int | None) -> Any:
     if isinstance(value, np.ndarray):
-        return [round(float(v), digits) for v in value]
-    return round(float(value), digits)
+        return [_rounded(v, digits) for v in value]
+    return float(value) if digits is None else round(float(value), digits)

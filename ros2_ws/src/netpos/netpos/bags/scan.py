@@ -1,19 +1,23 @@
 """Walk the records of an MCAP file that may be cut off or damaged.
 
-A record counts only if encoding it again gives the same bytes; a chunk only if its CRC is right as
-well. Where that fails, the walk goes on at the next place that holds a sound chunk.
+A record counts only if encoding it again gives the same bytes; a chunk or an attachment only if
+its CRC is right as well. Where that fails, the walk goes on at the next place that holds a sound
+chunk or attachment.
+
+A file that makes checksums is held to them: what none covers counts as lost.
 """
 
 from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
@@ -38,9 +42,11 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
-from netpos.bags.layout import DEFINITION_ATTACHMENT, LIBRARY
+from netpos.bags.layout import DEFINITION_ATTACHMENT, LIBRARY, RUN_ATTACHMENT, RUN_RECORD
 
 _HEAD = struct.Struct("<BQ")
+RECORD_MAX = 2**28  # bytes; chunks and messages are far smaller, damaged lengths are not
+_ATTACHMENTS = (DEFINITION_ATTACHMENT, RUN_ATTACHMENT)
 _KINDS: dict[int, Any] = {
     Opcode.HEADER: Header,
     Opcode.FOOTER: Footer,
@@ -61,19 +67,25 @@ _KINDS: dict[int, Any] = {
 
 @dataclass(slots=True)
 class Scan:
-    """What a walk finds; sizes in bytes."""
+    """What a walk finds; sizes in bytes. Chunks are found again in ``data``, which stays open."""
 
-    data: bytes
+    data: bytes | mmap
     schemas: dict[int, Any] = field(default_factory=dict)
     channels: dict[int, Any] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    blocks: list[tuple[Any, bool]] = field(default_factory=list)  # Chunk or Message, verified
+    proven_run: dict[str, str] = field(default_factory=dict)  # of the run, under a checksum
+    blocks: list[tuple[Any, bool]] = field(default_factory=list)  # place or Message, verified
     loose: list[Any] = field(default_factory=list)  # messages outside of chunks
     library: str = LIBRARY  # who wrote the file; ours until its header says otherwise
     complete: bool = False  # footer and closing magic are in place
     damaged_places: int = 0
     bytes_dropped: int = 0
     _certain: set[tuple[type, int]] = field(default_factory=set)
+
+    @property
+    def checked(self) -> bool:
+        """Whether the file makes checksums: something in it is under a right one."""
+        return bool(self._certain) or any(verified for _, verified in self.blocks)
 
     def messages(self) -> Iterator[tuple[Any, bool]]:
         """(mcap Message, covered by a checksum) in the order of the file.
@@ -87,7 +99,7 @@ class Scan:
             if isinstance(block, Message):
                 yield block, verified
                 continue
-            for record in records_inside(unpack(block)):
+            for record in records_inside(unpack(_record(self.data, Opcode.CHUNK, *block))):
                 if isinstance(record, Message):
                     yield record, verified
 
@@ -100,9 +112,26 @@ class Scan:
         if verified:
             self._certain.add(key)
 
+    def is_certain(self, channel: Any) -> bool:
+        """Whether a checksum covers a channel and its schema."""
+        return {(Channel, channel.id), (Schema, channel.schema_id)} <= self._certain
 
-def _record(data: bytes, opcode: int, start: int, length: int) -> Any:
+
+@contextmanager
+def content_of(file: Path) -> Iterator[bytes | mmap]:
+    """The bytes of a file, which may be larger than the memory."""
+    with file.open("rb") as stream:
+        if not file.stat().st_size:
+            yield b""
+            return
+        with mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
+            yield data
+
+
+def _record(data: bytes | mmap, opcode: int, start: int, length: int) -> Any:
     """The record whose body is ``data[start : start + length]``, or None where it is not sound."""
+    if length > RECORD_MAX:
+        return None
     body = data[start : start + length]
     stream = ReadDataStream(BytesIO(body))
     try:
@@ -124,17 +153,14 @@ def unpack(chunk: Any) -> bytes:
 
     Raises
     ------
-    ValueError  unknown compression, broken stream, wrong size or wrong CRC (0: the chunk has none)
+    ValueError  unknown compression, broken stream, wrong or absurd size, or wrong CRC (0: the
+        chunk has none)
     """
+    size = chunk.uncompressed_size
+    if size > RECORD_MAX:
+        raise ValueError(f"chunk promises {size} bytes, at most {RECORD_MAX} are read")
     try:
-        if chunk.compression == "zstd":
-            raw = zstandard.ZstdDecompressor().decompressobj().decompress(chunk.data)
-        elif chunk.compression == "lz4":
-            raw = lz4.frame.decompress(chunk.data)
-        elif chunk.compression == "":
-            raw = chunk.data
-        else:
-            raise ValueError(f"unknown compression {chunk.compression!r}")
+        raw = _uncompressed(chunk, size + 1)  # a byte more than promised would be one too many
     except Exception as error:  # damaged bytes raise nearly anything
         raise ValueError(f"chunk cannot be uncompressed: {error}") from error
     if len(raw) != chunk.uncompressed_size:
@@ -142,6 +168,18 @@ def unpack(chunk: Any) -> bytes:
     if chunk.uncompressed_crc and zlib.crc32(raw) != chunk.uncompressed_crc:
         raise ValueError("chunk has a wrong CRC")
     return bytes(raw)
+
+
+def _uncompressed(chunk: Any, limit: int) -> bytes:
+    """At most ``limit`` bytes: a few kB may describe gigabytes."""
+    if chunk.compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
+            return bytes(stream.read(limit))
+    if chunk.compression == "lz4":
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=limit))
+    if chunk.compression == "":
+        return bytes(chunk.data)
+    raise ValueError(f"unknown compression {chunk.compression!r}")
 
 
 def records_inside(raw: bytes) -> Iterator[Any]:
@@ -159,15 +197,18 @@ def records_inside(raw: bytes) -> Iterator[Any]:
         position += length
 
 
-def _sound_chunk(data: bytes, position: int) -> bool:
+def _is_proven(data: bytes | mmap, position: int) -> bool:
+    """Whether a chunk or an attachment of ours begins here whose CRC is right."""
     if position + _HEAD.size > len(data):
         return False
     opcode, length = _HEAD.unpack_from(data, position)
     start = position + _HEAD.size
-    if opcode != Opcode.CHUNK or start + length > len(data):
+    if start + length > len(data):
         return False
-    chunk = _record(data, opcode, start, length)
-    return chunk is not None and bool(chunk.uncompressed_crc) and _unpacks(chunk)
+    record = _record(data, opcode, start, length)
+    if isinstance(record, Chunk):
+        return bool(record.uncompressed_crc) and _unpacks(record)
+    return isinstance(record, Attachment) and record.name in _ATTACHMENTS
 
 
 def _unpacks(chunk: Any) -> bool:
@@ -178,27 +219,33 @@ def _unpacks(chunk: Any) -> bool:
     return True
 
 
-def _next_chunk(data: bytes, position: int) -> int:
-    """Offset of the next sound chunk at or after ``position``; the end of the data if none."""
-    mark = bytes([Opcode.CHUNK])
-    while (position := data.find(mark, position)) >= 0:
-        if _sound_chunk(data, position):
+def _next_proven(data: bytes | mmap, position: int) -> int:
+    """Offset of the next sound chunk or attachment at or after ``position``; the end of the data
+    if none."""
+    marks = {bytes([opcode]): -1 for opcode in (Opcode.CHUNK, Opcode.ATTACHMENT)}
+    while position < len(data):
+        for mark, place in marks.items():
+            if place < position:
+                found = data.find(mark, position)
+                marks[mark] = found if found >= 0 else len(data)
+        position = min(marks.values())
+        if _is_proven(data, position):
             return position
         position += 1
     return len(data)
 
 
-def scan(data: bytes) -> Scan:
+def scan(data: bytes | mmap) -> Scan:
     """Everything sound in the bytes of an MCAP file; never raises for what they hold."""
     found = Scan(data)
-    position = len(MCAP0_MAGIC) if data.startswith(MCAP0_MAGIC) else 0
+    position = len(MCAP0_MAGIC) if data[: len(MCAP0_MAGIC)] == MCAP0_MAGIC else 0
     while position < len(data):
-        if found.complete and data[position:] == MCAP0_MAGIC:
+        if found.complete and data[position : position + 99] == MCAP0_MAGIC:
             return found
         size = 0 if found.complete else _take(found, position)
         if size == 0:
             found.complete = False
-            following = _next_chunk(data, position + 1)
+            following = _next_proven(data, position + 1)
             found.damaged_places += 1
             found.bytes_dropped += following - position
             position = following
@@ -222,7 +269,7 @@ def _take(found: Scan, position: int) -> int:
     if record is None:
         return 0
     if isinstance(record, Chunk):
-        if not _take_chunk(found, record):
+        if not _take_chunk(found, record, (start, length)):
             return 0
     elif isinstance(record, Message):
         found.loose.append(record)
@@ -232,20 +279,59 @@ def _take(found: Scan, position: int) -> int:
         found.define(record, verified=False)
     elif isinstance(record, Metadata):
         found.metadata.setdefault(record.name, {}).update(record.metadata)
-    elif isinstance(record, Attachment) and record.name == DEFINITION_ATTACHMENT:
-        _take_definition(found, record.data)
+    elif isinstance(record, Attachment) and record.name in _ATTACHMENTS:
+        _take_copy(found, record.data)
+    elif isinstance(record, Footer):
+        _take_summary(found, record, start)
     found.complete = isinstance(record, Footer)
     return _HEAD.size + int(length)
 
 
-def _take_definition(found: Scan, compressed: bytes) -> None:
-    """A copy of a topic's schema and channel; the attachment's CRC was checked with the record."""
-    with suppress(zstandard.ZstdError):
-        for record in records_inside(zstandard.ZstdDecompressor().decompress(compressed)):
+def _take_copy(found: Scan, compressed: bytes) -> None:
+    """A copy of a topic's schema and channel, or of what is said of the run; the attachment's CRC
+    was checked with the record."""
+    try:
+        with zstandard.ZstdDecompressor().stream_reader(compressed) as stream:
+            raw = stream.read(RECORD_MAX)
+    except zstandard.ZstdError:
+        return
+    for record in records_inside(raw):
+        if isinstance(record, (Schema, Channel)):
+            found.define(record, verified=True)
+        elif isinstance(record, Metadata) and record.name == RUN_RECORD:
+            found.proven_run.update(record.metadata)
+
+
+def run_of_attachments(stream: IO[bytes], index: Iterable[Any]) -> dict[str, str]:
+    """What the attachments of an indexed file say of its run; ValueError where one is damaged."""
+    found = Scan(b"")
+    for entry in index:
+        if entry.name != RUN_ATTACHMENT:
+            continue
+        stream.seek(entry.offset + _HEAD.size)
+        body = stream.read(min(entry.length - _HEAD.size, RECORD_MAX))
+        attachment = _record(body, Opcode.ATTACHMENT, 0, len(body))
+        if attachment is None:
+            raise ValueError("what it says of its run has a wrong CRC")
+        _take_copy(found, attachment.data)
+    return found.proven_run
+
+
+def _take_summary(found: Scan, footer: Any, start: int) -> None:
+    """What the index repeats is proven where its CRC is right."""
+    end = start + 16  # of what the CRC covers: all of the footer but the CRC itself
+    first = footer.summary_start
+    if not footer.summary_crc or not 0 < first < end or end - first > RECORD_MAX:
+        return
+    summary = found.data[first:end]
+    if zlib.crc32(summary) != footer.summary_crc:
+        return
+    for record in records_inside(summary):
+        if isinstance(record, (Schema, Channel)):
             found.define(record, verified=True)
 
 
-def _take_chunk(found: Scan, chunk: Any) -> bool:
+def _take_chunk(found: Scan, chunk: Any, place: tuple[int, int]) -> bool:
     try:
         raw = unpack(chunk)
     except ValueError:
@@ -254,16 +340,16 @@ def _take_chunk(found: Scan, chunk: Any) -> bool:
     for record in records_inside(raw):
         if isinstance(record, (Schema, Channel)):
             found.define(record, verified)
-    found.blocks.append((chunk, verified))
+    found.blocks.append((place, verified))
     return True
 
 
 def _take_cut_chunk(found: Scan, start: int, length: int) -> None:
     """Keep the whole messages of a last, uncompressed chunk that the end of the file cuts."""
     fixed = struct.Struct("<QQQII")
-    body = found.data[start:]
-    if len(body) < fixed.size + 8:
+    if len(found.data) - start < fixed.size + 8 or length > RECORD_MAX:
         return
+    body = found.data[start:]
     size, compression = fixed.unpack_from(body)[2], fixed.unpack_from(body)[4]
     (stored,) = struct.unpack_from("<Q", body, fixed.size)
     if compression != 0 or stored != size or length != fixed.size + 8 + size:
@@ -289,7 +375,7 @@ def summary_is_sound(file: Path) -> bool:
         if footer.summary_crc == 0:
             return True
         end = size - len(MCAP0_MAGIC) - 4
-        if not footer.summary_start < end:
+        if not footer.summary_start < end or end - footer.summary_start > RECORD_MAX:
             return False
         stream.seek(footer.summary_start)
         summary = stream.read(end - footer.summary_start)

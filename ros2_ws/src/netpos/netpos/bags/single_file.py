@@ -35,7 +35,8 @@ class SingleFile:
         plain = found["storage_identifier"] == "mcap" and not found["compression_mode"]
         _require(plain and found["version"] <= layout.VERSION)
         self.custom: dict[str, Any] = found["custom_data"] or {}
-        self.bio = (folder / Path(name).name).open("rb")
+        self.file = folder / Path(name).name
+        self.bio = self.file.open("rb")
         try:
             self._index()
             self._order(found)

@@ -78,7 +78,7 @@ def _nested_types(fields: Any) -> list[str]:
 def _parse(text: str, type_name: str) -> Any:
     try:
         return get_types_from_msg(text, type_name)
-    except TypesysError as error:
+    except Exception as error:  # an unsound definition raises nearly anything
         raise BagError(f"the definition of {type_name} cannot be parsed: {error}") from error
 
 
@@ -170,7 +170,10 @@ def store_of_definition(type_name: str, text: str) -> Typestore:
         common.register(types)
     except TypesysError:
         own = get_typestore(Stores.EMPTY)
-        own.register(types)
+        try:
+            own.register(types)
+        except TypesysError as error:
+            raise BagError(f"the definition of {type_name} cannot be used: {error}") from error
         return own
     return common
 
@@ -182,7 +185,10 @@ def has_common_definition(type_name: str, text: str) -> bool:
 
 def type_hash(type_name: str, text: str) -> str:
     """REP-2016 hash of a definition, such as ``RIHS01_5df957...``."""
-    return store_of_definition(type_name, text).hash_rihs01(type_name)
+    try:
+        return store_of_definition(type_name, text).hash_rihs01(type_name)
+    except KeyError as error:
+        raise BagError(f"the definition of {type_name} lacks {error}") from error
 
 
 @cache

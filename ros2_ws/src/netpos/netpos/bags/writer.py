@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -43,6 +44,7 @@ class BagWriter:
 
     def __init__(self, path: Path, *, metadata: Mapping[str, str] | None = None) -> None:
         self.path = Path(path)
+        self._abandoned = False
         self._run = {str(key): str(value) for key, value in (metadata or {}).items()}
         self._topics: dict[str, layout.Topic] = {}
         self._schemas: dict[tuple[str, str], int] = {}
@@ -57,10 +59,15 @@ class BagWriter:
         self._mcap = FastWriter(
             self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
         )
-        self._mcap.start(profile="ros2", library=f"{layout.LIBRARY} {netpos.__version__}")
-        if self._run:
-            self._mcap.add_metadata(layout.RUN_RECORD, self._run)
-        self._file.flush()
+        try:
+            self._mcap.start(profile="ros2", library=f"{layout.LIBRARY} {netpos.__version__}")
+            if self._run:
+                self._say_of_run(self._run)
+            with self._writing():
+                self._file.flush()
+        except OSError:
+            shutil.rmtree(self.path)  # it holds nothing yet
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -131,8 +138,9 @@ class BagWriter:
 
     def _repeat_definition(self, entry: layout.Topic, schema_id: int) -> None:
         copy = layout.definition_records(entry, schema_id)
-        self._mcap.add_attachment(0, 0, layout.DEFINITION_ATTACHMENT, "application/zstd", copy)
-        self._file.flush()
+        with self._writing():
+            self._mcap.add_attachment(0, 0, layout.DEFINITION_ATTACHMENT, "application/zstd", copy)
+            self._file.flush()
 
     def write(self, topic: str, message: Any, log_time_ns: int) -> None:
         """Serialise and append one rosbags message; its topic is added on first use."""
@@ -162,27 +170,62 @@ class BagWriter:
             raise BagError(f"{topic}: log time {log_time_ns} ns is outside [0, 2^63 - 1]")
         if len(cdr) < 4:
             raise BagError(f"{topic}: {len(cdr)} bytes are no serialised message")
-        self._mcap.add_message(
-            entry.channel_id,
-            log_time_ns,
-            cdr,
-            log_time_ns if publish_time_ns is None else publish_time_ns,
-            entry.count & 0xFFFFFFFF,
-        )
+        try:
+            self._mcap.add_message(
+                entry.channel_id,
+                log_time_ns,
+                cdr,
+                log_time_ns if publish_time_ns is None else publish_time_ns,
+                entry.count & 0xFFFFFFFF,
+            )
+        except OSError as error:
+            raise self._not_written(error) from error
         entry.count += 1
 
     def note(self, key: str, value: str) -> None:
         """Add to the metadata what is known only now."""
         self._run[key] = value
-        self._mcap.add_metadata(layout.RUN_RECORD, {key: value})
+        self._say_of_run({key: value})
+
+    def _say_of_run(self, run: Mapping[str, str]) -> None:
+        """In a record that readers know, and under a checksum."""
+        copy = layout.run_records(run)
+        with self._writing():
+            self._mcap.add_metadata(layout.RUN_RECORD, dict(run))
+            self._mcap.add_attachment(0, 0, layout.RUN_ATTACHMENT, "application/zstd", copy)
+            self._file.flush()
 
     def flush(self) -> None:
         """Close the chunk in progress and hand everything to the operating system."""
-        self._mcap.flush()
+        with self._writing():
+            self._mcap.flush()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise self._not_written(error) from error
+
+    def _not_written(self, error: OSError) -> OSError:
+        """The error of a write, with the name of the bag; nothing more is written then."""
+        self.abandon()
+        return OSError(error.errno, os.strerror(error.errno or 0), str(self.path))
+
+    @property
+    def closed(self) -> bool:
+        """Whether nothing more can be written."""
+        return self._file.closed
+
+    def abandon(self) -> None:
+        """Close the file as it is, without an index: ``recover`` saves its whole chunks."""
+        self._abandoned = True
+        with suppress(OSError):  # what waits in the buffer of the file does not fit either
+            self._file.close()
 
     def close(self) -> None:
         """Write the index and metadata.yaml; may be called twice."""
-        if self._file.closed:
+        if self._file.closed or self._abandoned:
             return
         name = layout.storage_file(self.path.absolute()).name
         try:
@@ -194,8 +237,12 @@ class BagWriter:
                 layout.ROSBAG2_RECORD, {"serialized_metadata": layout.dump(information)}
             )
             self._mcap.finish()
-        finally:
             self._file.close()
+        except OSError as error:
+            raise self._not_written(error) from error
+        finally:
+            with suppress(OSError):
+                self._file.close()
         layout.write_metadata(self.path, information)
 
 

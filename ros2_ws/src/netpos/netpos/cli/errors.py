@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from typing import Any
 
 import typer
@@ -20,6 +21,9 @@ _BAD_INPUT = (
 )
 
 
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
 class WorkFailedError(RuntimeError):
     """The input was fine and the work was not done: exit status 1."""
 
@@ -27,7 +31,8 @@ class WorkFailedError(RuntimeError):
 def _sentences(error: BaseException) -> list[str]:
     """One sentence, or one for each of several faults."""
     if isinstance(error, OSError) and error.filename is not None:
-        return [f"{error.filename}: {error.strerror}"]
+        remedy = "; make room there and run it again" if error.errno in _FULL else ""
+        return [f"{error.filename}: {error.strerror}{remedy}"]
     if isinstance(error, FaultsError):
         return str(error).splitlines()
     return [" ".join(str(error).split()) or type(error).__name__]

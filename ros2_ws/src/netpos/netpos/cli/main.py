@@ -7,8 +7,9 @@ from typing import Annotated
 import typer
 
 import netpos
-from netpos.cli import params, recordings, reproduce, results, rsus, runs, sweep
+from netpos.cli import faults, params, recordings, reproduce, results, rsus, runs, sweep, watch
 from netpos.cli.errors import Commands
+from netpos.cli.examples import epilog
 from netpos.cli.interrupts import INTERRUPTED, answer_ctrl_c, leave
 
 EXAMPLES = """
@@ -33,12 +34,14 @@ for command in (
     results.report,
     results.compare,
     sweep.sweep,
+    faults.faults,
     results.bench,
     reproduce.reproduce,
     recordings.recover,
+    watch.watch,
     params.params,
 ):
-    app.command()(command)
+    app.command(epilog=epilog(command.__name__))(command)
 app.add_typer(recordings.importers, name="import")
 app.add_typer(rsus.rsus, name="rsus")
 

@@ -118,13 +118,7 @@ def import_csv(
 ) -> None:
     """Ranges, angles, times or fixes of any text file.
 
-    One measurement a line:
-    netpos import csv uwb.csv BAG --map time=t,rsu=anchor,range=dist --units time=ms,range=mm
-    --sd range=100 --rsus anchors.yaml
-
-    One column for each RSU:
-    netpos import csv uwb.tsv BAG --map "time=1,range:a1=6,range:a2=7,range:a3=8"
-    --sd range=0.1 --rsus anchors.csv --truth walk.tum
+    One measurement a line, or one column for each RSU.
     """
     from netpos.bags.importers.own import import_csv as work  # noqa: PLC0415
     from netpos.bags.importers.own.records import DELIMITERS  # noqa: PLC0415
@@ -180,11 +174,7 @@ def import_ros(
 ) -> None:
     """Ranges, angles, times or fixes of a topic of any ROS 1 or ROS 2 bag.
 
-    Fields are given by their path; the RSU's own position may be one of them:
-    netpos import ros walk.bag BAG --topic /uwb --map
-    time=header.stamp,rsu=responder_id,range=distance,rsu_x=place.x,rsu_y=place.y,rsu_z=place.z
-    --sd range=0.1 --truth-topic /pose --truth-map
-    time=header.stamp,x=pose.position.x,y=pose.position.y
+    Fields are given by their path; the RSU's own position may be one of them.
     """
     from netpos.bags.importers.own import import_ros as work  # noqa: PLC0415
 

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from netpos.cli.results import refuse_recording
+from netpos.common.files import write_text
 
 _WIDTH = 78
 
@@ -44,7 +45,7 @@ def params(
     refuse_recording(dump)
     if dump.exists():
         raise FileExistsError(f"{dump} exists; choose another name")
-    dump.write_text(params_file(values, settings.vue_ids), encoding="utf-8")
+    write_text(dump, params_file(values, settings.vue_ids))
     typer.echo(
         f"wrote {dump}; start the tracker with: scripts/run_tracker.sh {dump}, or "
         f"ros2 run ekf_tracker ekf_tracker --ros-args --params-file {dump}"

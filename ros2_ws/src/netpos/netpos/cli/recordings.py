@@ -7,13 +7,14 @@ from typing import Annotated
 
 import typer
 
+from netpos.cli.examples import epilog
 from netpos.cli.own_recordings import Bag, import_csv, import_ros, tell, three
 from netpos.cli.progress import doing
 
 importers = typer.Typer(no_args_is_help=True, help="Turn other people's recordings into bags.")
 
-importers.command("csv")(import_csv)
-importers.command("ros")(import_ros)
+importers.command("csv", epilog=epilog("import csv"))(import_csv)
+importers.command("ros", epilog=epilog("import ros"))(import_ros)
 
 
 def recover(bag: Annotated[Path, typer.Argument(help="Bag that was cut off.")]) -> None:
@@ -25,7 +26,7 @@ def recover(bag: Annotated[Path, typer.Argument(help="Bag that was cut off.")]) 
     typer.echo(str(found))
 
 
-@importers.command("ble-aoa")
+@importers.command("ble-aoa", epilog=epilog("import ble-aoa"))
 def ble_aoa(
     path: Annotated[Path, typer.Argument(help="Folder with beacons_*.csv and truth_*.csv.")],
     bag: Bag,
@@ -41,7 +42,7 @@ def ble_aoa(
     tell(bag, counts)
 
 
-@importers.command("uwb-anchors")
+@importers.command("uwb-anchors", epilog=epilog("import uwb-anchors"))
 def uwb_anchors(
     path: Annotated[Path, typer.Argument(help="Folder with A*.csv and trajectory.csv.")], bag: Bag
 ) -> None:
@@ -53,7 +54,7 @@ def uwb_anchors(
     tell(bag, counts)
 
 
-@importers.command("uwb-trolley")
+@importers.command("uwb-trolley", epilog=epilog("import uwb-trolley"))
 def uwb_trolley(
     path: Annotated[Path, typer.Argument(help="Folder with UWB_*.csv and motion_capture_*.csv.")],
     bag: Bag,
@@ -66,7 +67,7 @@ def uwb_trolley(
     tell(bag, counts)
 
 
-@importers.command("car-imu-rtk")
+@importers.command("car-imu-rtk", epilog=epilog("import car-imu-rtk"))
 def car_imu_rtk(
     path: Annotated[Path, typer.Argument(help="Folder with imu_*.csv, .tag and gnss_*.pos.")],
     bag: Bag,
@@ -110,7 +111,9 @@ def car_imu_rtk(
 
 
 def _imu_command(recording_format: str, what: str) -> None:
-    @importers.command(recording_format, help=what)
+    epilogue = epilog(f"import {recording_format}")
+
+    @importers.command(recording_format, help=what, epilog=epilogue)
     def command(path: Annotated[Path, typer.Argument(help="The recording.")], bag: Bag) -> None:
         from netpos.bags.importers.imu import import_imu  # noqa: PLC0415
 

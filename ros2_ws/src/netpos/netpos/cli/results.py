@@ -12,6 +12,7 @@ import typer
 
 from netpos.cli.own_recordings import Align, Offset, TruthMap, TruthOrigin, TruthUnits
 from netpos.cli.progress import doing
+from netpos.common.files import write_text
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -273,7 +274,7 @@ def write_json(path: Path, figures: dict[str, Any]) -> None:
     Raises what ``check_json`` does.
     """
     check_json(path)
-    path.write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(figures, indent=2, allow_nan=False) + "\n")
 
 
 def tables(evaluation: Evaluation) -> list[Table]:

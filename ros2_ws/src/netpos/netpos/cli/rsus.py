@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from netpos.cli.examples import epilog
 from netpos.cli.progress import doing
 
 rsus = typer.Typer(
@@ -14,7 +15,7 @@ rsus = typer.Typer(
 )
 
 
-@rsus.command()
+@rsus.command(epilog=epilog("rsus save"))
 def save(
     bag: Annotated[Path, typer.Argument(help="Bag with RSUs; with /rsu/learned, with that.")],
     file: Annotated[Path, typer.Argument(help="YAML file to write; it must not exist.")],
@@ -27,7 +28,7 @@ def save(
     typer.echo(f"wrote {file}: {len(found)} RSUs")
 
 
-@rsus.command()
+@rsus.command(epilog=epilog("rsus load"))
 def load(
     file: Annotated[Path, typer.Argument(help="YAML or CSV file with RSUs.")],
     bag: Annotated[Path, typer.Argument(help="Bag to copy.")],

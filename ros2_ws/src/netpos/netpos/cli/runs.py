@@ -233,6 +233,8 @@ def _track(
     others = ", ".join(f"{name} {value}" for name, value in summary.parameters.items())
     typer.echo(f"tracker parameters of {source}; not the default: {others or 'none'}")
     typer.echo(f"{summary.epochs} epochs")
+    for fault in summary.refused_rsus.values():
+        typer.echo(f"netpos: RSU refused: {fault}", err=True)
     for vue, counts in sorted(summary.rejected.items()):
         reasons = ", ".join(f"{reason} {n}" for reason, n in sorted(counts.items()) if n)
         typer.echo(f"{vue}: rejected {reasons or 'nothing'}")

@@ -6,6 +6,7 @@ stack, and both come with bags and scenarios of others.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -24,6 +25,22 @@ class YamlError(ValueError):
         super().__init__(f"{where}{problem}")
         self.problem = problem
         self.line = line
+
+
+def read_text(file: Path) -> str:
+    """The text of a file that is to be read as YAML.
+
+    Raises ``YamlError`` for one that is no regular file, too large or not UTF-8.
+    """
+    if not file.is_file():
+        raise YamlError(f"{file} is no regular file")
+    size = file.stat().st_size
+    if size > 4 * SIZE_MAX:  # bytes of a character in UTF-8
+        raise YamlError(f"{size} bytes; at most {SIZE_MAX} characters are read")
+    try:
+        return file.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise YamlError(f"not UTF-8 at byte {error.start}") from error
 
 
 def load_yaml(text: str) -> Any:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from netpos.bags import LOST_METADATA, BagEntry, BagReader, codec
+from netpos.bags import LOST_METADATA, BagEntry, BagError, BagReader, codec
 from netpos.bags.recording import SKIPPED, TRUTH_ALIGNMENT
 from netpos.common.yaml_text import load_yaml
 from netpos.evaluation.metrics import Run
@@ -267,7 +267,14 @@ def _read(
         if found != expected:
             raise ValueError(f"{bag.path}: {topic} must hold {expected}, it holds {found}")
     for done, entry in enumerate(bag.messages(wanted)):
-        sinks[entry.topic][1](entry)
+        try:
+            sinks[entry.topic][1](entry)
+        except BagError:
+            raise
+        except ValueError as error:
+            raise BagError(
+                f"{bag.path}: {entry.topic}, message of {entry.log_time_ns} ns: {error}"
+            ) from error
         if progress is not None:
             progress(done)
     return recording

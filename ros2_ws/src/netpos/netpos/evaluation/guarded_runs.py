@@ -144,13 +144,14 @@ def _simulated(name: str) -> Iterator[Material]:
     for runs, seed in enumerate(SEEDS):
         if runs >= FEWEST_RUNS and lasted_s >= ENOUGH_S:
             return
-        material = _material(simulation.with_seed(seed), settings)
+        material = simulated(simulation.with_seed(seed), settings)
         truth = next(iter(material.truth.values()))
         lasted_s += (truth[-1].stamp_ns - truth[0].stamp_ns) * 1e-9
         yield material
 
 
-def _material(simulation: Simulation, settings: TrackerSettings) -> Material:
+def simulated(simulation: Simulation, settings: TrackerSettings) -> Material:
+    """One run of a scenario."""
     items: list[Item | ImuSample] = []
     truth: dict[str, list[Odometry]] = defaultdict(list)
     clock: dict[str, list[ClockState]] = defaultdict(list)

@@ -18,6 +18,7 @@ from matplotlib.patches import Patch
 from PIL import Image
 from scipy.stats import chi2
 
+from netpos.common.files import whole_file
 from netpos.evaluation.evaluate import Evaluation, VueEvaluation
 from netpos.evaluation.metrics import NS, clock_error_series
 from netpos.evaluation.pairing import Trajectory, wrap_angle
@@ -51,8 +52,12 @@ def save(figure: Figure, path: Path, description: str = "") -> None:
     SVG carries ``description`` as text.
     """
     check_format(path)
+    with whole_file(path) as draft:
+        _draw(figure, draft, description)
+
+
+def _draw(figure: Figure, path: Path, description: str) -> None:
     suffix = path.suffix.lower()
-    path.parent.mkdir(parents=True, exist_ok=True)
     frame: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.15}
     if suffix == ".png":
         drawn = io.BytesIO()

@@ -69,7 +69,8 @@ def _is_done(bag: Path, plan: Replays) -> bool:
         return False
     with BagReader(bag) as source, BagReader(target) as found:
         settings = changed(plan.settings or bag_settings(source), plan.overrides)
-        wanted = tracker_fact(TrackerConfig.from_mapping(settings.parameters))
+        config = TrackerConfig.from_mapping(settings.parameters)
+        wanted = tracker_fact(config, settings.rsus)
         smoothed = any(topics.split(t)[1] == topics.ODOMETRY_SMOOTHED for t in found.topics)
         if wanted.items() <= found.metadata.items() and smoothed == plan.smooth:
             return True

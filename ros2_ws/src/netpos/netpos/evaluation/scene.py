@@ -14,11 +14,7 @@ def buildings_of(bag: BagReader) -> Array:
     None (k = 0) where the bag holds no scenario, or none that this version reads: a map without
     buildings is then the honest one.
     """
-    from netpos.scenario.build import buildings_of as buildings_of_scenario  # noqa: PLC0415 - slow
-    from netpos.scenario.load import ScenarioError, scenario_of_text  # noqa: PLC0415
+    from netpos.scenario.build import buildings_of_text  # noqa: PLC0415 - slow
 
     texts = bag.facts.get("scenario", ())
-    try:
-        return buildings_of_scenario(scenario_of_text(texts[-1], bag.path))
-    except (IndexError, ScenarioError):
-        return np.zeros((0, 4))
+    return buildings_of_text(texts[-1], bag.path) if texts else np.zeros((0, 4))

@@ -16,6 +16,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from scipy.stats import bootstrap
 
+from netpos.common.files import whole_file
 from netpos.evaluation.evaluate import evaluate_bag
 from netpos.evaluation.metrics import SKIP_EPOCHS
 from netpos.evaluation.pictures import TRACK_COLOURS
@@ -202,7 +203,8 @@ def check_table(path: Path) -> None:
 def write_table(table: pd.DataFrame, path: Path) -> None:
     """As CSV or Parquet, by the name of the file; raises what ``check_table`` does."""
     check_table(path)
-    if path.suffix == ".csv":
-        table.to_csv(path, index=False)
-    else:
-        table.to_parquet(path, index=False)
+    with whole_file(path) as draft:
+        if path.suffix == ".csv":
+            table.to_csv(draft, index=False)
+        else:
+            table.to_parquet(draft, index=False)

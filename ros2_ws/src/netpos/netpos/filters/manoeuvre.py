@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import math
 
-from netpos.filters.compile import leaf
+import numpy as np
+
+from netpos.filters.compile import kernel, leaf
 from netpos.filters.factor import eigenvalues
 from netpos.filters.measurement import GATE_VARIANCE, innovation_row, innovation_variance
 from netpos.filters.motion import add_velocity_step
@@ -27,11 +29,13 @@ def detection_delay_s(
 ) -> tuple[float, float]:
     """Time [s] until a velocity step of ``speed`` [m/s] takes ``rows`` (m, ROW_WIDTH) as far off
     the prediction mean (n,), cov (n, n) as ``gate``, a squared Mahalanobis distance, allows: for
-    a step in any direction, and for one in the direction they know least (inf: not at all).
+    a step in any direction, and for one in the direction they know least (inf: not at all). A
+    measured velocity shows the step at once, the longest time is then an upper bound.
 
     h : (n,) scratch
     """
     xx = xy = yy = 0.0
+    velocity_xx = velocity_xy = velocity_yy = 0.0
     for i in range(rows.shape[0]):
         innovation_row(rows[i], mean, height_m, h)
         noise = rows[i, GATE_VARIANCE]
@@ -39,10 +43,34 @@ def detection_delay_s(
         xx += h[X.PX] * h[X.PX] / variance
         xy += h[X.PX] * h[X.PY] / variance
         yy += h[X.PY] * h[X.PY] / variance
+        velocity_xx += h[X.VX] * h[X.VX] / variance
+        velocity_xy += h[X.VX] * h[X.VY] / variance
+        velocity_yy += h[X.VY] * h[X.VY] / variance
     least, _ = eigenvalues(xx, xy, yy)
-    typical = math.sqrt(2.0 * gate / (xx + yy)) / speed if xx + yy > 0.0 else math.inf
-    longest = math.sqrt(gate / least) / speed if least > 1e-12 * (xx + yy) else math.inf
+    least_velocity, _ = eigenvalues(velocity_xx, velocity_xy, velocity_yy)
+    step2 = speed * speed
+    left = max(2.0 * gate - step2 * (velocity_xx + velocity_yy), 0.0)
+    left_least = max(gate - step2 * max(least_velocity, 0.0), 0.0)
+    typical = longest = math.inf
+    if left == 0.0 or xx + yy > 0.0:
+        typical = math.sqrt(left / (xx + yy)) / speed if left > 0.0 else 0.0
+    if left_least == 0.0 or least > 1e-12 * (xx + yy):
+        longest = math.sqrt(left_least / least) / speed if left_least > 0.0 else 0.0
     return _FOLLOWED * typical, longest
+
+
+@kernel
+def measures_velocity(mean: Array, rows: Array, height_m: float) -> bool:
+    """Whether ``rows`` (m, ROW_WIDTH), about mean (n,), measure both axes of the velocity."""
+    h = np.empty(mean.size)
+    xx = xy = yy = 0.0
+    for i in range(rows.shape[0]):
+        innovation_row(rows[i], mean, height_m, h)
+        xx += h[X.VX] * h[X.VX]
+        xy += h[X.VX] * h[X.VY]
+        yy += h[X.VY] * h[X.VY]
+    least, largest = eigenvalues(xx, xy, yy)
+    return bool(least > 1e-6 * largest)
 
 
 @leaf

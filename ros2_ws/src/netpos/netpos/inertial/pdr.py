@@ -29,6 +29,7 @@ from netpos.inertial.pdr_config import PdrConfig
 from netpos.inertial.pdr_output import PdrOutput, StepEvent, StepVelocity, step_velocity
 from netpos.inertial.steps import LONGEST_STEP, Step, StepDetector
 from netpos.inertial.watch import Conditions, StreamWatch
+from netpos.messages.fields import bad_stamp, malformed_nanosec
 
 Array = npt.NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -47,11 +48,12 @@ def _vector(value: VectorLike) -> Vector | str:
 class PedestrianDeadReckoning:
     """Streaming core; see the module docstring for the model.
 
-    ``counters`` keys: ``malformed``, ``not_finite``, ``stamp_duplicate``, ``stamp_backwards``,
-    ``accelerometer_saturated`` (used for steps, not for tilt), ``gyro_saturated`` (used, the
-    heading less sure; either refused when beyond the range); ``gap``, ``clock_reset``
-    (restart); ``rate_out_of_range`` (per second of stream); ``gravity_implausible`` (an
-    alignment window without 1 g: wrong unit?); ``magnetic_*`` (field sample not used).
+    ``counters`` keys: ``malformed``, ``not_finite``, ``bad_stamp`` (a nanosec of a second or
+    more), ``stamp_duplicate``, ``stamp_backwards``, ``accelerometer_saturated``
+    (used for steps, not for tilt), ``gyro_saturated`` (used, the heading less sure; either
+    refused when beyond the range); ``gap``, ``clock_reset`` (restart);
+    ``rate_out_of_range`` (per second of stream); ``gravity_implausible`` (an alignment window
+    without 1 g: wrong unit?); ``magnetic_*`` (field sample not used).
     ``conditions``: ``rate``, ``axes``, ``gravity``, ``no_magnetic_field``, ``magnetic_disturbed``.
     """
 
@@ -127,6 +129,10 @@ class PedestrianDeadReckoning:
         if isinstance(rate, str) or isinstance(force, str):
             self._refuse(rate if isinstance(rate, str) else str(force))
             return None
+        nanosec = malformed_nanosec(stamp_ns)
+        if nanosec is not None:
+            self._refuse("bad_stamp", bad_stamp(nanosec))
+            return None
         if not self._in_order(stamp_ns):
             return None
         saturated = self._watch.saturated(rate, force)
@@ -164,6 +170,8 @@ class PedestrianDeadReckoning:
         to ``field_hold_s`` after them.
         """
         value = _vector(field_tesla)
+        if malformed_nanosec(stamp_ns) is not None:
+            value = "bad_stamp"
         if isinstance(value, str):
             self._counters[f"magnetic_{value}"] += 1
             return
@@ -215,12 +223,12 @@ class PedestrianDeadReckoning:
         self._restart()
         return True
 
-    def _refuse(self, reason: str) -> None:
+    def _refuse(
+        self, reason: str, why: str = "IMU samples without three finite values are left out"
+    ) -> None:
         """Count a sample that cannot be read; the first of a kind is told."""
         if not self._counters[reason]:
-            self._conditions.tell(
-                f"{reason}: IMU samples without three finite values are left out"
-            )
+            self._conditions.tell(f"{reason}: {why}")
         self._counters[reason] += 1
 
     def _on_gap(self, dt_s: float) -> None:

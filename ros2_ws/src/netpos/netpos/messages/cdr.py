@@ -201,12 +201,23 @@ class CdrCodec:
         self._clock_state = Layout(items("netpos_msgs/msg/ClockState"))
         self._track_status = Layout(items("netpos_msgs/msg/TrackStatus"))
 
+    def source(self, cdr: bytes) -> tuple[str, str, int] | None:
+        """RSU, device and stamp [ns] of a netpos_msgs/RsuMeasurement, of which nothing else is
+        read."""
+        parts = self._measurement.parts(cdr)
+        if parts is None:
+            return None
+        (sec, nanosec), (_, rsu_id, vue_id, _), _ = parts
+        return rsu_id, vue_id, sec * NS + nanosec
+
     def measurement(self, cdr: bytes) -> RsuMeasurement | None:
         """Value of a netpos_msgs/RsuMeasurement; values are not judged here."""
         parts = self._measurement.parts(cdr)
         if parts is None:
             return None
         (sec, nanosec), (frame_id, rsu_id, vue_id, reference_rsu_id), scalars = parts
+        if nanosec >= NS:
+            return None
         value = RsuMeasurement.__new__(RsuMeasurement)  # the defaults would cost most
         value.stamp_ns, value.rsu_id, value.vue_id = sec * NS + nanosec, rsu_id, vue_id
         value.frame_id, value.reference_rsu_id = frame_id, reference_rsu_id
@@ -244,6 +255,8 @@ class CdrCodec:
         if values is None:
             return None
         sec, nanosec, frame, *_, gx, gy, gz, rate_cov, ax, ay, az, force_cov = values
+        if nanosec >= NS:
+            return None
         return ImuSample(
             stamp_ns=sec * NS + nanosec,
             vue_id=vue_id or vue_of_frame(frame),

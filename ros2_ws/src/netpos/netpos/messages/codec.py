@@ -10,6 +10,7 @@ from netpos.messages.common_codec import CommonCodec
 from netpos.messages.fields import (
     MAP_FRAME,
     base_link,
+    certain_stamp_ns,
     flat,
     lever_arm,
     square,
@@ -61,7 +62,7 @@ class Codec(CommonCodec):
     def beacon_from_msg(msg: Any) -> Beacon:
         """Beacon value of a netpos_msgs/Beacon."""
         return Beacon(
-            stamp_ns=stamp_ns(msg.header.stamp),
+            stamp_ns=certain_stamp_ns(msg.header.stamp),
             vue_id=msg.vue_id,
             sequence=int(msg.sequence),
             position=xyz(msg.position),
@@ -181,7 +182,7 @@ class Codec(CommonCodec):
     def clock_state_from_msg(msg: Any) -> ClockState:
         """ClockState value of a netpos_msgs/ClockState."""
         return ClockState(
-            stamp_ns=stamp_ns(msg.header.stamp),
+            stamp_ns=certain_stamp_ns(msg.header.stamp),
             vue_id=vue_of_frame(msg.header.frame_id),
             offset_s=float(msg.offset),
             drift=float(msg.drift),
@@ -219,7 +220,7 @@ class Codec(CommonCodec):
         """TrackStatus value of a netpos_msgs/TrackStatus."""
         counts = [int(n) for n in msg.rejection_counts]
         return TrackStatus(
-            stamp_ns=stamp_ns(msg.header.stamp),
+            stamp_ns=certain_stamp_ns(msg.header.stamp),
             vue_id=vue_of_frame(msg.header.frame_id),
             state=TrackState(int(msg.state)),
             nis=float(msg.nis),
@@ -260,7 +261,7 @@ class Codec(CommonCodec):
             return tuple(float(value) for value in values)
 
         return RsuErrors(
-            stamp_ns=stamp_ns(msg.header.stamp),
+            stamp_ns=certain_stamp_ns(msg.header.stamp),
             rsu_id=str(msg.rsu_id),
             vue_id=vue_of_frame(msg.header.frame_id),
             quantities=tuple(msg.quantities),

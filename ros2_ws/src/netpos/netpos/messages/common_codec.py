@@ -16,6 +16,7 @@ from netpos.messages.fields import (
     MAP_FRAME,
     NS,
     base_link,
+    certain_stamp_ns,
     embed,
     flat,
     imu_covariance,
@@ -101,7 +102,7 @@ class CommonCodec:
         """Odometry value of a nav_msgs/Odometry."""
         q = msg.pose.pose.orientation
         return Odometry(
-            stamp_ns=stamp_ns(msg.header.stamp),
+            stamp_ns=certain_stamp_ns(msg.header.stamp),
             vue_id=vue_of_frame(msg.child_frame_id),
             position=xyz(msg.pose.pose.position),
             quaternion=np.array([q.x, q.y, q.z, q.w], dtype=np.float64),

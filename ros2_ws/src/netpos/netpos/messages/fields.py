@@ -10,6 +10,7 @@ from netpos.messages.values import Array
 
 MAP_FRAME = "map"
 NS = 1_000_000_000
+_MALFORMED_NS = -(2**62)  # below every stamp that a Time can hold
 
 
 def base_link(vue_id: str) -> str:
@@ -23,8 +24,41 @@ def vue_of_frame(frame_id: str) -> str:
 
 
 def stamp_ns(time: Any) -> int:
-    """Integer nanoseconds of a builtin_interfaces/Time."""
-    return int(time.sec) * NS + int(time.nanosec)
+    """Integer nanoseconds of a builtin_interfaces/Time.
+
+    A Time whose ``nanosec`` is a second or more says nothing certain. It becomes a number that
+    ``malformed_nanosec`` knows, and that whoever takes stamps refuses.
+    """
+    nanosec = int(time.nanosec)
+    if nanosec >= NS:
+        return _MALFORMED_NS - nanosec
+    return int(time.sec) * NS + nanosec
+
+
+def malformed_nanosec(stamp_ns: int) -> int | None:
+    """The ``nanosec`` of a Time that is none; None for a stamp."""
+    return _MALFORMED_NS - stamp_ns if stamp_ns <= _MALFORMED_NS - NS else None
+
+
+def stamp_fault(stamp_ns: int) -> str | None:
+    """Reason to refuse a stamp, or None: ``zero_stamp`` (not after 0), ``bad_stamp``."""
+    if stamp_ns > 0:
+        return None
+    return "zero_stamp" if malformed_nanosec(stamp_ns) is None else "bad_stamp"
+
+
+def certain_stamp_ns(time: Any) -> int:
+    """``stamp_ns`` for messages that nobody else judges; ValueError for a Time that is none."""
+    ns = stamp_ns(time)
+    nanosec = malformed_nanosec(ns)
+    if nanosec is not None:
+        raise ValueError(bad_stamp(nanosec))
+    return ns
+
+
+def bad_stamp(nanosec: int) -> str:
+    """Sentence about a Time that is none."""
+    return f"header.stamp.nanosec is {nanosec}; send one below {NS}"
 
 
 def xyz(point: Any) -> Array:

@@ -14,6 +14,12 @@ RUN_SCENARIO = "/run/scenario"  # of the simulator: scenario, rate
 RUN_ESTIMATOR = "/run/estimator"  # of trackers and fusion: their parameters
 RUN_TOPICS = (RUN_SCENARIO, RUN_ESTIMATOR)
 
+# Of the node viz, for viewers.
+VIZ = "viz"
+VIZ_MAP = f"/{VIZ}/map"  # latched: buildings and RSUs
+VIZ_MARKERS = f"/{VIZ}/markers"
+PATH = "path"
+
 # Per device: /<vue>/<name>.
 BEACON = "beacon"
 GROUND_TRUTH = "ground_truth"
@@ -36,7 +42,7 @@ TRACKS = "tracks"
 TRACKER_OUTPUTS = (ODOMETRY, ODOMETRY_SMOOTHED, CLOCK_STATE, TRACK_STATUS)
 
 
-_NO_DEVICES = ("rsu", "run")
+_NO_DEVICES = ("rsu", "run", VIZ)
 _NAME_MAX = 100  # that of a device and of its network fit into a topic, of 247 characters in ROS
 
 
@@ -57,6 +63,11 @@ def tracks_of(network: str) -> str:
     return f"/{NETWORKS}/{network}/{TRACKS}"
 
 
+def path_of(vue_id: str, network: str = "") -> str:
+    """Topic of the path that a viewer draws of a device: ``/viz/vue_1/path``."""
+    return f"/{VIZ}{of_vue(vue_id, PATH, network)}"
+
+
 def split(topic: str) -> tuple[str, str]:
     """Device and name of a device's topic; ("", topic) for any other."""
     parts = topic.strip("/").split("/")
@@ -73,8 +84,10 @@ def split_network(topic: str) -> tuple[str, str, str]:
 
 
 def is_tracker_output(topic: str) -> bool:
-    """Whether a topic is published by a tracker or by the fusion of tracks (and left out when a
-    bag is re-estimated)."""
-    if topic in (DIAGNOSTICS, RSU_LEARNED, RUN_ESTIMATOR, TF) or topic.startswith(f"/{NETWORKS}/"):
+    """Whether a topic is published by a tracker, by the fusion of tracks or from what they publish
+    (and left out when a bag is re-estimated)."""
+    if topic in (DIAGNOSTICS, RSU_LEARNED, RUN_ESTIMATOR, TF):
+        return True
+    if topic.startswith((f"/{NETWORKS}/", f"/{VIZ}/")):
         return True
     return split(topic)[1] in TRACKER_OUTPUTS

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,7 @@ from netpos.radio.clocks import clock_tones
 from netpos.radio.measure import Errors, Sight, Sites, los_model_number
 from netpos.radio.noise import generator, stream_key
 from netpos.radio.propagation import SPEED_OF_LIGHT_MPS
+from netpos.scenario.load import ScenarioError, scenario_of_text
 from netpos.scenario.measured import FixedErrors
 from netpos.scenario.places import Grid, RsuUnit
 from netpos.scenario.schema import Device, Scenario
@@ -29,6 +31,18 @@ def buildings_of(scenario: Scenario) -> Array:
         return METIS_MADRID.buildings
     rows = [(b.x_min, b.y_min, b.x_max, b.y_max) for b in scenario.world.buildings]
     return np.array(rows, dtype=np.float64).reshape(-1, 4)
+
+
+def buildings_of_text(text: str, place: Path) -> Array:
+    """(k, 4) rectangles of the scenario that a run tells of itself, found at ``place``.
+
+    None (k = 0) where the text is no scenario that this version reads: a map without buildings is
+    then the honest one.
+    """
+    try:
+        return buildings_of(scenario_of_text(text, place))
+    except ScenarioError:
+        return np.zeros((0, 4))
 
 
 def rsus_of(scenario: Scenario) -> tuple[RsuInfo, ...]:

@@ -20,6 +20,7 @@ from netpos.scenario.places import Rsus, World
 from netpos.scenario.section import (
     FileName,
     Finite,
+    Interval,
     Name,
     NotNegative,
     Place,
@@ -27,6 +28,7 @@ from netpos.scenario.section import (
     Section,
     Start,
 )
+from netpos.scenario.size import check_motion, check_size
 from netpos.world.body import BodyMotion
 from netpos.world.hills import Hills
 from netpos.world.maps import METIS_MADRID
@@ -38,13 +40,15 @@ from netpos.world.wander import Wander
 Array = npt.NDArray[np.float64]
 
 NS = 1_000_000_000
+LEGS_MAX = 40_000  # of a route
+DEVICES_MAX = 100_000  # with the same settings
 
 
 class RandomRoute(Section):
     """fokin2020 section 2.4: random turns on the METIS grid."""
 
     kind: Literal["metis_random"]
-    max_crossings: int = Field(default=6, ge=1)
+    max_crossings: int = Field(default=6, ge=1, le=LEGS_MAX)
     corner_radius_m: NotNegative = Field(default=0.0, lt=METIS_MADRID.block_m / 2)
 
     @property
@@ -77,7 +81,7 @@ class RectangleRoute(Section):
     corner: Place = (0.0, 0.0)
     width_m: Positive
     height_m: Positive
-    laps: int = Field(default=1, ge=1)
+    laps: int = Field(default=1, ge=1, le=LEGS_MAX // 4)
     corner_radius_m: NotNegative = 0.0
     pauses_s: tuple[NotNegative, ...] = ()
 
@@ -121,8 +125,8 @@ class Network(Section):
     measure at different instants. It calls the devices what it likes where ``own_names``."""
 
     name: Name
-    interval_s: Positive
-    phase_s: NotNegative = 0.0
+    interval_s: Interval
+    phase_s: NotNegative = Field(default=0.0, le=1e6)
     position_sd_m: Positive | None = None
     own_names: bool = False
 
@@ -147,7 +151,7 @@ class Device(Section):
     falls as a sine in time. ``wander_density_mps2_sqrthz`` adds the integral of white acceleration
     to the drive."""
 
-    count: int = Field(default=1, ge=1)
+    count: int = Field(default=1, ge=1, le=DEVICES_MAX)
     route: Route
     speed_mps: Positive | None = None
     wander_density_mps2_sqrthz: Positive | None = None
@@ -157,7 +161,7 @@ class Device(Section):
     hill_amplitude_m: NotNegative = 0.0
     hill_period_s: Positive = 180.0
     lever_arm_m: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
-    beacon_interval_s: Positive
+    beacon_interval_s: Interval
     ground_truth_rate_hz: Positive | None = None
     clock: ClockModel = ClockModel()
     imu: ImuModel | None = None
@@ -234,6 +238,7 @@ class Device(Section):
             interval_ns(rate)
         if self.ground_truth_rate_hz is not None:
             interval_ns(self.ground_truth_rate_hz)
+        check_motion(self)
         smooth = self.motion(0, "vue_1").smooth
         if isinstance(self.route, RandomRoute) and self.gait is None:
             smooth = self.route.corner_radius_m > 0
@@ -293,6 +298,11 @@ class Scenario(Section):
         """Time from the first stamp to the end of the last device's run [s]."""
         longest = max(device.motion(self.seed, vue).duration_s for vue, device in self.each_device)
         return min(longest, self.max_duration_s or math.inf)
+
+    @model_validator(mode="after")
+    def _fits_into_memory(self) -> Self:
+        check_size(self)
+        return self
 
     @model_validator(mode="after")
     def _heights_known(self) -> Self:

@@ -24,7 +24,7 @@ from netpos.filters.compile import kernel
 from netpos.filters.conditioning import Robust, reweight
 from netpos.filters.fit import neg2_log_likelihood
 from netpos.filters.gate import accepted_rows
-from netpos.filters.manoeuvre import add_manoeuvre
+from netpos.filters.manoeuvre import add_manoeuvre, measures_velocity
 from netpos.filters.measurement import (
     GROUP,
     VARIANCE,
@@ -282,7 +282,9 @@ def _at_once(
         if refuses and options.manoeuvre_speed_sd > 0.0:
             end = _add_explanations(k, end, prior, epoch, options, found)
     best = int(np.argmax(found.log_weights[:count]))
-    turns = may_turn(groups, since_turn_s, options) and found.accepted[best, 0] == 1.0
+    turns = found.accepted[best, 0] == 1.0 and may_turn(
+        prior.means[best], rows, since_turn_s, options
+    )
     if turns:
         _turn(end, prior, best, max(since_turn_s, epoch.unheard_s), rows, options, found)
         end += 1
@@ -300,10 +302,15 @@ def _at_once(
 
 
 @kernel
-def may_turn(groups: int, since_turn_s: float, options: FilterOptions) -> bool:
-    """Whether an epoch of so many groups begins a component "it has turned", ``since_turn_s``
-    after the last one; several RSUs tell where the device is."""
-    return bool(groups == 1 and options.manoeuvre_speed_sd > 0.0 and since_turn_s >= TURN_PERIOD_S)
+def may_turn(mean: Array, rows: Array, since_turn_s: float, options: FilterOptions) -> bool:
+    """Whether an epoch ``rows`` begins a component "it has turned" beside mean (n,),
+    ``since_turn_s`` after the last one: several RSUs tell where the device is, and a measured
+    velocity whether it has turned."""
+    if options.manoeuvre_speed_sd <= 0.0 or since_turn_s < TURN_PERIOD_S:
+        return False
+    if rows.shape[0] == 0 or rows[rows.shape[0] - 1, GROUP] > 0.0:
+        return False
+    return not measures_velocity(mean, rows, options.height_m)
 
 
 @kernel
@@ -335,15 +342,19 @@ def is_too_wide(
 
 @kernel
 def is_not_enough(
-    result: StepResult, epoch: EpochInput, since_turn_s: float, options: FilterOptions
+    result: StepResult,
+    mean: Array,
+    epoch: EpochInput,
+    since_turn_s: float,
+    options: FilterOptions,
 ) -> bool:
-    """Whether one component does not explain an epoch, of which ``engine.step`` made ``result``:
-    something is refused, or nothing tells that the device has not turned."""
+    """Whether one component does not explain an epoch, of which ``engine.step`` made ``result``
+    and mean (n,): something is refused, or nothing tells that the device has not turned."""
     groups = int(epoch.rows[epoch.rows.shape[0] - 1, GROUP]) + 1
     if options.manoeuvre_speed_sd <= 0.0:
         return False
     refused = result.groups < groups
-    return bool(refused or may_turn(groups, since_turn_s, options))
+    return bool(refused or may_turn(mean, epoch.rows, since_turn_s, options))
 
 
 @kernel
@@ -461,7 +472,7 @@ def _advance(
         return Update(components, 0.0, 0, 0.0, 0.0, False)
     if not several:
         result = step(x, S, epoch, dynamics.motion, dynamics.bias, options, memory)
-        if not is_not_enough(result, epoch, since_turn_s, options):
+        if not is_not_enough(result, x, epoch, since_turn_s, options):
             return Update(components, result.nis, result.used, 0.0, 0.0, False)
         P = srukf.covariance(memory.prior_cov_or_sqrt) if square_root else memory.prior_cov_or_sqrt
         components, moved = one_component(memory.prior_mean, P), True

@@ -24,6 +24,7 @@ MOTION_MODELS = (
     "strapdown",
 )
 ROBUST = ("none", "huber", "student_t")
+TRUST = ("listed", "first", "any")
 AMBIGUITY = ("hypotheses", "step_heading")
 
 
@@ -57,7 +58,10 @@ class TrackerConfig:
         "continuous | werner (fokin2020:eq.4) | white_acceleration (eq.36)",
     )
     accel_density_mps2_sqrthz: float = real(
-        1.0, 1e-6, 1e3, "continuous: density of the white acceleration [m/s^2/sqrt(Hz)]"
+        0.5,
+        1e-6,
+        1e3,
+        "continuous: density of the white acceleration between manoeuvres [m/s^2/sqrt(Hz)]",
     )
     steady_accel_density_mps2_sqrthz: float = real(
         0.0,
@@ -89,6 +93,12 @@ class TrackerConfig:
         1e-6,
         1e3,
         "inertial: noise of the forward acceleration and side slip; strapdown: of each axis",
+    )
+    inertial_manoeuvre_speed_sd_mps: float = real(
+        0.0,
+        0.0,
+        1e3,
+        "inertial, in place of manoeuvre_speed_sd_mps: velocity step that the IMU does not show",
     )
     gyro_noise_density: float = real(
         5e-3, 1e-9, 10.0, "inertial, strapdown: noise of the gyros [rad/s/sqrt(Hz)]"
@@ -143,7 +153,7 @@ class TrackerConfig:
         1e-10, 0.0, 1.0, "continuous: clock white frequency noise [s/sqrt(s)]"
     )
     clock_walk_density: float = real(
-        2.5e-7, 0.0, 1.0, "continuous: clock random-walk frequency noise [(s/s)/sqrt(s)]"
+        5e-7, 0.0, 1.0, "continuous: clock random-walk frequency noise [(s/s)/sqrt(s)]"
     )
     clock_offset_sd_s: float = real(1e-4, 0.0, 1e3, "initial clock offset sd, mean 0")
     clock_drift_mean: float = real(25e-6, -1.0, 1.0, "initial clock drift [s/s]")
@@ -154,6 +164,9 @@ class TrackerConfig:
     )
     initial_pose_wait_s: float = real(
         5.0, 0.0, 1e6, "with require_initial_pose: after this the track starts itself"
+    )
+    accept_initialpose: bool = described(
+        True, "start anew at an initialpose that the measurements permit; false: refuse all"
     )
     initial_position_sd_max_m: float = real(
         5.0, 1e-3, 1e4, "a first fix is taken once its position sd is below this"
@@ -221,7 +234,11 @@ class TrackerConfig:
     )
     isolate_rsus: bool = described(True, "refuse an RSU that at least two others contradict")
     manoeuvre_speed_sd_mps: float = real(
-        0.0, 0.0, 1e3, "velocity step a measurement that fails the gate may reveal; 0: none"
+        5.0,
+        0.0,
+        1e3,
+        "velocity step that a measurement which fails the gate may reveal; 0: none. Not with an"
+        " IMU, interacting models, filter kf or backend filterpy",
     )
     inflate_after_epochs: int = count(
         2, "epochs rejected in a row before the velocity opens to its initial sd"
@@ -258,6 +275,18 @@ class TrackerConfig:
     allowed_devices: str = described(
         "", "regular expression that names of devices match as a whole; empty: any name"
     )
+    trust: str = choice(
+        "first",
+        TRUST,
+        "whose RsuInfo counts: listed (RSUs of rsus_file, as described there) | first (anybody's;"
+        " the first pose of each RSU stands) | any (anybody's newest)",
+    )
+    max_rate_hz: int = count(
+        500, "measurements of one device by one RSU in a second of their stamps; more are refused"
+    )
+    max_rsu_rate_hz: int = count(
+        5000, "measurements by one RSU in a second of their stamps; more are refused"
+    )
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -270,6 +299,8 @@ class TrackerConfig:
             raise ValueError(
                 f"allowed_devices {self.allowed_devices!r} is no regular expression: {error}"
             ) from error
+        if self.require_initial_pose and not self.accept_initialpose:
+            raise ValueError("require_initial_pose needs accept_initialpose; set it to true")
         if self.motion_model == "strapdown":
             self._check_strapdown()
         if self.backend == "filterpy" and self.filter not in ("ekf", "ukf"):
@@ -287,11 +318,6 @@ class TrackerConfig:
                 " leave them at none and 0"
             )
         several = self.backend == "filterpy" or self.motion_model == "interacting"
-        if several and self.manoeuvre_speed_sd_mps > 0.0:
-            raise ValueError(
-                "manoeuvre_speed_sd_mps needs backend compiled and a single motion model, got"
-                f" {self.manoeuvre_speed_sd_mps}; set it to 0"
-            )
         if self.learn_errors and (several or self.motion_model == "strapdown"):
             raise ValueError(
                 "learn_errors needs backend compiled and a planar motion model other than"
@@ -337,6 +363,20 @@ class TrackerConfig:
     def use_imu(self) -> bool:
         """Whether the device's IMU is an input."""
         return self.motion_model in ("inertial", "strapdown")
+
+    @property
+    def manoeuvre_sd_mps(self) -> float:
+        """Velocity step per axis that a refused measurement may reveal to this estimate; 0: none.
+
+        Interacting models and the gain floor follow manoeuvres by themselves, and the reference
+        has none.
+        """
+        one_gaussian = self.filter == "kf" or self.backend == "filterpy"
+        if one_gaussian or self.motion_model in ("interacting", "strapdown"):
+            return 0.0
+        if self.use_imu:
+            return float(self.inertial_manoeuvre_speed_sd_mps)
+        return float(self.manoeuvre_speed_sd_mps)
 
     @property
     def step_errors(self) -> StepErrors:

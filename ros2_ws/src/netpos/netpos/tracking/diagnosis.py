@@ -13,6 +13,7 @@ from netpos.tracking.health import RsuReport, RsuState
 from netpos.tracking.refusals import Refused
 
 _NOTHING: Mapping[str, RsuErrors] = {}
+_NEVER: Mapping[str, int] = {}
 
 
 class Level(IntEnum):
@@ -69,6 +70,9 @@ def of_device(
     level = _DEVICE_LEVELS[status.state]
     if silent_s:
         level, state = Level.STALE, f"silent for {silent_s:.0f} s; was {state}"
+    poses = status.rejected.get("initialpose", 0)
+    if poses:
+        state = f"{state}; {poses} initialpose refused: the measurements exclude it"
     words = "" if refused is None else refused.words()
     if refused is not None and words:
         level = Level.ERROR if refused.all_of_it else max(level, Level.WARN)
@@ -105,11 +109,12 @@ def of_rsus(
     descriptions: Mapping[str, str],
     strangers: Mapping[str, Stranger],
     errors: Mapping[str, RsuErrors] = _NOTHING,
+    described: Mapping[str, int] = _NEVER,
 ) -> list[Finding]:
     """Every RSU heard, or of which something was refused, by name; ``errors``: the newest that is
-    learned."""
+    learned; ``described``: how many descriptions were refused since start."""
     heard = {report.rsu_id: report for report in reports}
-    names = sorted({*heard, *refused, *descriptions, *strangers})
+    names = sorted({*heard, *refused, *descriptions, *strangers, *described})
     return [
         _with_errors(
             _of_rsu(
@@ -118,6 +123,7 @@ def of_rsus(
                 refused.get(name),
                 descriptions.get(name),
                 strangers.get(name),
+                described.get(name, 0),
             ),
             errors.get(name),
         )
@@ -144,10 +150,13 @@ def _of_rsu(
     refused: Refused | None,
     fault: str | None,
     stranger: Stranger | None,
+    described: int,
 ) -> Finding:
     level, said, values = Level.OK, [], {}
     if report is not None:
         level, values = _RSU_LEVELS[report.state], _figures(report)
+    if described:
+        values = {**values, "refused: RsuInfo": str(described)}
     if fault is not None:
         level = Level.ERROR
         said.append(f"RsuInfo refused: {fault}")

@@ -224,7 +224,7 @@ class KalmanEstimate(OneModel):
             self.stamp_ns, self._prior = stamp_ns, None
             refused = result.groups < groups
             if not (refused or groups == 1) or not components.is_not_enough(
-                result, epoch, since_turn_s, options
+                result, self.mean, epoch, since_turn_s, options
             ):
                 return result.nis, result.used, accepted[:groups]
             prior = components.one_component(*self._prior_of_one())

@@ -75,13 +75,15 @@ def widen(innovations: Array, rows: Array, rsu: Rsu) -> None:
 def without_excluded(
     health: RsuHealth, stamp_ns: int, items: Sequence[AnySource]
 ) -> tuple[list[AnySource], list[RsuMeasurement]]:
-    """What may be fused, and what comes from an excluded RSU and is only looked at."""
+    """What may be fused, and what comes from an excluded or new RSU and is only looked at."""
     if health.trusts_all(stamp_ns):
         return list(items), []
     used: list[AnySource] = []
     watched: list[RsuMeasurement] = []
     for item in items:
-        if isinstance(item, RsuMeasurement) and health.excluded(item.rsu_id, stamp_ns):
+        if isinstance(item, RsuMeasurement) and health.excluded(
+            item.rsu_id, stamp_ns, item.vue_id
+        ):
             watched.append(item)
         else:
             used.append(item)

@@ -7,7 +7,8 @@ promises (a track led astray by two RSUs passes its gate, but not that); it spea
 when it takes it as it takes another one. Slots against it in a row, long enough and with
 measurements enough, isolate an RSU; slots for it, in a row and longer, re-admit it. So a sharp
 turn (the others are refused too), a burst, one of many devices with a blocked path, or two RSUs
-that contradict each other isolate nobody.
+that contradict each other isolate nobody. RSUs within 1 m of each other are one witness. An RSU
+that comes to a track which others hold is on probation first (``probation``).
 
 Everything follows from stamps. A slot is judged in one piece ``settle_s`` after its end, and the
 verdict holds for measurements from then on: while no measurement comes later than that, what a
@@ -26,6 +27,8 @@ from enum import IntEnum
 from netpos.tracking.health_memory import RsuMemory, Run, Vote
 from netpos.tracking.health_words import mean_nis, medians, off, rate_hz, words
 from netpos.tracking.observations import FittedEpoch, Observation
+from netpos.tracking.probation import Probation, independent
+from netpos.tracking.rsus import Rsu
 
 _AGREES, _REFUSED = 0.7, 0.3  # accept ratios
 _WITNESS = 2.5  # mean squared normalised innovation; that of a track led astray is larger
@@ -94,8 +97,18 @@ class RsuReport:
 class RsuHealth:
     """Collects observations of all tracks, reports and isolates RSUs."""
 
-    def __init__(self, config: HealthConfig | None = None) -> None:
+    def __init__(
+        self,
+        config: HealthConfig | None = None,
+        rsus: Mapping[str, Rsu] | None = None,
+        *,
+        probation: bool = False,
+    ) -> None:
+        """``rsus``: where they are, as far as known; ``probation``: new ones have to prove
+        themselves."""
         self._config = config or HealthConfig()
+        self._known: Mapping[str, Rsu] = {} if rsus is None else rsus
+        self._with_probation = probation
         self._slot_ns = int(self._config.slot_s * 1e9)
         self._settle_ns = int(self._config.settle_s * 1e9)
         self.reset()
@@ -111,6 +124,7 @@ class RsuHealth:
         self._due_ns = -(1 << 62)  # when the next one is
         self._trusted_ns = 0
         self._accused = False  # an RSU is, or was, excluded
+        self._probation = Probation(self._slot_ns, self._settle_ns)
 
     def observe(
         self,
@@ -190,12 +204,14 @@ class RsuHealth:
         """Whether no measurement with this stamp is to be refused."""
         if stamp_ns >= self._due_ns:
             self._advance(stamp_ns)
-        return not self._accused
+        return not (self._accused or self._probation.any)
 
-    def excluded(self, rsu_id: str, stamp_ns: int) -> bool:
-        """Whether a measurement of this RSU with this stamp is to be refused."""
+    def excluded(self, rsu_id: str, stamp_ns: int, vue_id: str = "") -> bool:
+        """Whether a measurement of this RSU with this stamp, of this device, is to be refused."""
         if stamp_ns >= self._due_ns:
             self._advance(stamp_ns)
+        if self._probation.any and self._probation.holds(rsu_id, vue_id, stamp_ns):
+            return True
         rsu = self._rsus.get(rsu_id)
         if rsu is None:
             return False
@@ -217,6 +233,7 @@ class RsuHealth:
         for slot in sorted(s for s in self._open if s < closed):
             self._judge(self._open.pop(slot), (slot + 1) * self._slot_ns)
         self._heard = {v: t for v, t in self._heard.items() if t > now_ns - _FORGET_NS}
+        self._probation.forget(self._heard.keys())
 
     def _judge(
         self, streams: Mapping[tuple[str, str], Mapping[int, Observation]], end_ns: int
@@ -236,8 +253,10 @@ class RsuHealth:
                 self._trusted_ns = max(self._trusted_ns, rsu.window[-1].stamp_ns)
         against: dict[str, list[Vote]] = {}
         agree: dict[str, list[Vote]] = {}
-        for votes in devices.values():
-            self._compare(votes, against, agree)
+        for vue_id, votes in devices.items():
+            taken = self._compare(votes, against, agree)
+            if self._with_probation:
+                self._probation.judge(vue_id, votes, taken, end_ns, self._known)
         for rsu_id in sorted(against.keys() | agree.keys()):
             self._extend(rsu_id, against.get(rsu_id, []), agree.get(rsu_id, []))
         self._decide(against, end_ns)
@@ -247,21 +266,34 @@ class RsuHealth:
         votes: Mapping[str, Vote],
         against: dict[str, list[Vote]],
         agree: dict[str, list[Vote]],
-    ) -> None:
-        """Sort what one device says of the RSUs into votes against and for them."""
+    ) -> frozenset[str]:
+        """Sort what one device says of the RSUs into votes against and for them; those it
+        takes."""
         trusted = [name for name in votes if not self._rsus[name].excluded]
-        taken = frozenset(
+        fitting = frozenset(
             name
             for name in trusted
             if votes[name].ratio >= _AGREES and votes[name].mean_nis <= _WITNESS
         )
-        refused = [name for name in trusted if votes[name].ratio <= _REFUSED]
+        old = [name for name in trusted if not self._is_held(name, votes[name])]
+        taken = fitting.intersection(old)
+        refused = [name for name in old if votes[name].ratio <= _REFUSED]
+        witnesses = independent(votes, taken, self._known)
+        needed = max(2, independent(votes, refused, self._known) + 1)
         for name, vote in votes.items():
             vote.witnesses = taken - {name}
             if vote.ratio >= _AGREES and vote.witnesses:
                 agree.setdefault(name, []).append(vote)
-            elif vote.ratio <= _REFUSED and len(taken) >= max(2, len(refused) + 1):
+            elif vote.ratio <= _REFUSED and witnesses >= needed:
                 against.setdefault(name, []).append(vote)
+        return fitting
+
+    def _is_held(self, rsu_id: str, vote: Vote) -> bool:
+        """Whether an RSU was on probation in a slot."""
+        newest = vote.entries[-1]
+        return self._with_probation and self._probation.holds(
+            rsu_id, newest.vue_id, newest.stamp_ns
+        )
 
     def _extend(self, rsu_id: str, against: list[Vote], agree: list[Vote]) -> None:
         """Lengthen the run of verdicts the majority of devices is for, end the other."""
@@ -331,7 +363,7 @@ class RsuHealth:
         ratio = -1.0
         if rsu.window:
             ratio = sum(e.accepted for e in rsu.window) / len(rsu.window)
-        state, text = self._verdict(rsu, now_ns, age_s, entries)
+        state, text = self._verdict(rsu_id, now_ns, age_s, entries)
         return RsuReport(
             rsu_id=rsu_id,
             state=state,
@@ -350,9 +382,9 @@ class RsuHealth:
         return [e for e in rsu.window if e.stamp_ns >= first_ns]
 
     def _verdict(
-        self, rsu: RsuMemory, now_ns: int, age_s: float, entries: list[Observation]
+        self, rsu_id: str, now_ns: int, age_s: float, entries: list[Observation]
     ) -> tuple[RsuState, str]:
-        faults = []
+        rsu, faults = self._rsus[rsu_id], []
         silent = age_s >= self._config.silent_after_s
         newest_ns = self._heard.get(rsu.last_vue, -1)
         if silent and newest_ns > max(rsu.last_ns, now_ns - self._config.silent_after_s * 1e9):
@@ -363,6 +395,8 @@ class RsuHealth:
                 consistent_s = (rsu.agrees.last_ns - rsu.agrees.first_ns) * 1e-9
                 faults.append(f"consistent again for {consistent_s:.0f} s")
             return RsuState.EXCLUDED, "; ".join(faults)
+        if rsu.window and self._probation.holds(rsu_id, rsu.last_vue, rsu.last_ns):
+            faults.append("new: not used until it agrees with the RSUs that track already")
         if rsu.against is not None and rsu.against.count >= _SPEAKS:
             faults.append(rsu.cause)
         elif len(entries) >= _FEW:

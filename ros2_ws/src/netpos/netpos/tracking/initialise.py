@@ -145,10 +145,7 @@ class Initialiser:
         if newest < self._next_attempt_ns:
             return None
         self._next_attempt_ns = newest + _ATTEMPT_NS
-        rows = np.vstack([entry[1] for entry in self._window])
-        ages = np.concatenate(
-            [np.full(len(entry[1]), (entry[0] - newest) * 1e-9) for entry in self._window]
-        )
+        rows, ages = self._stacked()
         fits = self._fits(rows, self._problem(rows, ages))
         if fits and not self._consistent(fits[0], len(rows)):
             fits = self._without_one(rows, ages) or fits
@@ -176,6 +173,32 @@ class Initialiser:
             self.missing = f"more than one place fits {self._heard(rows)}; waiting for more"
             return None
         return mean, cov * misfit
+
+    def excess_cost(self, stamp_ns: int, mean: Array, var: Array) -> float:
+        """How much worse the window fits where the device is at ``mean`` (6,), with variances
+        ``var`` (6,), at ``stamp_ns`` than where it fits best: chi-square with 2 degrees of freedom
+        for the true position. 0 without measurements of the time."""
+        age_s = (stamp_ns - self._window[-1][0]) * 1e-9 if self._window else math.inf
+        if age_s > self._config.initial_window_s:
+            return 0.0
+        rows, ages = self._stacked()
+        problem = self._problem(rows, ages)
+        fits = self._fits(rows, problem)
+        if not fits:
+            return 0.0
+        var = var.copy()
+        var[:2] += age_s**2 * var[2:4]
+        start = mean.copy()
+        start[4] = _clock_at(start, rows, self._config.device_height_m)
+        cost = _solve(start, (*problem[:3], mean, var))[0]
+        return max(0.0, cost - fits[0][0])
+
+    def _stacked(self) -> tuple[Array, Array]:
+        """The rows of the window, and their ages [s], <= 0, against the newest."""
+        newest = self._window[-1][0]
+        rows = np.vstack([entry[1] for entry in self._window])
+        ages = [np.full(len(entry[1]), (entry[0] - newest) * 1e-9) for entry in self._window]
+        return rows, np.concatenate(ages)
 
     def _heard(self, rows: Array) -> str:
         """What was measured, by whom."""

@@ -39,7 +39,7 @@ def options_of(config: TrackerConfig) -> FilterOptions:
         inflate_after=int(config.inflate_after_epochs),
         lost_after=int(config.max_rejected_epochs),
         initial_speed_sd=float(config.initial_speed_sd_mps),
-        manoeuvre_speed_sd=float(config.manoeuvre_speed_sd_mps),
+        manoeuvre_speed_sd=config.manoeuvre_sd_mps,
         coast_after_s=float(config.coast_after_s),
         integrity_risk=float(config.integrity_risk),
         robust=robust_options_of(config),

@@ -10,8 +10,9 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from netpos.messages.fields import MAP_FRAME
+from netpos.messages.fields import MAP_FRAME, bad_stamp, malformed_nanosec
 from netpos.messages.values import Field, ImuSample, RsuMeasurement
+from netpos.tracking.rate_limit import RATE
 from netpos.tracking.sequencer import Item
 from netpos.tracking.validation import explanation
 
@@ -23,6 +24,7 @@ OTHERS = "others"
 
 _SENTENCES = {
     "zero_stamp": "header.stamp is 0; set it to the time of emission",
+    "bad_stamp": "{bad_stamp}",
     "no_fields": "fields is 0; set the bits of what was measured",
     "unknown_fields": "fields is {fields}, of which only the bits {known} have a meaning",
     "vue_id": "{vue_id!r} is no name of a topic; send letters, digits and _, at most 100",
@@ -40,10 +42,16 @@ _SENTENCES = {
     "future_stamp": "its stamp is {ahead:.3g} s ahead of all others",
     "clock_ahead": "its stamp is {ahead:.3g} s ahead of those of the other RSUs; set its clock",
     "duplicate": "another one with the same stamp came before it",
+    "initialpose_off": "initial poses are refused; set accept_initialpose to true",
     "disabled": "the tracker is disabled; call its service enable with data: true",
     "not_finite": "a value is not finite, or beyond 1e9",
     "variance": "a covariance is not symmetric and positive definite with sds from 1e-6 to 1e6",
 }
+
+_RATE_SENTENCE = (
+    f"{RATE}: more in a second of its stamps than max_rate_hz or max_rsu_rate_hz allow; stop its "
+    "sender, or raise them"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +94,7 @@ class Refusals:
         self._devices: dict[str, _Door] = {}
         self._rsus: dict[str, _Door] = {}
         self._descriptions: dict[str, str] = {}
+        self._refused_descriptions: Counter[str] = Counter()
         self.any = False
         """Whether anything was ever refused: what is taken counts from then on."""
 
@@ -99,6 +108,12 @@ class Refusals:
             sentence = f"{sentence} (from {item.rsu_id})"
         _count(self._devices, item.vue_id, reason, sentence)
         return sentence
+
+    def refuse_rate(self, rsu_id: str, vue_id: str) -> None:
+        """Count a measurement beyond the limits of its RSU, at the least cost."""
+        self.any = True
+        _count(self._rsus, rsu_id, RATE, _RATE_SENTENCE)
+        _count(self._devices, vue_id, RATE, f"{_RATE_SENTENCE} (from {rsu_id})")
 
     def take(self, item: Item | ImuSample) -> None:
         """Note that an item is taken."""
@@ -116,8 +131,10 @@ class Refusals:
 
     def refuse_description(self, rsu_id: str, fault: str) -> None:
         """Note that the description of an RSU is refused, and why."""
-        if len(self._descriptions) < SOURCES_MAX:
+        kept = rsu_id in self._descriptions or len(self._descriptions) < SOURCES_MAX
+        if kept:
             self._descriptions[rsu_id] = fault
+        self._refused_descriptions[rsu_id if kept else OTHERS] += 1
 
     def take_description(self, rsu_id: str) -> None:
         """Note that an RSU is known now."""
@@ -126,6 +143,10 @@ class Refusals:
     def descriptions(self) -> dict[str, str]:
         """RSUs whose newest description is refused, and why."""
         return dict(self._descriptions)
+
+    def refused_descriptions(self) -> dict[str, int]:
+        """How many descriptions of each RSU were refused since start."""
+        return dict(self._refused_descriptions)
 
     def of_device(self, vue_id: str) -> Refused:
         """What was refused of a device."""
@@ -156,6 +177,7 @@ class Refusals:
             reference=getattr(item, "reference_rsu_id", ""),
             tdoa=getattr(item, "tdoa_s", 0.0),
             frame=getattr(item, "frame_id", ""),
+            bad_stamp=bad_stamp(malformed_nanosec(item.stamp_ns) or 0),
             map=MAP_FRAME,
             ahead=ahead_s,
             behind=-ahead_s,

@@ -4,7 +4,8 @@ node."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from netpos.tracking.settings import (
     TrackerSettings,
     bag_settings,
     fusion_fact,
+    list_of,
     not_usual,
     tracker_fact,
 )
@@ -38,6 +40,7 @@ from netpos.tracking.tracker import Tracker
 
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _FUSION = "fusion."
+_LIST = "rsus_file"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +52,8 @@ class ReplaySummary:
     epochs: int
     estimates: int
     rejected: Mapping[str, Mapping[str, int]]
+    refused_rsus: Mapping[str, str] = field(default_factory=dict)
+    """RSUs whose description was refused, and why."""
 
 
 def replay_bag(
@@ -76,7 +81,7 @@ def replay_bag(
             raise BagError(
                 f"{bag_in} has no {topics.RSU_MEASUREMENTS}: record that topic to replay"
             )
-        metadata = source.metadata | tracker_fact(config)
+        metadata = source.metadata | tracker_fact(config, settings.rsus)
         if settings.networks:
             fusion = FusionConfig.from_mapping(settings.fusion)
             metadata |= fusion_fact(settings.networks, fusion)
@@ -97,17 +102,21 @@ def replay_bag(
             for vue_id, odometry in tracker.smoothed().items() if smooth else ():
                 _write_smoothed(out, vue_id, odometry)
         rejected = {vue: dict(counts) for vue, counts in tracker.rejected().items()}
-        return ReplaySummary(not_usual(config), epochs, estimates, rejected)
+        refused = tracker.refused_rsus()
+        return ReplaySummary(not_usual(config), epochs, estimates, rejected, refused)
 
 
 def changed(settings: TrackerSettings, overrides: Mapping[str, Any]) -> TrackerSettings:
-    """Settings with other values; names of parameters of the fusion begin with ``fusion.``."""
+    """Settings with other values; names of parameters of the fusion begin with ``fusion.``, and
+    ``rsus_file`` is a file with the network's list of RSUs."""
     fusion = {n.removeprefix(_FUSION): v for n, v in overrides.items() if n.startswith(_FUSION)}
     if fusion and not settings.networks:
         raise ValueError(f"the bag has one network, so there is no {_FUSION}{min(fusion)} to set")
     rest = {name: v for name, v in overrides.items() if not name.startswith(_FUSION)}
+    file = rest.pop(_LIST, None)
     return replace(
         settings,
+        rsus=settings.rsus if file is None else list_of(str(file)),
         parameters={**settings.parameters, **rest},
         fusion={**settings.fusion, **fusion},
     )
@@ -118,10 +127,11 @@ def tracker_of(
 ) -> Tracker | Chain:
     """One tracker, or one for each of several networks with the fusion of their tracks."""
     if not settings.networks:
-        return Tracker(config, keep_posteriors=smooth)
+        return Tracker(config, settings.rsu_list, keep_posteriors=smooth)
     if smooth:
         raise ValueError("the tracks of several networks are not smoothed; leave --smooth out")
-    return Chain(settings.networks, config, FusionConfig.from_mapping(settings.fusion))
+    fusion = FusionConfig.from_mapping(settings.fusion)
+    return Chain(settings.networks, config, fusion, settings.rsu_list)
 
 
 def _through(
@@ -129,7 +139,8 @@ def _through(
 ) -> Iterator[list[TrackOutput]]:
     """Feed every message to the tracker and copy it, unless a tracker wrote it."""
     for entry in source.messages([topics.RSU_INFO]):
-        tracker.add_rsu(codec().rsu_info_from_msg(entry.message))
+        with suppress(ValueError):  # refused: the tracker names it
+            tracker.add_rsu(codec().rsu_info_from_msg(entry.message))
     read = {name: reading_of(name, info, tracker.config) for name, info in source.topics.items()}
     for entry in source.messages([t for t in source.topics if not topics.is_tracker_output(t)]):
         out.write_raw(entry.topic, entry.type_name, entry.cdr, entry.log_time_ns)

@@ -10,13 +10,18 @@ from typing import Any
 import yaml
 
 from netpos.bags import BagError, BagReader
+from netpos.bags.importers.own.rsus import read_rsus, rsus_of_text
+from netpos.bags.rsus_file import rsus_text
 from netpos.common.yaml_text import YamlError, load_yaml
 from netpos.messages import topics
+from netpos.messages.values import RsuInfo
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.networks.config import FusionConfig
 
 # What a bag calls the parameters of the tracker of its measurements, as YAML.
 TRACKER_FACT = "tracker"
+# The network's list of RSUs that its tracker was given, as YAML.
+RSUS_FACT = "rsus"
 # Its scenario, with the seed, where it was simulated, as YAML.
 SCENARIO_FACT = "scenario"
 # The same of the networks whose tracks are fused and the parameters of that.
@@ -37,6 +42,13 @@ class TrackerSettings:
     fusion: Mapping[str, Any] = field(default_factory=dict)
     names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """What each network calls the devices, where it has names of its own."""
+    rsus: str = ""
+    """The network's list of RSUs as YAML; empty: none."""
+
+    @property
+    def rsu_list(self) -> list[RsuInfo]:
+        """The RSUs of the list. Raises ``ValueError`` for one that cannot be understood."""
+        return rsus_of_text(self.rsus, "the list of RSUs") if self.rsus else []
 
     def names_by(self, network: str) -> tuple[str, ...]:
         """What a network calls the devices to expect."""
@@ -56,13 +68,26 @@ def bag_settings(bag: BagReader) -> TrackerSettings:
         raise BagError(f"{bag.path} does not say with which parameters it is to be tracked")
     networks = tuple(map(str, (fusion or {}).pop("networks", ())))
     parameters = _mapping(bag, TRACKER_FACT) or {}
-    return TrackerSettings(parameters, networks=networks, fusion=fusion or {})
+    lists = bag.facts.get(RSUS_FACT, ())
+    if len(lists) > 1:
+        raise BagError(f"{bag.path} was tracked with {len(lists)} different lists of RSUs")
+    rsus = lists[0] if lists else ""
+    return TrackerSettings(parameters, networks=networks, fusion=fusion or {}, rsus=rsus)
 
 
-def tracker_fact(config: TrackerConfig) -> dict[str, str]:
-    """What a bag is told of the parameters of its tracker, every one of them; trackers of several
-    networks say the same."""
-    return {TRACKER_FACT: yaml.safe_dump(asdict(replace(config, network="")))}
+def tracker_fact(config: TrackerConfig, rsus: str = "") -> dict[str, str]:
+    """What a bag is told of the parameters of its tracker, every one of them, and of the list of
+    RSUs it was given; trackers of several networks say the same."""
+    told = {TRACKER_FACT: yaml.safe_dump(asdict(replace(config, network="")))}
+    return told | ({RSUS_FACT: rsus} if rsus else {})
+
+
+def list_of(file: Path | str) -> str:
+    """The RSUs of a file as the text of a list, every digit kept; empty for no file.
+
+    Raises ``BagError`` for a file that cannot be understood.
+    """
+    return rsus_text(read_rsus(Path(file))) if file else ""
 
 
 def not_usual(config: TrackerConfig) -> dict[str, Any]:

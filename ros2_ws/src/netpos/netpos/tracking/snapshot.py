@@ -10,6 +10,7 @@ import numpy as np
 
 from netpos.messages.values import Array
 from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
+from netpos.tracking.epoch_rows import EpochRows
 from netpos.tracking.estimates import Estimate
 from netpos.tracking.initialise import Initialiser
 from netpos.tracking.networks.secondary import OwnNoise
@@ -35,6 +36,8 @@ class TrackSnapshot:
     bias: Array = field(default_factory=lambda: np.zeros((2, 0)))
     pose: tuple[int, Array, Array] | None = None
     """Stamp, mean and covariance of an initial pose that waits for its heading."""
+    recent: tuple[tuple[int, EpochRows], ...] = ()
+    """Stamps and rows of the newest epochs that fitted: an initial pose is weighed with them."""
     nis_window: NisWindow = field(default_factory=NisWindow)
     yaw: float = 0.0
     has_clock: bool = False

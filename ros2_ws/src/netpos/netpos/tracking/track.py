@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from netpos.filters.chi_square import chi_square_bound
 from netpos.filters.measurement import VARIANCE
 from netpos.filters.state import N_CORE, POSITION, VELOCITY
 from netpos.messages.values import (
@@ -65,6 +66,8 @@ from netpos.tracking.snapshot import TrackSnapshot
 
 _IMU_HOLE_S = 0.05
 _LEVEL_MAX_M = 1e6
+_RECENT = 5  # epochs
+_POSE_SD_MIN_M = 1.0  # an initial pose is no surer than this when it is weighed
 _BLIND_GYRO = 1.0  # rad/s/sqrt(Hz): what the heading does while the IMU is silent
 
 
@@ -245,10 +248,36 @@ class Track:
             self._state.bias = biases.arrays()
         return epoch_rows
 
+    def _is_excluded(self, stamp_ns: int, mean: Array, cov: Array) -> bool:
+        """Whether the newest measurements exclude an initial pose (6,), (6, 6), however sure it
+        is of itself."""
+        state = self._state
+        window = state.initialiser
+        if state.estimate is not None:
+            if state.rejected_in_row:
+                return False
+            window = Initialiser(self._config)
+            for then_ns, rows in state.recent:
+                bias_var = rows.slow_variance(state.biases)
+                window.add(then_ns, rows.rows, bias_var, self._heard(rows))
+        var = np.diag(cov).copy()
+        var[POSITION] = np.maximum(var[POSITION], _POSE_SD_MIN_M**2)
+        bound = chi_square_bound(2, 1.0 - self._config.gate_probability)
+        return window.excess_cost(stamp_ns, mean, var) > bound
+
+    def _heard(self, epoch_rows: EpochRows) -> tuple[Rsu, ...]:
+        """The RSUs of an epoch."""
+        return tuple(
+            self._rsus[i.rsu_id] for i in epoch_rows.items if isinstance(i, RsuMeasurement)
+        )
+
     def _start_from_pose(self, stamp_ns: int, pose: InitialPose) -> None:
+        mean, cov = pose_state(self._config, pose.position[:2], pose.cov[:2, :2])
+        if self._is_excluded(stamp_ns, mean, cov):
+            self._state.rejected["initialpose"] += 1
+            return
         self._forget()
         self._state.pose_wait.posed = True
-        mean, cov = pose_state(self._config, pose.position[:2], pose.cov[:2, :2])
         if self._heading >= 0:
             self._state.pose = stamp_ns, mean, cov  # the first antennas tell the heading
             return
@@ -260,9 +289,7 @@ class Track:
         if state.pose_wait.at(self._config, stamp_ns, tracked=state.accepted > 0):
             state.rejected["no_initial_pose"] += len(epoch_rows.items)
             return ()
-        heard = tuple(
-            self._rsus[i.rsu_id] for i in epoch_rows.items if isinstance(i, RsuMeasurement)
-        )
+        heard = self._heard(epoch_rows)
         bias_var = epoch_rows.slow_variance(state.biases)
         if state.phase_start.heard(epoch_rows):
             state.estimate = state.phase_start.add(stamp_ns, epoch_rows.rows, bias_var)
@@ -338,7 +365,10 @@ class Track:
         if refused:
             state.rejected["gate"] += refused
         sources = self._note_accepted(stamp_ns, epoch_rows, accepted) if dof > 0 else ()
-        self._count_rejected(not refused or mostly_accepted(epoch_rows, accepted))
+        fitted = not refused or mostly_accepted(epoch_rows, accepted)
+        if fitted:
+            state.recent = (*state.recent[1 - _RECENT :], (stamp_ns, epoch_rows))
+        self._count_rejected(fitted)
         return EpochResult(stamp_ns, nis, dof, sources)
 
     def _learn(self, stamp_ns: int, rows: Array, accepted: Array) -> None:
@@ -503,6 +533,6 @@ class Track:
         state, config = self._state, self._config
         level = state.nis_window.inflation() * radius_m
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
-        moved = state.undetected_m + config.manoeuvre_speed_sd_mps * unheard_s
+        moved = state.undetected_m + config.manoeuvre_sd_mps * unheard_s
         level = max(level, min(moved, _LEVEL_MAX_M))
         return estimate.radius(level)

@@ -27,9 +27,11 @@ from netpos.tracking.clocks import Clocks, Stranger
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.diagnosis import Finding
 from netpos.tracking.health import HealthConfig, RsuHealth, RsuReport
+from netpos.tracking.rate_limit import RATE, RateLimit
 from netpos.tracking.refusals import Refusals
+from netpos.tracking.register import Register
 from netpos.tracking.report import TrackOutput
-from netpos.tracking.rsus import REFERENCED, Rsu
+from netpos.tracking.rsus import REFERENCED
 from netpos.tracking.sequencer import IMU, Epoch, Item, Sequencer
 from netpos.tracking.shared_errors import SharedErrors
 from netpos.tracking.smoothing import check_smoothable
@@ -48,11 +50,17 @@ class Tracker:
     comes back."""
 
     def __init__(
-        self, config: TrackerConfig | None = None, *, keep_posteriors: bool = False
+        self,
+        config: TrackerConfig | None = None,
+        rsus: Iterable[RsuInfo] = (),
+        *,
+        keep_posteriors: bool = False,
     ) -> None:
-        """``keep_posteriors``: for ``smoothed``, the memory of a whole recording.
+        """``rsus``: the network's own list, known from the start (``trust``).
+        ``keep_posteriors``: for ``smoothed``, the memory of a whole recording.
 
-        Raises ``ValueError`` where they are wanted of a tracker that cannot be smoothed.
+        Raises ``ValueError`` where they are wanted of a tracker that cannot be smoothed, for an
+        unsound list, or with ``trust: listed`` without one.
         """
         self._config = config or TrackerConfig()
         self._keep_posteriors = keep_posteriors
@@ -60,18 +68,21 @@ class Tracker:
             check_smoothable(self._config)
         if self._config.motion_model == "strapdown":
             _strapdown().warm_up(self._config)
-        self._rsus: dict[str, Rsu] = {}
         self._tracks: dict[str, Track | StrapdownTrack] = {}
         self._sequencers: dict[str, Sequencer] = {}
         self._clocks: dict[str, Clocks] = {}  # of devices whose time was set back
         settle_s = max(2.0, self._config.history_s + 1.0)
-        self._health = RsuHealth(HealthConfig(settle_s=settle_s))
         self._shared = SharedErrors(settle_s) if self._config.learn_errors else None
         self._touched: set[str] = set()
         self._untold: dict[str, int] = {}  # stamps of refusals to be told
         self._errors: dict[str, RsuErrors] = {}  # the newest by RSU
         self.refusals = Refusals()
         """What was refused at the door, by device and RSU."""
+        self._register = Register(self._config.trust, rsus, self.refusals)
+        self._rsus = self._register.known
+        self._health = RsuHealth(
+            HealthConfig(settle_s=settle_s), self._rsus, probation=self._config.trust == "first"
+        )
         self.enabled = True
         self._admission = Admission(
             self._config.max_devices,
@@ -79,6 +90,7 @@ class Tracker:
             round(1e9 * self._config.max_gap_s),
         )
         self._left: list[str] = []
+        self._rate = RateLimit(self._config.max_rate_hz, self._config.max_rsu_rate_hz)
 
     @property
     def config(self) -> TrackerConfig:
@@ -91,13 +103,17 @@ class Tracker:
         return len(self._rsus)
 
     def add_rsu(self, info: RsuInfo) -> None:
-        """Make an RSU known or replace it. Raises ``ValueError`` for an unsound description."""
-        fault = validation.rsu_fault(info)
-        if fault is not None:
-            self.refusals.refuse_description(info.rsu_id, fault)
-            raise ValueError(f"RSU refused: {fault}")
-        self.refusals.take_description(info.rsu_id)
-        self._rsus[info.rsu_id] = Rsu.of(info)
+        """Make an RSU known, or describe it anew as far as ``trust`` lets it. Raises
+        ``ValueError`` for a description that is unsound or not trusted."""
+        self._register.add(info)
+
+    def refused_rsus(self) -> dict[str, str]:
+        """RSUs whose newest description is refused, and why."""
+        return self.refusals.descriptions()
+
+    def accept_rsus(self) -> list[str]:
+        """Let the poses hold that known RSUs were refused (``trust: first``); their names."""
+        return self._register.accept()
 
     def add(self, item: Item | ImuSample) -> str | None:
         """Take a measurement; returns the reason when it is refused (also counted in the track's
@@ -105,6 +121,10 @@ class Tracker:
         if isinstance(item, RsuMeasurement):
             if self._config.network and not self.concerns(item):
                 return None
+            source = item.rsu_id, item.vue_id, item.stamp_ns
+            if self.floods(*source):
+                return RATE
+            self._rate.count(*source)
         elif isinstance(item, ImuSample):
             return self._add_imu(item)
         reason = self._fault(item)
@@ -154,6 +174,17 @@ class Tracker:
         due = track.refused.total() % _TELL_EVERY == 1 and not track.has_estimate
         if due and is_vue_id(item.vue_id):
             self._untold[item.vue_id] = newest_ns or max(item.stamp_ns, 0)
+
+    def floods(self, rsu_id: str, vue_id: str, stamp_ns: int) -> bool:
+        """Whether a measurement is one too many of its RSU, which is then counted as refused: it
+        need not be added. A device that is not known stays so."""
+        if not self._rate.exceeded(rsu_id, vue_id, stamp_ns):
+            return False
+        track = self._tracks.get(vue_id)
+        if track is not None:
+            track.refused[RATE] += 1
+        self.refusals.refuse_rate(rsu_id, vue_id)
+        return True
 
     def concerns(self, measurement: RsuMeasurement) -> bool:
         """Whether a measurement is for this tracker: one of a network leaves those of RSUs it
@@ -236,7 +267,14 @@ class Tracker:
             diagnosis.of_network(
                 self.rsu_count, descriptions, [*warnings, *self._admission.warnings()]
             ),
-            *diagnosis.of_rsus(reports, refused.rsus(), descriptions, strangers, self._errors),
+            *diagnosis.of_rsus(
+                reports,
+                refused.rsus(),
+                descriptions,
+                strangers,
+                self._errors,
+                refused.refused_descriptions(),
+            ),
         ]
 
     def coasting(self, vue_id: str, stamp_ns: int) -> TrackOutput | None:
@@ -322,6 +360,8 @@ class Tracker:
             case GroundSpeed():
                 return validation.speed_fault(item)
             case InitialPose():
+                if not self._config.accept_initialpose:
+                    return "initialpose_off"
                 return validation.pose_fault(item)
 
     def _sequencer(self, vue_id: str) -> Sequencer:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
 from operator import attrgetter
 from typing import NamedTuple
@@ -14,7 +15,7 @@ from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.filters.rows import rsu_axes
 from netpos.filters.sensors.model import Reading, Refusal
 from netpos.filters.sensors.table import readings
-from netpos.messages.fields import MAP_FRAME
+from netpos.messages.fields import MAP_FRAME, bad_stamp, malformed_nanosec, stamp_fault
 from netpos.messages.topics import is_vue_id
 from netpos.messages.values import (
     Array,
@@ -44,6 +45,47 @@ _ASYMMETRY_MAX = 1e-6  # relative
 _CONDITION_MIN = 1e-12  # smallest over largest eigenvalue; below it a Cholesky factor is rounding
 
 
+class _Limit(NamedTuple):
+    """What one number of a description may be; 0 always may where it means none."""
+
+    name: str  # in the message
+    value: Callable[[RsuInfo], float]
+    unit: str
+    low: float
+    high: float
+
+    def fault(self, info: RsuInfo) -> str | None:
+        value = self.value(info)
+        if self.low <= value <= self.high or (value == 0.0 and self.low > 0.0):
+            return None
+        none = ", or 0 for none" if self.low > 0.0 else ""
+        return (
+            f"{self.name} of {info.rsu_id} is {value:g} {self.unit}; "
+            f"send one from {self.low:g} to {self.high:g}{none}"
+        )
+
+
+def _axis(i: int) -> Callable[[RsuInfo], float]:
+    return lambda info: float(info.position[i])
+
+
+# Beyond these the arithmetic of a track leaves what double precision holds.
+_TIME = ("s", 1e-6, 1e9)
+_LIMITS = (
+    *(_Limit(f"pose.position.{axis}", _axis(i), "m", -1e9, 1e9) for i, axis in enumerate("xyz")),
+    *(
+        _Limit(f"{name}_bias_sd", attrgetter(f"{name}_bias_sd_{unit}"), unit, 1e-9, 1e6)
+        for name, unit in (("azimuth", "rad"), ("elevation", "rad"), ("range", "m"))
+    ),
+    _Limit("common_range_bias_sd", attrgetter("common_range_bias_sd_m"), "m", 1e-9, 1e6),
+    *(
+        _Limit(f"{name}_correlation_time", attrgetter(f"{name}_correlation_time_s"), *_TIME)
+        for name in ("bias", "common_bias", "noise")
+    ),
+    _Limit("wavelength", attrgetter("wavelength_m"), "m", 1e-6, 1e6),
+)
+
+
 class _Checks(NamedTuple):
     """What is looked at in the scalars of a measurement."""
 
@@ -67,7 +109,7 @@ def measurement_fault(m: RsuMeasurement) -> str | None:
     if not is_vue_id(m.vue_id):
         return "vue_id"
     if m.stamp_ns <= 0:
-        return "zero_stamp"
+        return stamp_fault(m.stamp_ns)
     fields = int(m.fields)
     if not fields or fields & ~_KNOWN:
         return "no_fields" if not fields else "unknown_fields"
@@ -93,6 +135,8 @@ def measurement_fault(m: RsuMeasurement) -> str | None:
 def explanation(m: RsuMeasurement, reason: str) -> str:
     """Sentence about the scalar for which a measurement was refused: its name, its value and the
     remedy. Empty where the reason concerns no scalar."""
+    if reason == "bad_stamp":
+        return bad_stamp(malformed_nanosec(m.stamp_ns) or 0)
     for field, reading in _READINGS.items():
         if not int(m.fields) & field:
             continue
@@ -128,14 +172,14 @@ def difference_fault(m: RsuMeasurement, rsu: Rsu, reference: Rsu | None) -> str 
 def velocity_fault(v: Velocity) -> str | None:
     """Reason to refuse a velocity."""
     if v.stamp_ns <= 0:
-        return "zero_stamp"
+        return stamp_fault(v.stamp_ns)
     return "frame" if v.frame_id != MAP_FRAME else _gaussian_fault(v.velocity, v.cov)
 
 
 def speed_fault(v: GroundSpeed) -> str | None:
     """Reason to refuse a ground speed."""
     if v.stamp_ns <= 0:
-        return "zero_stamp"
+        return stamp_fault(v.stamp_ns)
     if not (math.isfinite(v.speed_mps) and math.isfinite(v.speed_var)):
         return "not_finite"
     if abs(v.speed_mps) >= _LARGEST:
@@ -146,13 +190,15 @@ def speed_fault(v: GroundSpeed) -> str | None:
 def imu_fault(sample: ImuSample) -> str | None:
     """Reason to refuse an IMU sample."""
     if sample.stamp_ns <= 0:
-        return "zero_stamp"
+        return stamp_fault(sample.stamp_ns)
     values = (*sample.angular_velocity.tolist(), *sample.specific_force.tolist())
     return None if all(abs(v) < _LARGEST for v in values) else "not_finite"
 
 
 def pose_fault(p: InitialPose) -> str | None:
     """Reason to refuse an initial pose; its stamp may be 0 (tools send it so)."""
+    if malformed_nanosec(p.stamp_ns) is not None:
+        return stamp_fault(p.stamp_ns)
     return _frame_fault(p.frame_id) or _gaussian_fault(p.position, p.cov)
 
 
@@ -181,7 +227,11 @@ def rsu_fault(info: RsuInfo) -> str | None:
         return f"common_bias_correlation_time of {info.rsu_id} must be > 0 s where it has a bias"
     if not 0.0 <= info.noise_correlation_time_s < _LARGEST:
         return f"noise_correlation_time of {info.rsu_id} must be finite and >= 0 s"
-    return _array_fault(info)
+    nanosec = malformed_nanosec(info.stamp_ns)
+    if nanosec is not None:
+        return f"RsuInfo of {info.rsu_id}: {bad_stamp(nanosec)}"
+    outside = (limit.fault(info) for limit in _LIMITS)
+    return _array_fault(info) or next((fault for fault in outside if fault), None)
 
 
 def _array_fault(info: RsuInfo) -> str | None:

@@ -35,7 +35,7 @@ def warm_up(network: str | None = None) -> None:
 def warm_up_components() -> None:
     """Two epochs of a mixture, the first of which begins it by a refused fix; once in a
     process."""
-    config = TrackerConfig(manoeuvre_speed_sd_mps=1.0)
+    config = TrackerConfig()
     estimate = estimates.start(config, 0, np.zeros(6), np.eye(6))
     for k in (1, 2):
         rows = linear_rows(np.full(2, 9.0), np.eye(2) / 100.0, np.eye(2, 6), 0)
@@ -46,7 +46,7 @@ def warm_up_components() -> None:
 @cache
 def warm_up_anchors() -> None:
     """Two epochs of an ambiguous phase; once in a process."""
-    tracker = Tracker(TrackerConfig(hold_s=0.0, manoeuvre_speed_sd_mps=1.0))
+    tracker = Tracker(TrackerConfig(hold_s=0.0))
     tracker.add_rsu(
         RsuInfo(rsu_id="anchor", position=np.zeros(3), baseline_m=0.2, wavelength_m=0.1)
     )
@@ -84,7 +84,7 @@ def _fixes_of_a_network() -> None:
 
 
 def _angles_and_ranges() -> None:
-    tracker = Tracker(TrackerConfig(hold_s=0.0, manoeuvre_speed_sd_mps=1.0))
+    tracker = Tracker(TrackerConfig(hold_s=0.0))
     for name, x in (("a", 0.0), ("b", 40.0)):
         tracker.add_rsu(RsuInfo(rsu_id=name, position=np.array([x, 0.0, 0.0])))
     position = np.array([10.0, 10.0, 0.0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import shutil
 import subprocess
@@ -10,9 +11,11 @@ import tempfile
 import time
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -20,6 +23,7 @@ from mcap.writer import CompressionType, Writer
 from netpos.bags import BagError, BagReader, BagWriter, codec
 from netpos.bags.qos import is_latched
 from netpos.bags.recover import checksums, recover
+from netpos.bags.scan import unpack
 from netpos.bags.types import definition
 
 CLOCK = "rosgraph_msgs/msg/Clock"
@@ -307,6 +311,7 @@ def test_every_cut_of_the_last_records(tmp_path: Path, original: tuple[bytes, Co
 WRITER = """
 import sys, time
 from pathlib import Path
+from types import SimpleNamespace
 from netpos.bags import BagWriter, codec
 bag = BagWriter(Path(sys.argv[1]))
 flushed = time.monotonic()
@@ -339,3 +344,189 @@ def test_killed_writer_loses_at_most_a_second(tmp_path: Path, seed: int) -> None
     for _, log_time_ns, cdr in content(report.output):
         stamp = int.from_bytes(cdr[4:8], "little") * 10**9 + int.from_bytes(cdr[8:12], "little")
         assert stamp == log_time_ns
+
+
+DAMAGES = 60
+"""Bags of each kind of damage; ``scripts/fuzz.py`` makes more."""
+
+
+def facts(path: Path) -> dict[str, Any]:
+    """What a bag says, message by message and of itself."""
+    with BagReader(path) as reader:
+        return {
+            "messages": Counter(
+                (e.topic, e.type_name, e.log_time_ns, e.cdr) for e in reader.messages()
+            ),
+            "definitions": {name: info.definition for name, info in reader.topics.items()},
+            "metadata": dict(reader.metadata),
+        }
+
+
+def compare(path: Path, original: dict[str, Any]) -> None:
+    """Everything that is called saved is as it was."""
+    found = facts(path)
+    assert not found["messages"] - original["messages"]
+    for what in ("definitions", "metadata"):
+        said = {k: v for k, v in found[what].items() if k != "recovered_from"}
+        assert said.items() <= original[what].items()
+
+
+@pytest.fixture(scope="module")
+def many_chunks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag of which fifty flips leave something."""
+    rng = random.Random(5)
+    folder = tmp_path_factory.mktemp("many") / "run"
+    with BagWriter(folder, metadata={"scenario": "name: x\nseed: 3\n", "seed": "3"}) as bag:
+        for i in range(600):
+            said = rng.randrange(2**31 * 10**9)
+            bag.write("/rsu/info" if i % 2 else "/clock", codec().clock_to_msg(said), i)
+            if i % 5 == 4:
+                bag.flush()
+    return folder
+
+
+@pytest.mark.parametrize("flips", [1, 8, 50])
+def test_flipped_bytes_are_never_called_saved(
+    many_chunks: Path, flips: int, tmp_path: Path
+) -> None:
+    original, saved = facts(many_chunks), 0
+    (file,) = many_chunks.glob("*.mcap")
+    for seed in range(DAMAGES):
+        rng = random.Random(1000 * flips + seed)
+        folder = tmp_path / str(seed) / "run"
+        shutil.copytree(many_chunks, folder)
+        bad = bytearray(file.read_bytes())
+        for _ in range(flips):
+            bad[rng.randrange(len(bad))] ^= 1 << rng.randrange(8)
+        (folder / file.name).write_bytes(bad)
+        try:
+            report = recover(folder)
+        except BagError as error:
+            assert "nothing could be saved" in str(error)  # noqa: PT017
+            continue
+        compare(report.output or folder, original)
+        saved += report.messages
+    assert saved > 0.1 * DAMAGES * original["messages"].total()
+
+
+def test_flips_in_the_description_of_a_bag_are_noticed(many_chunks: Path, tmp_path: Path) -> None:
+    """metadata.yaml has no checksum: what it says counts where the file says the same."""
+    original = facts(many_chunks)
+    text = (many_chunks / "metadata.yaml").read_bytes()
+    for seed in range(2 * DAMAGES):
+        rng = random.Random(seed)
+        folder = tmp_path / str(seed) / "run"
+        shutil.copytree(many_chunks, folder)
+        bad = bytearray(text)
+        bad[rng.randrange(len(bad))] ^= 1 << rng.randrange(8)
+        (folder / "metadata.yaml").write_bytes(bad)
+        try:
+            compare(folder, original)
+        except BagError as error:
+            assert "try: netpos recover" in str(error)  # noqa: PT017
+        output = recover(folder).output
+        compare(output or folder, original)
+        if output is not None:
+            assert facts(output)["messages"] == original["messages"]
+
+
+@pytest.mark.parametrize("old", [b"/clock", b"rosgraph_msgs/msg/Clock"])
+def test_names_changed_alike_in_all_records_without_a_checksum(
+    many_chunks: Path, tmp_path: Path, old: bytes
+) -> None:
+    """One letter other in metadata.yaml and in every plain record of the file."""
+    original = facts(many_chunks)
+    folder = tmp_path / "run"
+    shutil.copytree(many_chunks, folder)
+    new = old[:-1] + bytes([old[-1] ^ 1])
+    for file in folder.iterdir():
+        file.write_bytes(file.read_bytes().replace(old, new))
+    compare(recover(folder).output, original)
+
+
+def test_facts_changed_alike_in_all_records_are_noticed(many_chunks: Path, tmp_path: Path) -> None:
+    """The copy under a checksum no longer fits."""
+    folder = tmp_path / "run"
+    shutil.copytree(many_chunks, folder)
+    for file in folder.iterdir():
+        file.write_bytes(file.read_bytes().replace(b"seed: 3", b"seed: 2"))
+    with pytest.raises(BagError, match="what it says of its run has a wrong CRC"):
+        BagReader(folder)
+
+
+def test_facts_of_an_older_bag_count_where_two_copies_agree(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bags without the copy under a checksum."""
+    monkeypatch.setattr("netpos.bags.layout.RUN_ATTACHMENT", "something/else")
+    with BagWriter(tmp_path / "run", metadata={"seed": "3", "name": "x"}) as bag:
+        bag.write("/clock", codec().clock_to_msg(5), 5)
+    whole = tmp_path / "run" / "metadata.yaml"
+    whole.write_text(whole.read_text().replace("seed: '3'", "seed: '2'"))
+    with pytest.raises(BagError, match="copies of the run's metadata differ"):
+        BagReader(tmp_path / "run")
+    report = recover(tmp_path / "run")
+    with BagReader(report.output) as reader:
+        assert reader.metadata == {"recovered_from": "run", "seed": "3", "name": "x"}
+    whole.unlink()
+    shutil.rmtree(report.output)
+    (file,) = (tmp_path / "run").glob("*.mcap")
+    file.write_bytes(file.read_bytes().replace(b"seed: '3'", b"seed: '2'"))
+    report = recover(tmp_path / "run")
+    assert report.doubtful == ["seed"]
+    assert "left out of the run's metadata, unproven: seed" in str(report)
+    with BagReader(report.output) as reader:
+        assert reader.metadata == {"recovered_from": "run", "name": "x"}
+
+
+@pytest.mark.parametrize("name", ["run_0.mcap", "metadata.yaml"])
+def test_a_pipe_in_place_of_a_file_is_refused(tmp_path: Path, name: str) -> None:
+    write(tmp_path / "run")
+    (tmp_path / "run" / name).unlink()
+    os.mkfifo(tmp_path / "run" / name)
+    with pytest.raises(BagError, match=r"no regular file|not a bag"):
+        BagReader(tmp_path / "run")
+    if name == "run_0.mcap":
+        with pytest.raises(BagError, match="no regular file"):
+            recover(tmp_path / "run")
+        with pytest.raises(BagError, match="no regular file"):
+            recover(tmp_path / "run" / name)
+        with pytest.raises(BagError, match="no regular file"):
+            BagReader(tmp_path / "run" / name)
+
+
+def test_a_sparse_file_larger_than_the_memory(
+    tmp_path: Path, original: tuple[bytes, Counter]
+) -> None:
+    """Of 20 GB nothing is read into memory; the messages before the hole are saved."""
+    data, messages = original
+    folder = damaged(tmp_path, data[:-50])
+    file = folder / "run_0.mcap"
+    with file.open("r+b") as stream:
+        stream.truncate(20 * 10**9)
+    with pytest.raises(BagError, match="no sound index"):
+        BagReader(file)
+    report = recover(folder)
+    assert content(report.output) == messages
+    assert report.bytes_total == 20 * 10**9
+
+
+def test_a_few_bytes_that_unpack_to_gigabytes(tmp_path: Path) -> None:
+    bomb = zstandard.compress(bytes(2**20)) * 3
+    for size in (2**40, 2**20):
+        chunk = SimpleNamespace(
+            compression="zstd", data=bomb, uncompressed_size=size, uncompressed_crc=0
+        )
+        if size == 2**20:
+            assert unpack(chunk) == bytes(size)
+        else:
+            with pytest.raises(ValueError, match="promises 1099511627776 bytes"):
+                unpack(chunk)
+    short = SimpleNamespace(
+        compression="zstd",
+        data=zstandard.compress(bytes(10**8)),
+        uncompressed_size=1000,
+        uncompressed_crc=0,
+    )
+    with pytest.raises(ValueError, match="holds 1001 bytes, not 1000"):
+        unpack(short)

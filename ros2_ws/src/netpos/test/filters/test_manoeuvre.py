@@ -7,8 +7,9 @@ import math
 import filter_rows
 import numpy as np
 import pytest
-from netpos.filters.manoeuvre import add_manoeuvre, detection_delay_s
+from netpos.filters.manoeuvre import add_manoeuvre, detection_delay_s, measures_velocity
 from netpos.filters.measurement import GATE_VARIANCE, Kind, curvature_variance, linearise
+from netpos.filters.rows import linear_rows
 from netpos.messages.values import Array
 
 MEAN = np.array([30.0, 20.0, 5.0, -1.0, 0.0, 0.0])
@@ -71,3 +72,29 @@ def test_a_step_at_any_time_moves_the_place_by_half_of_it() -> None:
         np.testing.assert_allclose(found, drawn, rtol=0.01)
     cov[:4, :4] -= np.kron(found, np.eye(2))
     np.testing.assert_allclose(cov, 0.0, atol=1e-12)
+
+
+def velocities(sd: float) -> Array:
+    """A measured velocity: two linear rows of variance sd²."""
+    return linear_rows(np.zeros(2), sd**2 * np.eye(2), np.eye(2, 6, 2), 0)
+
+
+def test_a_measured_velocity_shows_a_step_at_once() -> None:
+    cov, rows = 0.01 * np.eye(6), velocities(0.1)
+    assert detection_delay_s(MEAN, cov, rows, 1.0, GATE, SPEED, np.empty(6)) == (0.0, 0.0)
+    assert measures_velocity(MEAN, rows, 1.0)
+    assert not measures_velocity(MEAN, rows[:1], 1.0)
+    assert not measures_velocity(MEAN, problem(1)[1], 1.0)
+
+
+def test_a_velocity_too_uncertain_to_show_a_step_leaves_it_to_the_positions() -> None:
+    """At sd so large that the step is far within the gate, the delay is that of the other rows."""
+    cov, rows = problem(2)
+    alone = detection_delay_s(MEAN, cov, rows, 1.0, GATE, SPEED, np.empty(6))
+    with_both = np.concatenate([rows, velocities(1e6)])
+    both = detection_delay_s(MEAN, cov, with_both, 1.0, GATE, SPEED, np.empty(6))
+    np.testing.assert_allclose(both, alone, rtol=1e-6)
+    assert detection_delay_s(MEAN, cov, velocities(1e6), 1.0, GATE, SPEED, np.empty(6)) == (
+        math.inf,
+        math.inf,
+    )

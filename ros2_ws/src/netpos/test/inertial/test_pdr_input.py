@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from netpos.inertial.pdr import PedestrianDeadReckoning
 from netpos.inertial.pdr_config import PdrConfig
 from netpos.inertial.steps import StepConfig
+from netpos.messages.fields import stamp_ns
 from straight_walk import G, Walk, heading_error, run, walk
 
 
@@ -218,3 +220,18 @@ def test_the_order_of_arrival_of_imu_and_field_does_not_matter(late_ns: int) -> 
     expected, got = through(True), through(False)
     assert expected[50:] == got[50:]
     assert len(got) > 200
+
+
+def test_a_time_that_is_none_is_counted_and_changes_nothing() -> None:
+    pdr = PedestrianDeadReckoning()
+    bad = stamp_ns(SimpleNamespace(sec=1, nanosec=4 * 10**9))
+    for _ in range(3):
+        assert pdr.add_imu(bad, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81)) is None
+    pdr.add_magnetic_field(bad, (2e-5, 0.0, 0.0))
+    assert pdr.counters["bad_stamp"] == 3
+    assert pdr.counters["magnetic_bad_stamp"] == 1
+    assert pdr.take_notices() == [
+        "bad_stamp: header.stamp.nanosec is 4000000000; send one below 1000000000"
+    ]
+    pdr.add_imu(10**9, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
+    assert "clock_reset" not in pdr.counters

@@ -298,3 +298,35 @@ def test_types_are_flattened_to_their_fields() -> None:
 def test_a_type_with_sequences_is_not_read() -> None:
     assert Layout(["I[]", "d"]).unpack(b"\0\1\0\0" + bytes(16)) is None
     assert Layout(["I", "d"]).unpack(b"\0\1\0\0" + bytes(16)) == [0, 0.0]
+
+
+@pytest.mark.parametrize("nanosec", [10**9, 4 * 10**9, 2**32 - 1])
+def test_a_time_that_is_none_is_left_to_the_codec_of_messages(nanosec: int) -> None:
+    fast, make = cdr_codec(), codec()
+    for type_name, read in ((MEASUREMENT, fast.measurement), (IMU, fast.imu)):
+        store = typestore()
+        value = (
+            make.measurement_to_msg(RsuMeasurement(stamp_ns=5, rsu_id="a", vue_id="v"))
+            if type_name == MEASUREMENT
+            else make.imu_to_msg(
+                ImuSample(
+                    stamp_ns=5,
+                    vue_id="v",
+                    angular_velocity=np.zeros(3),
+                    specific_force=np.zeros(3),
+                )
+            )
+        )
+        value.header.stamp.nanosec = 10**9 - 1
+        assert read(bytes(store.serialize_cdr(value, type_name))).stamp_ns == 10**9 - 1
+        value.header.stamp.nanosec = nanosec
+        assert read(bytes(store.serialize_cdr(value, type_name))) is None
+
+
+@given(measurements)
+def test_the_source_of_a_measurement_is_read_alone(value: RsuMeasurement) -> None:
+    message = codec().measurement_to_msg(value)
+    cdr = bytes(typestore().serialize_cdr(message, MEASUREMENT))
+    found = cdr_codec().source(cdr)
+    assert found in (None, (value.rsu_id, value.vue_id, value.stamp_ns))
+    assert (found is None) == (cdr_codec().measurement(cdr) is None)

@@ -11,7 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from netpos.bags import codec, typestore
-from netpos.messages.fields import base_link, stamp_ns, vue_of_frame
+from netpos.messages.fields import (
+    base_link,
+    certain_stamp_ns,
+    malformed_nanosec,
+    stamp_ns,
+    vue_of_frame,
+)
 from netpos.messages.values import (
     AngleConvention,
     Beacon,
@@ -362,3 +368,36 @@ def test_measurements_survive_bit_by_bit(values: list[float], flags: int) -> Non
         **numbers,
     )
     assert_same(m, codec().measurement_from_msg(over_the_wire(codec().measurement_to_msg(m))))
+
+
+@pytest.mark.parametrize("nanosec", [10**9, 4 * 10**9, 2**32 - 1])
+def test_a_time_that_is_none_is_known_as_such(nanosec: int) -> None:
+    make = codec()
+    time = make.time(1)
+    for sec in (-(2**31), 0, 7, 2**31 - 1):
+        time.sec, time.nanosec = sec, nanosec
+        ns = stamp_ns(time)
+        assert -(2**63) <= ns < -(2**31) * 10**9
+        assert malformed_nanosec(ns) == nanosec
+        with pytest.raises(ValueError, match=f"nanosec is {nanosec}; send one below 1000000000"):
+            certain_stamp_ns(time)
+
+
+@pytest.mark.parametrize(
+    ("sec", "nanosec"), [(0, 0), (-(2**31), 0), (2**31 - 1, 10**9 - 1), (-1, 5)]
+)
+def test_a_time_is_its_nanoseconds(sec: int, nanosec: int) -> None:
+    time = codec().time(sec * 10**9 + nanosec)
+    assert (time.sec, time.nanosec) == (sec, nanosec)
+    assert stamp_ns(time) == certain_stamp_ns(time) == sec * 10**9 + nanosec
+    assert malformed_nanosec(stamp_ns(time)) is None
+
+
+def test_nobody_else_judges_these_stamps() -> None:
+    """The values of all other messages go through the door of a tracker."""
+    make = codec()
+    state = ClockState(stamp_ns=5, vue_id="v", offset_s=0.0, drift=0.0)
+    message = make.clock_state_to_msg(state)
+    message.header.stamp.nanosec = 10**9
+    with pytest.raises(ValueError, match="nanosec is 1000000000"):
+        make.clock_state_from_msg(message)

@@ -24,7 +24,12 @@ INFO = RsuInfo(
     baseline_m=TURNS * WAVELENGTH,
     wavelength_m=WAVELENGTH,
 )
-CONFIG: dict[str, Any] = {"filter": "srukf", "initial_speed_sd_mps": 1.5, "hold_s": 0.0}
+CONFIG: dict[str, Any] = {
+    "filter": "srukf",
+    "initial_speed_sd_mps": 1.5,
+    "hold_s": 0.0,
+    "accel_density_mps2_sqrthz": 1.0,
+}
 
 
 def true_values(xy: Array) -> tuple[Array, Array]:

@@ -183,7 +183,7 @@ def run(config: TrackerConfig, mean: Array, cov: Array, inputs: Any) -> tuple[in
 
 @pytest.mark.parametrize("change", [{}, {"filter": "ekf"}])
 def test_a_run_is_its_steps(change: dict[str, Any]) -> None:
-    config = TrackerConfig(**change)
+    config = TrackerConfig(**change, manoeuvre_speed_sd_mps=0.0)
     motion, options = motions_of(config)[0], options_of(config)
     mean, cov = start()
     stamps, starts, rows = drive()
@@ -213,7 +213,9 @@ def test_a_run_is_its_steps(change: dict[str, Any]) -> None:
 
 
 def test_a_run_ends_where_the_track_is_lost() -> None:
-    config = TrackerConfig(max_rejected_epochs=3, inflate_after_epochs=100, filter="ekf")
+    config = TrackerConfig(
+        max_rejected_epochs=3, inflate_after_epochs=100, filter="ekf", manoeuvre_speed_sd_mps=0.0
+    )
     mean, cov = start()
     stamps, starts, rows = drive(60)
     done, (means, _, _, _, taken, _) = run(config, mean, 1e-4 * cov, (stamps, starts, rows))

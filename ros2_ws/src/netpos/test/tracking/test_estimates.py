@@ -265,12 +265,10 @@ def test_bad_combinations(values: dict[str, Any], message: str) -> None:
         {"robust": "huber", "backend": "filterpy", "filter": "ekf"},
         {"nlos_probability": 0.1, "motion_model": "interacting"},
         {"robust": "student_t", "motion_model": "interacting"},
-        {"manoeuvre_speed_sd_mps": 2.0, "motion_model": "interacting"},
-        {"manoeuvre_speed_sd_mps": 2.0, "backend": "filterpy", "filter": "ekf"},
     ],
 )
 def test_options_an_estimate_cannot_do_are_refused(values: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"robust|nlos|manoeuvre_speed_sd_mps needs"):
+    with pytest.raises(ValueError, match=r"robust|nlos"):
         TrackerConfig(**values)
 
 

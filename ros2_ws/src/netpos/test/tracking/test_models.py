@@ -196,3 +196,21 @@ def test_growing_appends_independent_states() -> None:
     np.testing.assert_array_equal(P[7:, 7:], np.diag([4.0, 9.0]))
     assert not P[:7, 7:].any()
     assert not P[7:, :7].any()
+
+
+@pytest.mark.parametrize(
+    ("values", "sd"),
+    [
+        ({"manoeuvre_speed_sd_mps": 3.0}, 3.0),
+        ({"manoeuvre_speed_sd_mps": 3.0, "motion_model": "rigid_body"}, 3.0),
+        ({"manoeuvre_speed_sd_mps": 3.0, "motion_model": "inertial"}, 0.0),
+        ({"inertial_manoeuvre_speed_sd_mps": 0.3, "motion_model": "inertial"}, 0.3),
+        ({"inertial_manoeuvre_speed_sd_mps": 0.3, "manoeuvre_speed_sd_mps": 0.0}, 0.0),
+        ({"manoeuvre_speed_sd_mps": 3.0, "motion_model": "interacting"}, 0.0),
+        ({"manoeuvre_speed_sd_mps": 3.0, "backend": "filterpy", "filter": "ekf"}, 0.0),
+    ],
+)
+def test_a_manoeuvre_is_allowed_where_nothing_else_shows_it(
+    values: dict[str, Any], sd: float
+) -> None:
+    assert options_of(TrackerConfig(**values)).manoeuvre_speed_sd == sd

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from netpos.bags import codec
+from netpos.messages.fields import stamp_ns
 from netpos.messages.values import (
     Field,
     ImuSample,
@@ -261,3 +263,24 @@ def test_a_device_nobody_hears_is_coasting() -> None:
     (after,) = made.process()
     assert after.status.state is TrackState.TRACKING
     assert after.status.position_sd_m == pytest.approx(last.position_sd_m, rel=0.1)
+
+
+def test_a_time_that_is_none_is_told_of_the_device_and_the_rsu() -> None:
+    """It does not set the time of its device back, nor forward."""
+    made = tracker()
+    stamp = codec().time(T0)
+    stamp.nanosec = 4 * 10**9
+    for name in SITES:
+        made.add(measured(name))
+    before = made.process()
+    for _ in range(30):
+        assert made.add(measured("a", stamp_ns=stamp_ns(stamp))) == "bad_stamp"
+    words = "bad_stamp: header.stamp.nanosec is 4000000000; send one below 1000000000"
+    assert made.refusals.of_device("vue_1").sentence == f"{words} (from a)"
+    assert made.refusals.rsus()["a"].sentence == words
+    assert made.rejected()["vue_1"]["bad_stamp"] == 30
+    for name in SITES:
+        made.add(measured(name, at_s=0.1))
+    after = made.process()
+    assert before
+    assert after[-1].status.stamp_ns == T0 + S // 10

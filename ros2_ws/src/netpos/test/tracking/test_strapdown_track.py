@@ -288,7 +288,7 @@ def test_combinations_that_do_not_exist_are_refused(changes: dict[str, object], 
 def test_an_rsu_may_look_anywhere(simulation: Simulation, items: list[Item]) -> None:
     """Angles are turned by the pose of the RSU: all turned alike give the same track."""
     turn = Rotation.from_euler("ZYX", [1.0, 0.2, -0.1])
-    tracker = tracker_of(simulation)
+    tracker = tracker_of(simulation, trust="any")
     for rsu in simulation.rsus:
         tracker.add_rsu(replace(rsu, quaternion=turn.as_quat()))
 

@@ -125,7 +125,12 @@ def test_velocity_is_opened_after_rejected_epochs(world: Any, feed: Any) -> None
     lost = {}
     for after in (2, 10000):
         tracker = settled(
-            world, feed, Field.RANGE, inflate_after_epochs=after, max_rejected_epochs=10000
+            world,
+            feed,
+            Field.RANGE,
+            inflate_after_epochs=after,
+            max_rejected_epochs=10000,
+            manoeuvre_speed_sd_mps=0.0,
         )
         outputs = []
         for k in range(20):

@@ -60,7 +60,7 @@ def predicted(track: Any, stamp_ns: int) -> Any:
 def test_prediction_between_measurements_is_the_model(
     world: Any, feed: Any, matrices: Any
 ) -> None:
-    tracker = settled(world, feed, accel_density_mps2_sqrthz=0.7)
+    tracker = settled(world, feed, accel_density_mps2_sqrthz=0.7, clock_walk_density=2.5e-7)
     track = tracker._tracks["vue_1"]
     now = track._state.estimate
     ahead = predicted(track, T0 + 2_400_000_000)

@@ -171,8 +171,8 @@ def test_rsu_refused() -> None:
 
 
 def test_rsu_replaced(world: Any, feed: Any) -> None:
-    """A corrected description is used from then on."""
-    tracker = world.tracker()
+    """With ``trust: any`` a corrected description is used from then on."""
+    tracker = world.tracker(trust="any")
     assert tracker.rsu_count == 3
     for info in world.rsus.values():
         tracker.add_rsu(replace(info, position=info.position + np.array([1000.0, 0.0, 0.0])))

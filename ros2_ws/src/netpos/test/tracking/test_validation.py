@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from netpos.messages.fields import stamp_ns
 from netpos.messages.values import (
     Field,
     GroundSpeed,
+    ImuSample,
     InitialPose,
+    NetworkTrack,
     RsuInfo,
     RsuMeasurement,
     Velocity,
 )
+from netpos.tracking.networks.validation import network_track_fault
 from netpos.tracking.validation import (
     explanation,
+    imu_fault,
     measurement_fault,
     pose_fault,
     rsu_fault,
@@ -330,3 +336,67 @@ def test_a_scalar_that_is_not_sent_is_not_explained() -> None:
     bad = replace(GOOD, fields=Field.AZIMUTH, range_m=-1.0, toa_var=0.0, azimuth_var=-1.0)
     assert explanation(bad, "negative_range") == ""
     assert explanation(bad, "variance").startswith("azimuth_var is -1 rad^2")
+
+
+HUGE = replace(INFO, position=np.array([1e308, 0.0, 0.0]))
+ODD_TIME = replace(INFO, range_bias_sd_m=0.1, bias_correlation_time_s=1e-300)
+
+
+@pytest.mark.parametrize(
+    ("info", "text"),
+    [
+        (HUGE, "pose.position.x of a is 1e+308 m; send one from -1e+09 to 1e+09"),
+        (replace(INFO, position=np.array([0.0, -1.01e9, 0.0])), "pose.position.y of a is -1.01e+"),
+        (replace(INFO, position=np.array([0.0, 0.0, 1.01e9])), "pose.position.z of a is 1.01e+09"),
+        (replace(INFO, position=np.array([-1e9, 1e9, 1e9])), None),
+        (ODD_TIME, "bias_correlation_time of a is 1e-300 s; send one from 1e-06 to 1e+09, or 0"),
+        (replace(ODD_TIME, bias_correlation_time_s=0.99e-6), "bias_correlation_time of a is 9.9e"),
+        (replace(ODD_TIME, bias_correlation_time_s=1e-6), None),
+        (replace(ODD_TIME, bias_correlation_time_s=1e9), None),
+        (replace(ODD_TIME, bias_correlation_time_s=INF), "bias_correlation_time of a is inf s"),
+        (
+            replace(INFO, common_range_bias_sd_m=1.0, common_bias_correlation_time_s=1e-300),
+            "common_bias_correlation_time of a is 1e-300 s",
+        ),
+        (replace(INFO, noise_correlation_time_s=1e-300), "noise_correlation_time of a is 1e-300"),
+        (replace(ODD_TIME, bias_correlation_time_s=1.0, range_bias_sd_m=1e-300), "range_bias_sd"),
+        (replace(ODD_TIME, bias_correlation_time_s=1.0, range_bias_sd_m=1.1e6), "range_bias_sd"),
+        (
+            replace(INFO, azimuth_bias_sd_rad=5e-324, bias_correlation_time_s=1.0),
+            "azimuth_bias_sd",
+        ),
+        (replace(INFO, baseline_m=1e-300, wavelength_m=1e-300), "wavelength of a is 1e-300 m"),
+    ],
+)
+def test_numbers_of_an_rsu_that_no_track_can_hold(info: RsuInfo, text: str | None) -> None:
+    fault = rsu_fault(info)
+    assert (fault is None) if text is None else (fault or "").startswith(text), fault
+
+
+def malformed(nanosec: int = 4 * 10**9) -> int:
+    return stamp_ns(SimpleNamespace(sec=5, nanosec=nanosec))
+
+
+def test_a_stamp_that_is_none_is_refused_of_everything() -> None:
+    bad = malformed()
+    m = replace(GOOD, stamp_ns=bad)
+    assert measurement_fault(m) == "bad_stamp"
+    assert explanation(m, "bad_stamp") == (
+        "header.stamp.nanosec is 4000000000; send one below 1000000000"
+    )
+    v = Velocity(stamp_ns=bad, vue_id="v", velocity=np.ones(2), cov=np.eye(2))
+    assert velocity_fault(v) == "bad_stamp"
+    s = GroundSpeed(stamp_ns=bad, vue_id="v", speed_mps=1.0, speed_var=1.0)
+    assert speed_fault(s) == "bad_stamp"
+    p = InitialPose(stamp_ns=bad, vue_id="v", position=np.ones(3), cov=np.eye(3))
+    assert pose_fault(p) == "bad_stamp"
+    zeros = np.zeros(3)
+    i = ImuSample(stamp_ns=bad, vue_id="v", angular_velocity=zeros, specific_force=zeros)
+    assert imu_fault(i) == "bad_stamp"
+    assert rsu_fault(replace(INFO, stamp_ns=bad)) == (
+        "RsuInfo of a: header.stamp.nanosec is 4000000000; send one below 1000000000"
+    )
+    track = NetworkTrack(stamp_ns=bad, network="n", vue_id="v", mean=np.zeros(6), cov=np.eye(6))
+    assert network_track_fault(track) == "bad_stamp"
+    assert measurement_fault(replace(GOOD, stamp_ns=malformed(10**9))) == "bad_stamp"
+    assert measurement_fault(replace(GOOD, stamp_ns=malformed(10**9 - 1))) is None

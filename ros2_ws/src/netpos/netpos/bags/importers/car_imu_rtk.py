@@ -23,6 +23,7 @@ from netpos.bags.errors import BagError
 from netpos.inertial.attitude import GRAVITY_MPS2
 from netpos.inertial.strapdown import earth_at
 from netpos.messages.values import Array, ImuSample, Odometry
+from netpos.world.geodesy import Datum
 
 Stamps = NDArray[np.int64]
 
@@ -122,11 +123,12 @@ def load_car_drive(path: Path, mount: Mount = MOUNT) -> CarDrive:
     offset_ns = round(mount.clock_offset_s * NS)
     imu_ns = start_ns + offset_ns + np.rint(share * (length_ms * 1e6)).astype(np.int64)
     rtk_ns, geodetic = _positions(path / f"gnss_{run}_sf.pos")
+    on_earth = geodetic * [180.0 / math.pi, 180.0 / math.pi, 1.0]
     return CarDrive(
         imu_ns=imu_ns,
         rates=rates,
         rtk_ns=rtk_ns,
-        antenna=_to_map(geodetic),
+        antenna=Datum(*on_earth[0].tolist()).to_map(on_earth),
         latitude_rad=float(geodetic[0, 0]),
         height_m=float(geodetic[0, 2]),
         lever_arm_m=mount.lever_arm_m,
@@ -196,25 +198,6 @@ def _lines(file: Path) -> list[str]:
         raise BagError(f"{file} does not exist; give the folder of the recording") from None
     except UnicodeDecodeError as error:
         raise BagError(f"{file} is not a text file ({error})") from None
-
-
-def _to_map(geodetic: Array) -> Array:
-    """(k, 3) east, north, up of the first of latitude, longitude [rad], height [m] on WGS 84."""
-    latitude, longitude, height = geodetic.T
-    a, e2 = 6378137.0, 6.69437999014e-3
-    n = a / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
-    level = (n + height) * np.cos(latitude)
-    earth = np.column_stack(
-        [
-            level * np.cos(longitude),
-            level * np.sin(longitude),
-            (n * (1 - e2) + height) * np.sin(latitude),
-        ]
-    )
-    sf, cf = math.sin(latitude[0]), math.cos(latitude[0])
-    sl, cl = math.sin(longitude[0]), math.cos(longitude[0])
-    axes = np.array([[-sl, cl, 0.0], [-sf * cl, -sf * sl, cf], [cf * cl, cf * sl, sf]])
-    return np.asarray((earth - earth[0]) @ axes.T)
 
 
 def truth_of(drive: CarDrive, vue_id: str) -> list[Odometry]:

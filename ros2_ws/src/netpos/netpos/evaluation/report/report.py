@@ -11,6 +11,7 @@ import jinja2
 from plotly.offline import get_plotlyjs
 
 from netpos import __version__
+from netpos.common.files import write_text
 from netpos.evaluation.evaluate import Evaluation, assess_bag
 from netpos.evaluation.metrics import SKIP_EPOCHS
 from netpos.evaluation.report import plots, tables
@@ -78,8 +79,7 @@ def write_report(
         sections=sections,
         left_out=left_out,
     )
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(page, encoding="utf-8")
+    write_text(out, page)
     return left_out
 
 

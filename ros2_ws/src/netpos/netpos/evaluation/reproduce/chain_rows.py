@@ -24,6 +24,7 @@ LONG, SHORT = 4.0, 0.5
 
 PAPER_FILTER = (
     ("process_noise", "werner"),
+    ("manoeuvre_speed_sd_mps", 0.0),
     ("steady_accel_density_mps2_sqrthz", 0.0),
     ("velocity_step_sd_mps", 0.1),  # sigma_xi = 1 m/s^2 over T = 0.1 s (petukhov:eq.2, 4, 23)
     ("velocity_correlation_s", 0.0),
@@ -38,7 +39,7 @@ LOOSE = Variant(name="loose")
 # The IMU's forward acceleration is not all there is: a turn on the spot may have to be revealed.
 TIGHT = Variant(
     name="tight",
-    settings=(("motion_model", "inertial"), ("manoeuvre_speed_sd_mps", 0.3)),
+    settings=(("motion_model", "inertial"), ("inertial_manoeuvre_speed_sd_mps", 0.3)),
 )
 _DEFAULTS = {
     LOOSE.name: Variant(name="loose, defaults", defaults=True),

@@ -91,9 +91,9 @@ FIG_5_DRAWN = tuple(
 )
 
 _WITH_IMU = (("motion_model", "inertial"),)
-_WITHOUT_IMU = (("motion_model", "constant_velocity"),)
+_WITHOUT_IMU = (("motion_model", "constant_velocity"), ("manoeuvre_speed_sd_mps", 0.0))
 _TOLD = (  # the settings of metis_madrid for 3 m/s: it keeps its speed, its turns are manoeuvres
-    *_WITHOUT_IMU,
+    ("motion_model", "constant_velocity"),
     ("process_noise", "continuous"),
     ("accel_density_mps2_sqrthz", 0.1),
     ("manoeuvre_speed_sd_mps", 3.0 * math.sqrt(2.0)),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import pickle
 from collections.abc import Callable
 from functools import cache
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import netpos
+from netpos.common.files import whole_file
 
 
 class Kept:
@@ -38,9 +38,8 @@ class Kept:
 
         def finish() -> Any:
             result = wait()
-            unfinished = path.with_suffix(f".{os.getpid()}")
-            unfinished.write_bytes(pickle.dumps(result))
-            unfinished.replace(path)
+            with whole_file(path) as unfinished:
+                unfinished.write_bytes(pickle.dumps(result))
             return result
 
         return finish

@@ -19,16 +19,24 @@ class Chain:
     """Takes what a ``Tracker`` takes and gives what all trackers and the fusion give."""
 
     def __init__(
-        self, networks: Sequence[str], config: TrackerConfig, fusion: FusionConfig
+        self,
+        networks: Sequence[str],
+        config: TrackerConfig,
+        fusion: FusionConfig,
+        rsus: Sequence[RsuInfo] = (),
     ) -> None:
         self.config = config
-        self._trackers = [Tracker(replace(config, network=name)) for name in networks]
+        self._trackers = [Tracker(replace(config, network=name), rsus) for name in networks]
         self.fusion = TrackFusion(networks, fusion)
 
     def add_rsu(self, info: RsuInfo) -> None:
-        """Make an RSU known to all. Raises ``ValueError`` for an unsound description."""
+        """Make an RSU known to all. Raises ``ValueError`` for a description that is refused."""
         for tracker in self._trackers:
             tracker.add_rsu(info)
+
+    def refused_rsus(self) -> dict[str, str]:
+        """RSUs whose newest description is refused, and why."""
+        return {k: v for tracker in self._trackers for k, v in tracker.refused_rsus().items()}
 
     def add(self, item: Item | ImuSample) -> None:
         """Give an item to every tracker: each takes what is for its network."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from netpos.messages.fields import MAP_FRAME
+from netpos.messages.fields import MAP_FRAME, stamp_fault
 from netpos.messages.topics import is_vue_id
 from netpos.messages.values import NetworkTrack
 
@@ -21,7 +21,7 @@ def network_track_fault(track: NetworkTrack) -> str | None:
     if not (is_vue_id(track.network) and is_vue_id(track.vue_id)):
         return "name"
     if track.stamp_ns <= 0:
-        return "zero_stamp"
+        return stamp_fault(track.stamp_ns)
     if track.frame_id != MAP_FRAME:
         return "frame"
     if track.mean.shape != (6,) or track.cov.shape != (6, 6) or track.own_cov.shape != (6, 6):

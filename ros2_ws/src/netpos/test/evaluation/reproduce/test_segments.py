@@ -19,6 +19,14 @@ LOSING = Experiment(
 )
 
 
+RIGID = (
+    ("accel_density_mps2_sqrthz", 1.0),
+    ("manoeuvre_speed_sd_mps", 0.0),
+    ("clock_walk_density", 2.5e-7),
+)
+"""Settings that lose the device in a turn."""
+
+
 def _of_the_tracker(setup: Setup, seed: int) -> dict[int, tuple[np.ndarray, float] | None]:
     """Position and protection level by stamp; None where the tracker has no track."""
     return {
@@ -31,7 +39,7 @@ def _of_the_tracker(setup: Setup, seed: int) -> dict[int, tuple[np.ndarray, floa
 
 @pytest.mark.parametrize("seed", [7, 8])
 def test_a_track_that_was_lost_comes_back_as_in_the_tracker(seed: int) -> None:
-    setup = Setup(LOSING)
+    setup = Setup(replace(LOSING, estimator="scenario", tracker=RIGID))
     track = setup.run(seed)
     assert track.losses > 0
     assert 0.1 < track.tracked.mean() < 1.0

@@ -12,10 +12,12 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any, Protocol
 
-from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.highlevel import AnyReader
 
-from netpos.bags.errors import BagError
+from netpos.bags.errors import BagError, require_file
+from netpos.bags.layout import METADATA_FILE
 from netpos.common.parameters import nearest
+from netpos.common.yaml_text import YamlError, check_limits, read_text
 
 DELIMITERS = {"comma": ",", "tab": "\t", "semicolon": ";", "blank": " "}
 EMPTY = {"", "nan", "none", "null", "na", "-"}
@@ -218,6 +220,13 @@ def messages(bag: Path, topic: str) -> Iterator[Message]:
     """
     if not bag.exists():
         raise BagError(f"{bag} does not exist; give a .bag, .mcap or .db3 file or a bag's folder")
+    if not bag.is_dir():
+        require_file(bag)
+    elif (bag / METADATA_FILE).exists():
+        try:
+            check_limits(read_text(bag / METADATA_FILE))
+        except YamlError as error:
+            raise BagError(f"{bag}/{METADATA_FILE} cannot be read: {error}") from error
     try:
         with AnyReader([bag]) as reader:
             chosen = [c for c in reader.connections if c.topic == topic]
@@ -230,8 +239,10 @@ def messages(bag: Path, topic: str) -> Iterator[Message]:
             for count, (connection, time_ns, raw) in enumerate(found, start=1):
                 content = reader.deserialize(raw, connection.msgtype)
                 yield Message(topic, count, content, time_ns)
-    except AnyReaderError as error:
-        raise BagError(f"{bag} cannot be read as a ROS bag: {error}") from error
+    except BagError:
+        raise
+    except Exception as error:  # damaged bytes raise nearly anything
+        raise BagError(f"{bag} cannot be read as a ROS bag: {error!r}") from error
 
 
 class Skipped(Counter[str]):

@@ -32,7 +32,12 @@ def read_rsus(file: Path) -> list[RsuInfo]:
     """
     if not file.is_file():
         raise BagError(f"{file} does not exist; give a YAML or CSV file with the RSUs' positions")
-    found = _from_yaml(file) if file.suffix in {".yaml", ".yml"} else _from_csv(file)
+    if file.suffix in {".yaml", ".yml"}:
+        try:
+            return rsus_of_text(file.read_text(encoding="utf-8"), str(file))
+        except UnicodeDecodeError as error:
+            raise BagError(f"{file}: {error}") from error
+    found = _from_csv(file)
     names = [info.rsu_id for info in found]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
@@ -55,10 +60,11 @@ def _from_csv(file: Path) -> list[RsuInfo]:
     return found
 
 
-def _from_yaml(file: Path) -> list[RsuInfo]:
+def rsus_of_text(text: str, file: str) -> list[RsuInfo]:
+    """RSUs of the text of a YAML file named ``file``. Raises ``BagError`` as ``read_rsus``."""
     try:
-        content = load_yaml(file.read_text(encoding="utf-8"))
-    except (YamlError, UnicodeDecodeError) as error:
+        content = load_yaml(text)
+    except YamlError as error:
         raise BagError(f"{file}: {error}") from error
     entries = content.get("rsus", content) if isinstance(content, dict) else None
     if not isinstance(entries, dict) or not entries:
@@ -66,7 +72,7 @@ def _from_yaml(file: Path) -> list[RsuInfo]:
     return [_of_entry(file, str(name), entry) for name, entry in entries.items()]
 
 
-def _of_entry(file: Path, name: str, entry: Any) -> RsuInfo:
+def _of_entry(file: str, name: str, entry: Any) -> RsuInfo:
     values = {"position": entry} if isinstance(entry, list) else entry
     if not isinstance(values, dict):
         raise BagError(f"{file}, {name}: give [x, y, z] or fields of RsuInfo, got {entry!r}")
@@ -89,7 +95,7 @@ def _of_entry(file: Path, name: str, entry: Any) -> RsuInfo:
     return info
 
 
-def _convention(file: Path, name: str, said: Any) -> AngleConvention:
+def _convention(file: str, name: str, said: Any) -> AngleConvention:
     for convention in AngleConvention:
         if said in (convention.name, convention.value):
             return convention

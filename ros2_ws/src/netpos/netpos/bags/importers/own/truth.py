@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pyproj import Transformer
 
 from netpos.bags.errors import BagError
 from netpos.bags.importers.common import truth_of_poses
@@ -16,6 +15,7 @@ from netpos.bags.importers.own.columns import ANGLE, CLOCK_NS, LENGTH, pairs, ti
 from netpos.bags.importers.own.records import Record, Skipped, number, problem
 from netpos.common.parameters import nearest
 from netpos.messages.values import Array, Odometry
+from netpos.world.geodesy import Datum
 
 Stamps = NDArray[np.int64]
 Pose = tuple[int, float, float, float, float]
@@ -183,14 +183,8 @@ def poses_of(found: Iterable[Pose | None], skipped: Skipped) -> Poses:
 def local(poses: Poses, origin: tuple[float, float, float] | None) -> Poses:
     """Poses of latitude, longitude [deg, WGS84] and height [m] as metres east, north and up of
     ``origin``; None: of the first pose."""
-    latitude, longitude, height = origin or poses.values[0, :3].tolist()
-    to_local = Transformer.from_pipeline(
-        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
-        "+step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 "
-        f"+lat_0={latitude!r} +lon_0={longitude!r} +h_0={height!r}"
-    )
-    latitudes, longitudes, heights = poses.values[:, :3].T
-    places = np.column_stack(to_local.transform(longitudes, latitudes, heights))
+    datum = Datum(*(origin or poses.values[0, :3].tolist()))
+    places = datum.to_map(poses.values[:, :3])
     return replace(poses, values=np.column_stack([places, poses.values[:, 3]]))
 
 

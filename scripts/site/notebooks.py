@@ -1,0 +1,46 @@
+"""Notebooks as pages: run anew, with their outputs."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+import nbformat
+from jupyter_client import AsyncKernelManager
+from nbclient import NotebookClient
+from nbconvert import MarkdownExporter
+
+
+def executed(path: Path, folder: Path) -> nbformat.NotebookNode:
+    """A notebook after all its cells ran in ``folder``.
+
+    Raises ``nbclient.exceptions.CellExecutionError`` where a cell fails.
+    """
+    notebook = nbformat.read(path, as_version=4)
+    os.environ.setdefault("MPLBACKEND", "module://matplotlib_inline.backend_inline")
+    resources = {"metadata": {"path": str(folder)}}
+    with tempfile.TemporaryDirectory() as sockets:  # no port is opened
+        place = f"{sockets}/kernel"
+        kernel = AsyncKernelManager(kernel_name="python3", transport="ipc", ip=place)
+        NotebookClient(notebook, km=kernel, timeout=300, resources=resources).execute(
+            cleanup_kc=True
+        )
+    return notebook
+
+
+def notebook_page(path: Path) -> tuple[str, dict[str, bytes]]:
+    """Markdown of an executed notebook and its pictures by file name."""
+    with tempfile.TemporaryDirectory() as folder:
+        notebook = executed(path, Path(folder))
+    resources = {"unique_key": path.stem, "output_files_dir": path.stem}
+    text, found = MarkdownExporter().from_notebook_node(notebook, resources)
+    pictures = {Path(name).name: data for name, data in found["outputs"].items()}
+    for name in found["outputs"]:
+        text = text.replace(f"]({name})", f"]({Path(name).name})")
+    told = (
+        f"!!! note\n    This page is the notebook `docs/notebooks/{path.name}`, run when the site"
+        " was built.\n"
+    )
+    head, _, rest = text.partition("\n\n")
+    return f"{head}\n\n{told}\n{rest}", pictures

@@ -1,0 +1,120 @@
+"""What the documents promise to be complete: scenario keys, reasons for refusal, topics."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from netpos.filters.sensors.table import readings
+from netpos.messages import topics
+from netpos.scenario import load_scenario
+from netpos.scenario.schema import Scenario
+from netpos.tracking import refusals
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+TRACKING = ROOT / "ros2_ws/src/netpos/netpos/tracking"
+README_LINES = 120
+# Parameters of tracker, fusion and dead reckoning are described on another page.
+FREE = ("tracker", "fusion", "pdr")
+
+
+def yaml_blocks(page: str) -> list[dict[str, Any]]:
+    text = (DOCS / page).read_text(encoding="utf-8")
+    return [yaml.safe_load(block) for block in re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)]
+
+
+FIRST, *OTHERS = yaml_blocks("scenarios.md")
+
+
+def shown(content: Any, path: str = "") -> Iterator[str]:
+    """Dotted keys of a scenario, without the indices of lists."""
+    if isinstance(content, list):
+        for item in content:
+            yield from shown(item, path)
+    elif isinstance(content, dict):
+        for key, value in content.items():
+            yield f"{path}{key}"
+            if key not in FREE:
+                yield from shown(value, f"{path}{key}.")
+
+
+def known(schema: dict[str, Any], node: dict[str, Any], path: str = "") -> Iterator[str]:
+    """Dotted keys that a scenario may have."""
+    if "$ref" in node:
+        node = schema["$defs"][node["$ref"].rpartition("/")[2]]
+    variants = [*node.get("anyOf", ()), *node.get("oneOf", ())]
+    for inner in [*variants, node["items"]] if "items" in node else variants:
+        yield from known(schema, inner, path)
+    for key, value in node.get("properties", {}).items():
+        yield f"{path}{key}"
+        yield from known(schema, value, f"{path}{key}.")
+
+
+def test_every_key_of_a_scenario_has_an_example() -> None:
+    schema = Scenario.model_json_schema()
+    keys = set(known(schema, schema))
+    assert {"devices.route.points", "measurement.errors.waveform.pilots"} <= keys
+    assert keys - set().union(*map(set, map(shown, (FIRST, *OTHERS)))) == set()
+
+
+@pytest.mark.parametrize("number", range(len(OTHERS) + 1))
+def test_the_examples_of_scenarios_load(number: int, tmp_path: Path) -> None:
+    changes = OTHERS[number - 1] if number else {}
+    path = tmp_path / "example.yaml"
+    path.write_text(yaml.safe_dump({**FIRST, **changes}), encoding="utf-8")
+    assert load_scenario(str(path)).duration_s > 1.0
+
+
+def test_every_scenario_is_in_the_table() -> None:
+    text = (DOCS / "scenarios.md").read_text(encoding="utf-8")
+    shipped = (ROOT / "ros2_ws/src/netpos_bringup/scenarios").glob("*.yaml")
+    assert [path.stem for path in shipped if f"`{path.stem}`" not in text] == []
+
+
+def reasons() -> set[str]:
+    """Every word under which something is refused or counted."""
+    found = set(refusals._SENTENCES)
+    found |= {refusal.reason for _, reading in readings() for refusal in reading.refusals}
+    for path in TRACKING.rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        found |= set(re.findall(r'rejected\["(\w+)"\]', text))
+        found |= set(re.findall(r'^ +Verdict\.\w+: "(\w+)"', text, re.MULTILINE))
+    networks = (TRACKING / "networks" / "validation.py").read_text(encoding="utf-8")
+    found |= set(re.findall(r'return "(\w+)"$', networks, re.MULTILINE))
+    return found | {"unknown_network", "own_covariance"}
+
+
+@pytest.mark.parametrize("page", ["troubleshooting.md", "topics.md"])
+def test_every_reason_for_refusal_is_explained(page: str) -> None:
+    assert {"gate", "negative_range", "clock_ahead", "shape"} <= reasons()
+    text = (DOCS / page).read_text(encoding="utf-8")
+    assert sorted(reason for reason in reasons() if f"`{reason}`" not in text) == []
+
+
+@pytest.mark.parametrize(
+    "name", ["AMBIGUOUS", "COASTING", "STALE", "INITIALISING", "WAITING", "NEES", "recorder"]
+)
+def test_troubleshooting_knows_what_a_user_sees(name: str) -> None:
+    assert name in (DOCS / "troubleshooting.md").read_text(encoding="utf-8")
+
+
+def test_every_topic_is_described() -> None:
+    text = (DOCS / "topics.md").read_text(encoding="utf-8")
+    device = (topics.BEACON, topics.GROUND_TRUTH, topics.GROUND_TRUTH_CLOCK, topics.IMU,
+              topics.MAG, topics.STEP, topics.STEP_VELOCITY, topics.GROUND_SPEED,
+              topics.INITIAL_POSE, *topics.TRACKER_OUTPUTS)  # fmt: skip
+    names = [*(f"/<vue>/{name}" for name in device), *topics.RUN_TOPICS]
+    names += [topics.CLOCK, topics.RSU_INFO, topics.RSU_MEASUREMENTS, topics.RSU_LEARNED]
+    names += [topics.DIAGNOSTICS, topics.TF, topics.tracks_of("<network>")]
+    assert [name for name in names if f"`{name}`" not in text and name != "/<vue>/mag"] == []
+
+
+def test_the_readme_is_two_screens() -> None:
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= README_LINES
+    assert max(map(len, lines)) <= 400
