@@ -21,6 +21,11 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "sweep": (
         "netpos sweep fast_pass --vary tracker.hold_s=0,0.1 --runs 20 --out t.csv --plot t.png",
     ),
+    "faults": (
+        "netpos faults fast_pass --out faults.md --json faults.json",
+        "netpos faults fast_pass my_site.yaml --plan faults.yaml",
+    ),
+    "watch": ("netpos watch", "netpos watch ws://192.168.1.20:8765 --once"),
     "bench": ("netpos bench --json speed.json",),
     "reproduce": ("netpos reproduce fokin2020 --runs 20 --json rows.json --out pictures",),
     "recover": ("netpos recover my_run",),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -73,21 +73,31 @@ def widen(innovations: Array, rows: Array, rsu: Rsu) -> None:
 
 
 def without_excluded(
-    health: RsuHealth, stamp_ns: int, items: Sequence[AnySource]
+    health: RsuHealth,
+    stamp_ns: int,
+    items: Sequence[AnySource],
+    agrees: Callable[[RsuMeasurement], bool],
 ) -> tuple[list[AnySource], list[RsuMeasurement]]:
-    """What may be fused, and what comes from an excluded or new RSU and is only looked at."""
+    """What may be fused, and what is only looked at: that of an excluded RSU, and of one on
+    probation where it does not agree with the prediction (``agrees``)."""
     if health.trusts_all(stamp_ns):
         return list(items), []
     used: list[AnySource] = []
     watched: list[RsuMeasurement] = []
     for item in items:
-        if isinstance(item, RsuMeasurement) and health.excluded(
-            item.rsu_id, stamp_ns, item.vue_id
+        if isinstance(item, RsuMeasurement) and (
+            health.excluded(item.rsu_id, stamp_ns)
+            or (health.on_probation(item.rsu_id, item.vue_id, stamp_ns) and not agrees(item))
         ):
             watched.append(item)
         else:
             used.append(item)
     return used, watched
+
+
+def fits(innovations: Array, gate: Array) -> bool:
+    """Whether each of ``innovations`` (m, 2), with its sd, is within the ``gate`` of one row."""
+    return bool(((innovations[:, 0] / innovations[:, 1]) ** 2 <= gate[1]).all())
 
 
 def with_refused(
@@ -109,13 +119,11 @@ def observe_excluded(
     stamp_ns: int,
     epoch_rows: EpochRows,
     innovations: Array,
-    rsu: Rsu,
     gate: Array,
 ) -> None:
-    """Tell ``health`` how what the excluded ``rsu`` alone says, ``epoch_rows``, fitted without
-    being fused; its rows have no bias states."""
-    widen(innovations, epoch_rows.rows, rsu)
-    fitting = bool(((innovations[:, 0] / innovations[:, 1]) ** 2 <= gate[1]).all())
+    """Tell ``health`` how what one RSU alone says, ``epoch_rows``, fitted without being fused;
+    its rows have no bias states, which the sd of ``innovations`` (m, 2) holds."""
+    accepted = [fits(innovations, gate)]
     health.hear(
-        FittedEpoch(stamp_ns, vue_id, epoch_rows.items, epoch_rows.rows, innovations, [fitting])
+        FittedEpoch(stamp_ns, vue_id, epoch_rows.items, epoch_rows.rows, innovations, accepted)
     )

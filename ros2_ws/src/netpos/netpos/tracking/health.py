@@ -206,12 +206,17 @@ class RsuHealth:
             self._advance(stamp_ns)
         return not (self._accused or self._probation.any)
 
-    def excluded(self, rsu_id: str, stamp_ns: int, vue_id: str = "") -> bool:
-        """Whether a measurement of this RSU with this stamp, of this device, is to be refused."""
+    def on_probation(self, rsu_id: str, vue_id: str, stamp_ns: int) -> bool:
+        """Whether a measurement of this RSU, device and stamp is to be fused only where it agrees
+        with the prediction."""
         if stamp_ns >= self._due_ns:
             self._advance(stamp_ns)
-        if self._probation.any and self._probation.holds(rsu_id, vue_id, stamp_ns):
-            return True
+        return self._probation.holds(rsu_id, vue_id, stamp_ns)
+
+    def excluded(self, rsu_id: str, stamp_ns: int) -> bool:
+        """Whether a measurement of this RSU with this stamp is to be refused."""
+        if stamp_ns >= self._due_ns:
+            self._advance(stamp_ns)
         rsu = self._rsus.get(rsu_id)
         if rsu is None:
             return False
@@ -396,7 +401,7 @@ class RsuHealth:
                 faults.append(f"consistent again for {consistent_s:.0f} s")
             return RsuState.EXCLUDED, "; ".join(faults)
         if rsu.window and self._probation.holds(rsu_id, rsu.last_vue, rsu.last_ns):
-            faults.append("new: not used until it agrees with the RSUs that track already")
+            faults.append("new: used where it agrees with the RSUs that track already")
         if rsu.against is not None and rsu.against.count >= _SPEAKS:
             faults.append(rsu.cause)
         elif len(entries) >= _FEW:

@@ -1,10 +1,10 @@
-"""Which RSUs are independent of one another, and which are too new to be fused.
+"""Which RSUs are independent of one another, and which are too new to have a vote.
 
 A device whose track at least three admitted RSUs at different places agree with is *guarded*. An
-RSU that comes then is on probation: it is compared with the track and not fused, and it has no
-vote, until it has agreed with the track in three slots in a row. The first RSUs of a network, and
-those that come while nothing guards a device, are admitted as soon as they agree with another.
-Everything follows from stamps, as in ``health``.
+RSU that comes then is on probation: what it measures is fused only where it alone agrees with the
+prediction, and it has no vote, until it has agreed with the track in three slots in a row. The
+first RSUs of a network, and those that come while nothing guards a device, are admitted as soon
+as they agree with another. Everything follows from stamps, as in ``health``.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Probation:
         return bool(self._guards)
 
     def holds(self, rsu_id: str, vue_id: str, stamp_ns: int) -> bool:
-        """Whether a measurement of this RSU, device and stamp is not to be fused yet."""
+        """Whether an RSU is on probation in a measurement of this device and stamp."""
         if self._admitted.get(rsu_id, stamp_ns + 1) <= stamp_ns:
             return False
         for end_ns in self._guards.get(vue_id, ()):

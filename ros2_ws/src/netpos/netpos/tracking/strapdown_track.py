@@ -26,7 +26,7 @@ from netpos.messages.values import Array, InitialPose, Odometry, RsuMeasurement,
 from netpos.tracking import output
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import EpochRows, mostly_accepted
-from netpos.tracking.fit import observe_excluded, with_refused, without_excluded
+from netpos.tracking.fit import fits, observe_excluded, widen, with_refused, without_excluded
 from netpos.tracking.health import RsuHealth
 from netpos.tracking.history import History, merge
 from netpos.tracking.models import gate_thresholds, robust_options_of
@@ -229,7 +229,9 @@ class StrapdownTrack:
     def _apply(self, stamp_ns: int, items: list[Source]) -> EpochResult:
         watched: list[RsuMeasurement] = []
         if self._config.isolate_rsus:
-            items, watched = without_excluded(self._health, stamp_ns, items)
+            items, watched = without_excluded(
+                self._health, stamp_ns, items, lambda item: self._agrees(stamp_ns, item)
+            )
             self._state.rejected.update(["isolated_rsu"] * len(watched))
         epoch_rows = epoch_rows_3d(items, self._rsus, self._state.biases) if items else None
         estimate = self._state.estimate
@@ -240,23 +242,28 @@ class StrapdownTrack:
         self._grow(estimate)
         self._advance(estimate, stamp_ns, self.recorder)
         for item in watched:
-            alone = epoch_rows_3d([item], self._rsus, None)
-            innovations, rsu = (
-                innovations_with_sd_3d(alone.rows, estimate.nav, estimate.cov),
-                item.rsu_id,
-            )
-            observe_excluded(
-                self._health,
-                self._vue_id,
-                stamp_ns,
-                alone,
-                innovations,
-                self._rsus[rsu],
-                self._gate,
-            )
+            rows, innovations = self._fit_alone(estimate, item)
+            observe_excluded(self._health, self._vue_id, stamp_ns, rows, innovations, self._gate)
         return (
             self._update(stamp_ns, estimate, epoch_rows) if epoch_rows else EpochResult(stamp_ns)
         )
+
+    def _fit_alone(self, estimate: _Estimate, item: RsuMeasurement) -> tuple[EpochRows, Array]:
+        """Rows of one measurement without bias states, and its innovations at ``estimate`` with
+        their sd (m, 2)."""
+        rows = epoch_rows_3d([item], self._rsus, None)
+        innovations = innovations_with_sd_3d(rows.rows, estimate.nav, estimate.cov)
+        widen(innovations, rows.rows, self._rsus[item.rsu_id])
+        return rows, innovations
+
+    def _agrees(self, stamp_ns: int, item: RsuMeasurement) -> bool:
+        """Whether a measurement alone agrees with the prediction; without one none does."""
+        if self._state.estimate is None:
+            return False
+        predicted = self._state.estimate.copy()
+        self._grow(predicted)
+        self._advance(predicted, stamp_ns, None)
+        return fits(self._fit_alone(predicted, item)[1], self._gate)
 
     def _update(self, stamp_ns: int, estimate: _Estimate, epoch_rows: EpochRows) -> EpochResult:
         state, nav, cov = self._state, estimate.nav, estimate.cov

@@ -33,9 +33,11 @@ from netpos.tracking.epoch_rows import (
 )
 from netpos.tracking.estimates import Estimate
 from netpos.tracking.fit import (
+    fits,
     innovations_and_level,
     innovations_with_sd,
     observe_excluded,
+    widen,
     with_refused,
     without_excluded,
 )
@@ -232,7 +234,9 @@ class Track:
         """What may be fused, and what comes from an excluded RSU and is only looked at."""
         if not self._config.isolate_rsus:
             return items, []
-        used, watched = without_excluded(self._health, stamp_ns, items)
+        used, watched = without_excluded(
+            self._health, stamp_ns, items, lambda item: self._agrees(stamp_ns, item)
+        )
         if watched:
             self._state.rejected["isolated_rsu"] += len(watched)
         return used, watched
@@ -448,21 +452,32 @@ class Track:
             self._health.hear(epoch)
         return True
 
+    def _fit_alone(self, stamp_ns: int, item: RsuMeasurement) -> tuple[EpochRows, Array]:
+        """Rows of one measurement without bias states, and its innovations with their sd at the
+        prediction (m, 2); there is an estimate."""
+        self._predict(stamp_ns)
+        estimate = self._state.estimate
+        assert estimate is not None
+        rows = epoch_rows_of([item], self._rsus, None, self._heading)
+        innovations = innovations_with_sd(
+            estimate.mean, estimate.cov, rows.rows, self._config.device_height_m
+        )
+        widen(innovations, rows.rows, self._rsus[item.rsu_id])
+        return rows, innovations
+
+    def _agrees(self, stamp_ns: int, item: RsuMeasurement) -> bool:
+        """Whether a measurement alone agrees with the prediction; without one none does."""
+        if self._state.estimate is None:
+            return False
+        return fits(self._fit_alone(stamp_ns, item)[1], self._gate)
+
     def _watch(self, stamp_ns: int, watched: list[RsuMeasurement]) -> None:
-        """Compare what excluded RSUs say with the estimate, without fusing it."""
+        """Compare what is not fused with the estimate."""
         if self._state.estimate is None:
             return
-        self._predict(stamp_ns)
-        mean, cov = self._state.estimate.mean, self._state.estimate.cov
         for item in watched:
-            epoch_rows = epoch_rows_of([item], self._rsus, None, self._heading)
-            innovations = innovations_with_sd(
-                mean, cov, epoch_rows.rows, self._config.device_height_m
-            )
-            rsu = self._rsus[item.rsu_id]
-            observe_excluded(
-                self._health, self._vue_id, stamp_ns, epoch_rows, innovations, rsu, self._gate
-            )
+            rows, innovations = self._fit_alone(stamp_ns, item)
+            observe_excluded(self._health, self._vue_id, stamp_ns, rows, innovations, self._gate)
 
     def _note_accepted(
         self, stamp_ns: int, epoch_rows: EpochRows, accepted: Sequence[float] | None = None

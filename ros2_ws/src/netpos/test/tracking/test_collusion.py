@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement, TrackState
 from netpos.tracking import Tracker, TrackerConfig
-from netpos.tracking.health import RsuHealth, RsuState
+from netpos.tracking.health import RsuHealth, RsuReport, RsuState
 from netpos.tracking.rsus import Rsu
 
 S = 1_000_000_000
@@ -108,18 +108,26 @@ def test_they_take_over_only_after_the_track_is_lost() -> None:
     assert used[0] > T0 + 50 * S  # max_gap_s after the last honest one
 
 
+def report_of(tracker: Tracker, name: str) -> RsuReport:
+    return next(r for r in tracker.rsu_reports() if r.rsu_id == name)
+
+
 @pytest.mark.parametrize("seed", range(3))
-def test_an_honest_newcomer_is_used_after_some_seconds(seed: int) -> None:
+def test_an_honest_newcomer_is_used_at_once_and_votes_after_some_seconds(seed: int) -> None:
     tracker = tracker_of(HONEST | {"new": (30.0, -20.0)})
 
     def told(t_s: float) -> list[RsuMeasurement]:
         sites = HONEST | ({"new": (30.0, -20.0)} if t_s >= 10.0 else {})
         return measured(sites, t_s, truth(t_s), 0.3, seed)
 
-    found = run(tracker, (0.0, 20.0), told)
+    found = run(tracker, (0.0, 14.0), told)
     stamps = [o.status.stamp_ns for _, o in found if "new" in o.status.sources]
-    assert T0 + 13 * S <= stamps[0] <= T0 + 16 * S
-    assert stamps[-1] == found[-1][1].status.stamp_ns
+    assert stamps[0] == T0 + 10 * S
+    assert "new: used where it agrees" in report_of(tracker, "new").text
+    found += run(tracker, (14.0, 20.0), told)
+    stamps = [o.status.stamp_ns for _, o in found if "new" in o.status.sources]
+    assert len(stamps) >= 95
+    assert report_of(tracker, "new").state is RsuState.OK
 
 
 def test_no_probation_where_few_track() -> None:

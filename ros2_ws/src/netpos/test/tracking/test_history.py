@@ -350,8 +350,12 @@ def test_history_is_bounded(world: Any) -> None:
 # a late initial pose
 
 
-def pose(t_s: float, x: float) -> InitialPose:
-    position = np.array([x, 0.0, 0.0])
+BESIDE = np.array([7.7, -0.5, 0.0])
+
+
+def pose(t_s: float) -> InitialPose:
+    """Where the device is 0.9 s after the start, to a metre: the measurements permit it."""
+    position = BESIDE
     stamp = T0 + round(t_s * 1e9)
     return InitialPose(stamp_ns=stamp, vue_id="vue_1", position=position, cov=np.eye(3))
 
@@ -360,9 +364,9 @@ def test_a_late_initial_pose_counts_from_the_newest_epoch_on(world: Any) -> None
     """It tells where the device is, whatever its stamp: the running track is replaced."""
     for stamp_s in (0.2, -1.0):
         tracker = ran(world, epochs(world, 10))
-        (output,) = fed(tracker, [pose(stamp_s, 500.0)]) or tracker.flush()
+        (output,) = fed(tracker, [pose(stamp_s)]) or tracker.flush()
         assert output.status.stamp_ns == T0 + 900 * MS
-        np.testing.assert_allclose(output.odometry.position, [500.0, 0.0, 0.0])
+        np.testing.assert_allclose(output.odometry.position, BESIDE)
         assert output.status.accepted == 30
 
 
@@ -371,10 +375,10 @@ def test_a_late_pose_outlives_a_late_measurement(world: Any) -> None:
     batches = epochs(world, 10)
     late = batches[7].pop()
     tracker = ran(world, batches)
-    fed(tracker, [pose(0.2, 60.0)])
+    fed(tracker, [pose(0.2)])
     tracker.flush()
     (output,) = fed(tracker, [late])
-    np.testing.assert_allclose(output.odometry.position, [60.0, 0.0, 0.0])
+    np.testing.assert_allclose(output.odometry.position, BESIDE)
     assert output.status.accepted == 30
     assert tracker.add(batches[9][0]) == "duplicate"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from netpos.evaluation.reproduce import PAPERS
+from netpos.evaluation.reproduce import PAPERS, network_defaults
 from netpos.evaluation.reproduce import dvornikov2017 as paper
 from netpos.evaluation.reproduce.frame import Outcome
 from netpos.evaluation.reproduce.network_claims import Sides, claims
@@ -182,9 +182,11 @@ def test_an_estimator_without_estimates_has_an_empty_column() -> None:
     )
 
 
-def test_default_networks_hear_the_fixes_the_filters_do() -> None:
+def test_default_networks_hear_the_fixes_the_filters_do(monkeypatch: pytest.MonkeyPatch) -> None:
     """Once the start is forgotten, a tracker's track is that of the stages with the same process
-    noise; the fused track is the only network's that has one."""
+    noise, which know of no manoeuvre; the fused track is the only network's that has one."""
+    steady = replace(network_defaults.TRACKER, manoeuvre_speed_sd_mps=0.0)
+    monkeypatch.setattr(network_defaults, "TRACKER", steady)
     setting = replace(paper.COMMON_NOISE, duration_s=30.0)
     estimates = run_defaults(setting, 5000)
     own = replace(setting, tracker=replace(paper.JERKY, jerk_density=1.0), start_var=25.0)
