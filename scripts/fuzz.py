@@ -27,8 +27,8 @@ from netpos.cli.main import app
 from netpos.messages import topics
 from netpos.messages.network_tracks import network_track_from_msg
 from netpos.scenario.load import ScenarioError, load_scenario, scenario_files
+from netpos.scenario.settings import bag_settings
 from netpos.tracking import Tracker, TrackerConfig
-from netpos.tracking.settings import bag_settings
 from rosbags.serde import SerdeError
 from typer.testing import CliRunner
 

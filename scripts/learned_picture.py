@@ -18,7 +18,7 @@ from netpos.evaluation.pictures import TRACK_COLOURS, save
 from netpos.messages.topics import RSU_LEARNED, RSU_MEASUREMENTS, is_tracker_output
 from netpos.scenario import load_scenario
 from netpos.scenario.offline import simulate_to_bag
-from netpos.tracking.replay import replay_bag
+from netpos.scenario.replay import replay_bag
 
 FACTORS = (1 / 16, 16.0, 1 / 4, 4.0)
 """Of the variances that the RSUs state, in turn; of the sd, one over the root is to be learned."""

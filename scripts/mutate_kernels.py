@@ -2,7 +2,7 @@
 
     python scripts/mutate_kernels.py [ROOM|ROOM.KERNEL ...]
 
-A room is a module of the filters, or another with its folder before it, as ``tracking/engine``
+A room is a module of ``estimation``, or another with its folder before it, as ``tracking/fit``
 (``TESTS_OF`` lists them; all where none is named). The kernels run as plain Python here
 (NUMBA_DISABLE_JIT), so that a change needs no compiling. Exit code 1 where a change survives.
 """
@@ -54,20 +54,20 @@ TESTS_OF = {
     "space_conditioning": "test_space_conditioning.py",
     "srukf": "test_srukf.py -knot+ten_thousand",
     **{
-        f"filters/sensors/{name}": "test_models.py ../test_measurement.py ../test_space.py "
+        f"estimation/sensors/{name}": "test_models.py ../test_measurement.py ../test_space.py "
         "../test_measurement_curvature.py ../test_measurement_phase.py ../test_step_velocity.py"
         for name in (
             *("azimuth", "elevation", "cone_angle", "range", "phase", "position"),
             *("ground_speed", "step_velocity", "body_motion", "geometry"),
         )
     },
-    "tracking/engine": "test_engine_parts.py test_engine.py -knot+equals_the_tracker",
+    "engine": "test_engine_parts.py test_engine.py -knot+equals_the_tracker",
     "tracking/fit": "test_protection.py -kinnovations_and_level+or+is_not_sound",
     "tracking/initialise": "test_initialise.py test_initialise_fit.py",
     "tracking/output": "test_output.py",
     "tracking/phase_fix": "test_phase_fix.py",
-    "tracking/protection": "test_protection.py",
-    "tracking/components": "test_components.py",
+    "protection": "test_protection.py",
+    "components": "test_components.py",
     "tracking/sectors": "test_sector_bank.py -kwhere_a_phase",
     "tracking/sector_bank": "test_sector_bank_rules.py test_sector_bank.py",
     "ukf": "test_ukf.py test_gate.py",
@@ -88,7 +88,7 @@ EQUIVALENT = {
     ("bearing", "fuse_bearing", "operator swapped: reach - 0.5 * a[0]"),  # ends beyond all weight
     ("measurement", "wrap", "operator swapped: angle + math.pi"),  # a whole turn away
     *(  # both are squared
-        ("filters/sensors/range", "exact", f"operator swapped: {sum_}")
+        ("estimation/sensors/range", "exact", f"operator swapped: {sum_}")
         for sum_ in ("Pd += cov[i, j] * d[j]", "along += d[i] * Pd")
     ),
     ("srukf", "_eliminate", "left out: continue"),
@@ -108,17 +108,14 @@ EQUIVALENT = {
         for a, f in (("PX", "cos"), ("PY", "sin"))
     ),
     ("iteration", "refine_used", "operator swapped: cost - 0.001"),  # the same place again
-    *(
-        ("tracking/protection", "gaussian_radius", f"operator swapped: {where}")
-        for where in _START
-    ),
+    *(("protection", "gaussian_radius", f"operator swapped: {where}") for where in _START),
     # one that converges as fast, and terms too small for the sum
-    ("tracking/protection", "gaussian_radius", "operator swapped: 1e-06 * u"),
-    ("tracking/protection", "gaussian_radius", "operator swapped: u + 2.0 * _NEGLIGIBLE"),
-    ("tracking/protection", "radius_of", "operator swapped: xx + yy"),  # finite where both are
+    ("protection", "gaussian_radius", "operator swapped: 1e-06 * u"),
+    ("protection", "gaussian_radius", "operator swapped: u + 2.0 * _NEGLIGIBLE"),
+    ("protection", "radius_of", "operator swapped: xx + yy"),  # finite where both are
     ("tracking/sector_bank", "_gains", "operator swapped: _WIDE_RAD * _WIDE_RAD"),  # is 1
     *(  # memory for more rows than there are
-        ("tracking/engine", "run_epochs", f"operator swapped: {size}")
+        ("engine", "run_epochs", f"operator swapped: {size}")
         for size in ("row_start[k + 1] - row_start[k] (2)", "k + 1 (3)")
     ),
     ("iteration", "iterate_from", "left out: x, P = (mean.copy(), cov.copy())"),  # likewise
@@ -201,7 +198,7 @@ def run(tests: list[str]) -> int:
 def folder_and_module(room: str) -> tuple[str, ModuleType]:
     """Where a room is."""
     folder, _, name = room.rpartition("/")
-    folder = folder or "filters"
+    folder = folder or "estimation"
     return folder, import_module(f"netpos.{folder.replace('/', '.')}.{name}")
 
 

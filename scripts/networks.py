@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sys
 
-from netpos.tracking.settings import settings_from
+from netpos.scenario.settings import settings_from
 
 
 def main() -> None:

@@ -8,8 +8,8 @@ import sys
 from collections.abc import Iterator
 
 import numpy as np
-from netpos.evaluation.reproduce import car_drive
-from netpos.filters.error_state import Sensors
+from netpos.estimation.error_state import Sensors
+from netpos.reproduction.deng2022 import car_drive
 
 CONSTRAINTS_MPS = (0.1, 0.2, 0.4)
 FACTORS = (0.5, 1.0, 2.0)

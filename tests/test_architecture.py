@@ -21,15 +21,25 @@ MAY_IMPORT: dict[str, set[str]] = {
     "world": {"messages"},
     "radio": {"messages", "world"},
     "inertial": {"messages", "common", "world", "radio"},
-    "filters": {"messages", "inertial"},
+    "estimation": {"messages", "inertial"},
+    "tracking": {"messages", "common", "estimation", "inertial"},
     "bags": {"messages", "common", "world", "inertial"},
-    # The sensors say what a simulator sends.
-    "scenario": {"messages", "common", "world", "radio", "inertial", "filters", "bags"},
+    # The sensors say what a simulator sends; a replay sends a recording through the tracker.
+    "scenario": {
+        *("messages", "common", "world", "radio", "inertial", "estimation", "tracking", "bags"),
+    },
     "live": {"messages", "world", "bags"},
-    "tracking": {"messages", "common", "filters", "inertial", "bags", "scenario"},
     "evaluation": {
-        *("messages", "common", "world", "radio", "inertial", "filters", "bags", "scenario"),
+        *("messages", "common", "world", "radio", "inertial", "estimation", "bags", "scenario"),
         "tracking",
+    },
+    "bench": {
+        *("messages", "common", "world", "radio", "inertial", "estimation", "bags", "scenario"),
+        *("tracking", "evaluation", "reproduction"),
+    },
+    "reproduction": {
+        *("messages", "common", "world", "radio", "inertial", "estimation", "bags", "scenario"),
+        *("tracking", "evaluation"),
     },
 }
 
@@ -97,7 +107,7 @@ def test_library_imports_no_ros() -> None:
 def test_the_order_of_rooms_has_no_circle() -> None:
     order = list(TopologicalSorter(MAY_IMPORT).static_order())
     assert order.index("messages") == 0
-    assert order.index("world") < order.index("scenario") < order.index("tracking")
+    assert order.index("estimation") < order.index("tracking") < order.index("scenario")
 
 
 def test_rooms_import_forwards_only() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import yaml
-from netpos.filters.sensors.table import readings
+from netpos.estimation.sensors.table import readings
 from netpos.messages import topics
 from netpos.scenario import load_scenario
 from netpos.scenario.schema import Scenario

@@ -14,7 +14,7 @@ from graph import LATCHED, Graph
 from nav_msgs.msg import Odometry
 from netpos.bags import BagReader
 from netpos.messages.values import RsuInfo
-from netpos.tracking.settings import bag_settings
+from netpos.scenario.settings import bag_settings
 from netpos_msgs.msg import RsuInfo as RsuInfoMessage
 from netpos_msgs.msg import RsuMeasurement
 from netpos_node import CODEC

@@ -14,7 +14,7 @@ from netpos.bags import LOST_METADATA, BagReader, BagWriter
 from netpos.evaluation.contents import notes_of
 from netpos.scenario import load_scenario
 from netpos.scenario.load import scenario_of_text
-from netpos.tracking.settings import bag_settings
+from netpos.scenario.settings import bag_settings
 from runs import ESTIMATES, ODOMETRY, assert_same, changed_scenario, netpos, run_netpos
 
 MASTS = {"device_height_m": 1.25, "manoeuvre_speed_sd_mps": 2.0}

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from netpos.bags import BagReader, codec
-from netpos.tracking.replay import replay_bag
+from netpos.scenario.replay import replay_bag
 
 BAGS = Path(__file__).resolve().parents[1] / "bags"
 NAMES = ("fast_pass", "intersection_turn")

@@ -20,7 +20,7 @@ setup(
         # Links to where ROS has them; packages hold the files themselves.
         "netpos.bags": ["msg/*.msg"],
         "netpos.scenario": ["scenarios/*.yaml"],
-        "netpos.evaluation.bench": ["*.c"],
+        "netpos.bench": ["*.c"],
         "netpos.evaluation.faults": ["*.yaml"],
         "netpos.evaluation.report": ["*.html", "*.js"],
     },

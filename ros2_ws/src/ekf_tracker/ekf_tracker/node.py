@@ -10,10 +10,10 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from netpos.messages import topics
 from netpos.messages.values import RsuMeasurement as Measurement
+from netpos.scenario.settings import tracker_fact
 from netpos.tracking import Tracker, TrackOutput
 from netpos.tracking.admission import NOT_ALLOWED, TOO_MANY
 from netpos.tracking.rate_limit import RATE
-from netpos.tracking.settings import tracker_fact
 from netpos.tracking.validation import explanation
 from netpos.tracking.warm_up import warm_up, warm_up_anchors, warm_up_components
 from netpos_msgs.msg import NetworkTrack, RsuErrors, RsuInfo, RsuMeasurement

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 
 from netpos.messages.topics import is_vue_id
+from netpos.scenario.settings import TrackerSettings, list_of, settings_from
 from netpos.tracking import TrackerConfig
-from netpos.tracking.settings import TrackerSettings, list_of, settings_from
 from netpos_node import declare, declare_config
 from rclpy.node import Node
 

@@ -46,7 +46,7 @@ _PUBLIC = {
     "load_scenario": "netpos.scenario",
     "read_bag": "netpos.bags.recording",
     "simulate": "netpos.scenario.offline",
-    "track": "netpos.tracking.replay",
+    "track": "netpos.scenario.replay",
     "write_bag": "netpos.bags.recording",
 }
 # Under other names inside.

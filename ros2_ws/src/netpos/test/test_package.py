@@ -16,7 +16,7 @@ import netpos
 import numpy as np
 import pytest
 from netpos.bags import BagError, BagReader, BagWriter, codec
-from netpos.filters.first_compilation import SENTENCE
+from netpos.estimation.first_compilation import SENTENCE
 
 SOURCE = Path(__file__).resolve().parents[1]
 # Distributions whose modules have another name.
@@ -133,7 +133,7 @@ def test_a_wheel_writes_and_reads_bags_without_ros(wheel: Path, tmp_path: Path) 
 
 
 KERNEL = """
-from netpos.filters.compile import leaf
+from netpos.estimation.compile import leaf
 
 @leaf
 def double(x):

@@ -10,7 +10,7 @@ from typing import Any
 import rclpy
 from netpos.bags import BagEntry, BagReader
 from netpos.messages.topics import CLOCK, RUN_SCENARIO
-from netpos.tracking.settings import FUSION_FACT, TRACKER_FACT
+from netpos.scenario.settings import FUSION_FACT, TRACKER_FACT
 from netpos_node import init, message_class, say_of_run, wait_until_heard
 from rclpy.duration import Duration
 from rclpy.node import Node

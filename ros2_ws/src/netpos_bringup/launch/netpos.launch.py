@@ -19,7 +19,7 @@ from launch.substitutions import LaunchConfiguration, PythonExpression
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from netpos.scenario import load_scenario
-from netpos.tracking.settings import settings_from
+from netpos.scenario.settings import settings_from
 
 FLUSH_S = 1.0  # the last messages are under way when the simulator ends
 

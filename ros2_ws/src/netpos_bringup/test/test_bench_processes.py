@@ -13,7 +13,7 @@ import pytest
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages.values import Field, RsuMeasurement
 from netpos_bringup import bench_probe
 from netpos_bringup.bench_process import Measured

@@ -7,8 +7,8 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from netpos.messages import topics
+from netpos.scenario.settings import fusion_fact
 from netpos.tracking.networks.tertiary import TrackFusion
-from netpos.tracking.settings import fusion_fact
 from netpos_msgs.msg import NetworkTrack
 from netpos_node import run, say_of_run
 from netpos_node.estimating import EstimatingNode

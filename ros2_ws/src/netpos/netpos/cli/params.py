@@ -29,8 +29,8 @@ def params(
     """Show the parameters of the tracker: default, range and meaning."""
     from dataclasses import asdict  # noqa: PLC0415
 
+    from netpos.scenario.settings import settings_from  # noqa: PLC0415
     from netpos.tracking.config import TrackerConfig  # noqa: PLC0415
-    from netpos.tracking.settings import settings_from  # noqa: PLC0415
 
     settings = settings_from(source)
     values = asdict(TrackerConfig.from_mapping(settings.parameters))

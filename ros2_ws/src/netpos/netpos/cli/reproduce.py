@@ -14,7 +14,7 @@ from netpos.cli.work import ClusterAddress, Resume, Workers, worked
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from netpos.evaluation.reproduce import Reproduction
+    from netpos.reproduction import Reproduction
 
 
 def reproduce(
@@ -41,8 +41,8 @@ def reproduce(
     """
     from rich.console import Console  # noqa: PLC0415
 
-    from netpos.evaluation.reproduce import reproduce as run  # noqa: PLC0415
     from netpos.evaluation.work import Kept  # noqa: PLC0415
+    from netpos.reproduction import reproduce as run  # noqa: PLC0415
 
     if out is not None and out.exists() and not out.is_dir():
         raise NotADirectoryError(f"--out {out} is a file; give a folder")

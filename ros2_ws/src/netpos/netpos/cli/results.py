@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from netpos.bench import Result
     from netpos.evaluation import Evaluation, Survey
-    from netpos.evaluation.bench import Result
     from netpos.evaluation.evaluate import TruthOf
     from netpos.messages.values import Odometry, RsuInfo, RsuMeasurement
 
@@ -335,8 +335,8 @@ def bench(
     """Measure speed as ratios, side by side in one run."""
     from rich.console import Console  # noqa: PLC0415
 
-    from netpos.evaluation.bench import as_json, chosen, surroundings  # noqa: PLC0415
-    from netpos.evaluation.bench import bench as run_bench  # noqa: PLC0415
+    from netpos.bench import as_json, chosen, surroundings  # noqa: PLC0415
+    from netpos.bench import bench as run_bench  # noqa: PLC0415
 
     if json_file is not None:
         check_json(json_file)
@@ -362,7 +362,8 @@ def bench_table(results: Iterable[Result]) -> Table:
     from rich.markup import escape  # noqa: PLC0415
     from rich.table import Table  # noqa: PLC0415
 
-    from netpos.evaluation.bench import Row, quantity  # noqa: PLC0415
+    from netpos.bench import Row  # noqa: PLC0415
+    from netpos.common.quantity import quantity  # noqa: PLC0415
 
     table = Table("what, and beside what", box=SIMPLE, padding=(0, 1, 1, 0), expand=False)
     for head in ("ours", "beside", "ratio", "target"):
@@ -384,7 +385,7 @@ def bench_table(results: Iterable[Result]) -> Table:
 
 def bench_remarks(results: Iterable[Result]) -> list[str]:
     """What the rows do not say: notes, and what was left out."""
-    from netpos.evaluation.bench import LeftOut  # noqa: PLC0415
+    from netpos.bench import LeftOut  # noqa: PLC0415
 
     return [
         f"left out: {r.name}: {r.reason}" if isinstance(r, LeftOut) else f"{r.name}: {r.note}"

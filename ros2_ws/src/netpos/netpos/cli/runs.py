@@ -23,7 +23,7 @@ from netpos.cli.work import ClusterAddress, Workers, worked
 if TYPE_CHECKING:
     from netpos.evaluation.replays import Replays
     from netpos.scenario import Scenario
-    from netpos.tracking.settings import TrackerSettings
+    from netpos.scenario.settings import TrackerSettings
 
 
 def scenarios() -> None:
@@ -125,7 +125,7 @@ def replay(
     Several bags are tracked side by side; those whose track is there already, with the same
     parameters, are left out.
     """
-    from netpos.tracking.settings import settings_from  # noqa: PLC0415
+    from netpos.scenario.settings import settings_from  # noqa: PLC0415
 
     overrides = dict(parse_setting(text) for text in settings or [])
     source = "" if parameters in (None, "defaults") else str(parameters)
@@ -216,8 +216,8 @@ def _track(
 ) -> None:
     """Replay ``bag`` with parameters of ``source``, and tell of it."""
     from netpos.bags import BagReader  # noqa: PLC0415
-    from netpos.tracking.replay import replay_bag  # noqa: PLC0415
-    from netpos.tracking.settings import bag_settings  # noqa: PLC0415
+    from netpos.scenario.replay import replay_bag  # noqa: PLC0415
+    from netpos.scenario.settings import bag_settings  # noqa: PLC0415
 
     if settings is None:
         with BagReader(bag) as reader:

@@ -14,10 +14,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from netpos.filters import ekf
-from netpos.filters.compile import kernel
-from netpos.filters.measurement import VARIANCE, predict_row
-from netpos.filters.motion import NO_BIAS
+from netpos.estimation import ekf
+from netpos.estimation.compile import kernel
+from netpos.estimation.measurement import VARIANCE, predict_row
+from netpos.estimation.motion import NO_BIAS
 from netpos.messages.values import Array
 
 Stamps = npt.NDArray[np.int64]

@@ -29,8 +29,8 @@ from netpos.messages.values import (
     RsuMeasurement,
     TrackStatus,
 )
+from netpos.scenario.settings import bag_settings
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.settings import bag_settings
 
 _ODOMETRY, _CLOCK = "nav_msgs/msg/Odometry", "netpos_msgs/msg/ClockState"
 _Sink = tuple[str, Callable[[BagEntry], None]]

@@ -36,11 +36,11 @@ from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.load import scenario_names
 from netpos.scenario.offline import timeline
 from netpos.scenario.recorded_drive import import_car_drive
+from netpos.scenario.replay import reading_of, tracker_of
+from netpos.scenario.settings import TrackerSettings, bag_settings, settings_from
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.replay import reading_of, tracker_of
 from netpos.tracking.report import TrackOutput
 from netpos.tracking.sequencer import Item
-from netpos.tracking.settings import TrackerSettings, bag_settings, settings_from
 
 SEEDS = range(9001, 9061)
 FEWEST_RUNS = 8

@@ -8,10 +8,10 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
+from netpos.estimation.state import N_CORE
 from netpos.evaluation.bounds import bound_rmse, run_bound
 from netpos.evaluation.pairing import Stamps, Trajectory
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS
-from netpos.filters.state import N_CORE
 from netpos.messages.values import Array, InitialPose, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import epoch_rows_of

@@ -23,9 +23,9 @@ from netpos.evaluation.yardsticks import (
     snapshots,
 )
 from netpos.messages.values import TrackStatus
+from netpos.scenario.replay import replay_bag
+from netpos.scenario.settings import bag_settings
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.replay import replay_bag
-from netpos.tracking.settings import bag_settings
 
 Json = dict[str, Any]
 

@@ -11,9 +11,9 @@ from typing import Any
 from netpos.bags import BagReader
 from netpos.evaluation.work import Work
 from netpos.messages import topics
+from netpos.scenario.replay import ReplaySummary, changed, replay_bag
+from netpos.scenario.settings import TrackerSettings, bag_settings, tracker_fact
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.replay import ReplaySummary, changed, replay_bag
-from netpos.tracking.settings import TrackerSettings, bag_settings, tracker_fact
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

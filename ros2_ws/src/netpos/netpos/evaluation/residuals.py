@@ -13,13 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from netpos.estimation.measurement import HEADING, KIND, LEVER, VALUE, VARIANCE, predict_row, wrap
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
+from netpos.estimation.rows import rsu_axes, rsu_place, rsu_rows
+from netpos.estimation.sensors.model import Wraps
+from netpos.estimation.sensors.table import BY_KIND
+from netpos.estimation.state import N_CORE, POSITION, VELOCITY, X
 from netpos.evaluation.pairing import ClockOffsets, Trajectory
-from netpos.filters.measurement import HEADING, KIND, LEVER, VALUE, VARIANCE, predict_row, wrap
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS
-from netpos.filters.rows import rsu_axes, rsu_place, rsu_rows
-from netpos.filters.sensors.model import Wraps
-from netpos.filters.sensors.table import BY_KIND
-from netpos.filters.state import N_CORE, POSITION, VELOCITY, X
 from netpos.messages.values import (
     Array,
     Field,

@@ -24,9 +24,9 @@ from netpos.evaluation.work import Work
 from netpos.messages.values import Array
 from netpos.scenario import Scenario, load_scenario
 from netpos.scenario.offline import simulate_to_bag
+from netpos.scenario.replay import replay_bag
+from netpos.scenario.settings import settings_from
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.replay import replay_bag
-from netpos.tracking.settings import settings_from
 
 TABLES = (".csv", ".parquet")
 CONFIDENCE = 0.95

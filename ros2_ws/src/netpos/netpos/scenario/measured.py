@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from netpos.filters.sensors.table import readings
+from netpos.estimation.sensors.table import readings
 from netpos.radio.anchor import TwoWayRanging
 from netpos.radio.arrays import AntennaArray
 from netpos.radio.propagation import LosModel, PathLoss

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from netpos.filters.sensors.table import readings
+from netpos.estimation.sensors.table import readings
 from netpos.inertial.imu import NS, ImuSamples, interval_ns, simulate_imu, simulate_magnetometer
 from netpos.messages.values import (
     Beacon,

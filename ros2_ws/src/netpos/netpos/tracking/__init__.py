@@ -8,7 +8,6 @@
 ``output``      state to odometry, clock state and status
 ``tracker``     all devices
 ``networks``    several networks, one track: a tracker each, their tracks fused
-``replay``      a bag through the tracker, without ROS
 """
 
 from netpos.tracking.config import TrackerConfig

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from netpos.common.parameters import check_fields, choice, count, described, from_mapping, real
-from netpos.filters.motion import ProcessNoise
+from netpos.estimation.motion import ProcessNoise
 from netpos.tracking.rsus import StepErrors
 
 FILTERS = ("ekf", "iekf", "ukf", "srukf", "kf")

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netpos.filters.measurement import BIAS, COMMON, KIND, ROW_WIDTH, VARIANCE, Kind, linearise
-from netpos.filters.rows import ROWS_MAX, couple, linear_rows, put_measurement, speed_row
-from netpos.filters.state import N_CORE, VELOCITY, X
+from netpos.estimation.measurement import BIAS, COMMON, KIND, ROW_WIDTH, VARIANCE, Kind, linearise
+from netpos.estimation.rows import ROWS_MAX, couple, linear_rows, put_measurement, speed_row
+from netpos.estimation.state import N_CORE, VELOCITY, X
 from netpos.messages.values import Array, Field, GroundSpeed, RsuMeasurement, Velocity
 from netpos.tracking.rsus import REFERENCED, BiasStates, Rsu
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages.values import RsuErrors
 
 _SURE = 3.0  # sd of a bias that is mentioned

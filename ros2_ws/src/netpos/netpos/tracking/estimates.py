@@ -11,18 +11,17 @@ from typing import Protocol
 
 import numpy as np
 
-from netpos.filters import ekf, filterpy_backend, imm
-from netpos.filters.measurement import GROUP
-from netpos.filters.mixture import Mixture, mode_of
-from netpos.filters.motion import Parameter
-from netpos.filters.state import N_CORE, X
+from netpos.estimation import components, ekf, engine, filterpy_backend, imm
+from netpos.estimation.components import Dynamics, moments
+from netpos.estimation.engine import EpochInput, FilterOptions
+from netpos.estimation.measurement import GROUP
+from netpos.estimation.mixture import Mixture, mode_of
+from netpos.estimation.motion import Parameter
+from netpos.estimation.protection import mixture_radius
+from netpos.estimation.state import N_CORE, X
 from netpos.messages.values import Array, TrackMode
-from netpos.tracking import components, engine
-from netpos.tracking.components import Dynamics, moments
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.engine import EpochInput, FilterOptions
 from netpos.tracking.models import augmented, initial_extra_sd, motions_of, options_of
-from netpos.tracking.protection import mixture_radius
 
 
 class Estimate(Protocol):
@@ -112,7 +111,7 @@ class OneModel:
 
 class KalmanEstimate(OneModel):
     """One motion model in the compiled engine: one component, or a mixture of them while one does
-    not explain the measurements (``tracking.components``)."""
+    not explain the measurements (``estimation.components``)."""
 
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
         self.stamp_ns = self._turn_ns = stamp_ns

@@ -8,8 +8,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from netpos.filters.compile import kernel, leaf
-from netpos.filters.measurement import (
+from netpos.estimation.compile import kernel, leaf
+from netpos.estimation.engine import FilterOptions, is_sound
+from netpos.estimation.measurement import (
     GATE_VARIANCE,
     GROUP,
     KIND,
@@ -17,12 +18,11 @@ from netpos.filters.measurement import (
     innovation_row,
     innovation_variance,
 )
+from netpos.estimation.protection import FusedEpoch, manoeuvre_level
 from netpos.messages.values import Array, RsuMeasurement
-from netpos.tracking.engine import FilterOptions, is_sound
 from netpos.tracking.epoch_rows import EpochRows, Source
 from netpos.tracking.health import RsuHealth
 from netpos.tracking.observations import FittedEpoch
-from netpos.tracking.protection import FusedEpoch, manoeuvre_level
 from netpos.tracking.rsus import Rsu
 
 AnySource = TypeVar("AnySource", bound=Source)

@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterable, Sequence
 from statistics import median
 
-from netpos.filters.measurement import wrap
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS
-from netpos.filters.sensors.model import Wraps
-from netpos.filters.sensors.table import SENSORS
+from netpos.estimation.measurement import wrap
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
+from netpos.estimation.sensors.model import Wraps
+from netpos.estimation.sensors.table import SENSORS
 from netpos.tracking.observations import Observation
 
 _OFF = _SCATTERS = 3.0  # median and sd of the normalised innovations of what is refused

@@ -16,11 +16,11 @@ from collections import deque
 import numpy as np
 
 from netpos.common.least_squares import minimise
-from netpos.filters import ekf
-from netpos.filters.chi_square import chi_square_bound
-from netpos.filters.compile import kernel
-from netpos.filters.fit import map_cost
-from netpos.filters.measurement import (
+from netpos.estimation import ekf
+from netpos.estimation.chi_square import chi_square_bound
+from netpos.estimation.compile import kernel
+from netpos.estimation.fit import map_cost
+from netpos.estimation.measurement import (
     AXES,
     BIAS,
     BLOCKED,
@@ -37,8 +37,8 @@ from netpos.filters.measurement import (
     predict_row,
     wrap,
 )
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS
-from netpos.filters.sensors.table import BY_KIND
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
+from netpos.estimation.sensors.table import BY_KIND
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.rsus import Rsu

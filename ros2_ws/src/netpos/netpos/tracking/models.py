@@ -6,19 +6,19 @@ import math
 
 import numpy as np
 
-from netpos.filters.chi_square import chi_square_bound
-from netpos.filters.conditioning import RobustOptions
-from netpos.filters.motion import (
+from netpos.estimation.chi_square import chi_square_bound
+from netpos.estimation.conditioning import RobustOptions
+from netpos.estimation.engine import GATE_SIZE, FilterOptions
+from netpos.estimation.motion import (
     SPEED_OF_LIGHT_MPS,
     Model,
     ProcessNoise,
     extra_states,
     motion_parameters,
 )
-from netpos.filters.state import N_CORE, POSITION, X
+from netpos.estimation.state import N_CORE, POSITION, X
 from netpos.messages.values import Array
 from netpos.tracking.config import FILTERS, ROBUST, TrackerConfig
-from netpos.tracking.engine import GATE_SIZE, FilterOptions
 
 FILTER_ITERATIONS = {"ekf": 1, "iekf": 8}
 

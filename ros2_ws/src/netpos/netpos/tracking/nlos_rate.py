@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from netpos.filters.measurement import BLOCKED, GROUP, KIND
-from netpos.filters.robust import update_prior
-from netpos.filters.sensors.table import SENSORS
+from netpos.estimation.measurement import BLOCKED, GROUP, KIND
+from netpos.estimation.robust import update_prior
+from netpos.estimation.sensors.table import SENSORS
 from netpos.messages.values import RsuMeasurement
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import EpochRows

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netpos.filters.measurement import GROUP, KIND
-from netpos.filters.sensors.table import SENSORS
+from netpos.estimation.measurement import GROUP, KIND
+from netpos.estimation.sensors.table import SENSORS
 from netpos.messages.values import Array, GroundSpeed, RsuMeasurement, Velocity
 
 _KIND_AND_GROUP = slice(KIND, GROUP + 1, GROUP - KIND)

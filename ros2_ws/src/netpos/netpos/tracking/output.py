@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
-from netpos.filters.compile import leaf
-from netpos.filters.factor import eigenvalues
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS
-from netpos.filters.state import POSITION, X
+from netpos.estimation.compile import leaf
+from netpos.estimation.factor import eigenvalues
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
+from netpos.estimation.protection import radius_of
+from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array, ClockState, Odometry, TrackState
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.protection import radius_of
 
 # What a planar tracker takes for granted and does not estimate: that the device is at the height
 # it was told, upright, and neither climbs nor tips nor (without a heading of its own) turns.
@@ -199,16 +199,18 @@ def track_state(
     position_sd_m: float,
     *,
     decided: bool = True,
+    bounded: bool = True,
 ) -> TrackState:
     """What a track is worth at ``stamp_ns``; last_accepted_ns : of its last accepted measurement,
     None before the first fix; position_sd_m : along its worst axis [m]; decided : whether it is
-    known which of several places is the true one."""
+    known which of several places is the true one; bounded : whether there is a protection level,
+    none where a manoeuvre would go unnoticed."""
     if last_accepted_ns is None:
         return TrackState.WAITING
     if stamp_ns - last_accepted_ns > config.coast_after_s * 1e9:
         return TrackState.COASTING
     if not decided:
         return TrackState.AMBIGUOUS
-    if position_sd_m > config.initial_position_sd_max_m:
+    if position_sd_m > config.initial_position_sd_max_m or not bounded:
         return TrackState.INITIALISING
     return TrackState.TRACKING

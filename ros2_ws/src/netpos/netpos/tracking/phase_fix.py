@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from netpos.filters.compile import kernel, leaf
-from netpos.filters.factor import factor
-from netpos.filters.measurement import (
+from netpos.estimation.compile import kernel, leaf
+from netpos.estimation.factor import factor
+from netpos.estimation.measurement import (
     AXES,
     BIAS,
     COMMON,
@@ -23,7 +23,7 @@ from netpos.filters.measurement import (
     Kind,
     predict_row,
 )
-from netpos.filters.state import N_CORE, X
+from netpos.estimation.state import N_CORE, X
 from netpos.messages.values import Array
 
 TWO_PI = 2.0 * math.pi

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from netpos.filters.measurement import AXES, ORIGIN, VALUE, VARIANCE
+from netpos.estimation.measurement import AXES, ORIGIN, VALUE, VARIANCE
 from netpos.messages.values import Array, Velocity
 from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig

@@ -74,6 +74,8 @@ class EstimateStatus:
     steps: StepCalibration | None = None
 
 
+LEVEL_MAX_M = 1e6
+"""Protection level of a track whose error nothing bounds."""
 NO_ESTIMATE = EstimateStatus()
 
 
@@ -88,7 +90,12 @@ def track_status(
     """Status of a track after an ``epoch``; accepted, rejected : counts since start."""
     modes = estimate.modes
     state = track_state(
-        config, epoch.stamp_ns, estimate.heard_ns, estimate.position_sd_m, decided=not modes
+        config,
+        epoch.stamp_ns,
+        estimate.heard_ns,
+        estimate.position_sd_m,
+        decided=not modes,
+        bounded=estimate.level_m < LEVEL_MAX_M,
     )
     return TrackStatus(
         stamp_ns=epoch.stamp_ns,
@@ -130,6 +137,8 @@ def _reason(
         case TrackState.WAITING:
             return estimate.missing
         case TrackState.INITIALISING:
+            if estimate.level_m >= LEVEL_MAX_M:
+                return "nothing bounds the error: a manoeuvre would not show in what is measured"
             limit_m = config.initial_position_sd_max_m
             return f"position sd {estimate.position_sd_m:.1f} m, above {limit_m:g} m"
         case TrackState.COASTING:

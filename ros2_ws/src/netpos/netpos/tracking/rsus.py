@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netpos.filters.measurement import BIAS, GATE_VARIANCE, GROUP, Kind
-from netpos.filters.rows import UNCOUPLED, Coupling, rsu_axes, rsu_place, scalar_kinds
-from netpos.filters.sensors.table import BY_KIND, SENSORS, readings
-from netpos.filters.state import N_CORE, X
-from netpos.filters.unexplained import unexplained
+from netpos.estimation.measurement import BIAS, GATE_VARIANCE, GROUP, Kind
+from netpos.estimation.rows import UNCOUPLED, Coupling, rsu_axes, rsu_place, scalar_kinds
+from netpos.estimation.sensors.table import BY_KIND, SENSORS, readings
+from netpos.estimation.state import N_CORE, X
+from netpos.estimation.unexplained import unexplained
 from netpos.messages.values import (
     AngleConvention,
     Array,

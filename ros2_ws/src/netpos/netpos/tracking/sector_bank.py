@@ -16,16 +16,15 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from netpos.filters import srukf
-from netpos.filters.compile import kernel, leaf
-from netpos.filters.factor import factor
-from netpos.filters.gate import accepted_rows, gate_groups
-from netpos.filters.measurement import GROUP, KIND, VALUE, VARIANCE, Kind
-from netpos.filters.sensors.row import group_end
-from netpos.filters.sigma import innovation_cov, regress
+from netpos.estimation import engine, srukf
+from netpos.estimation.compile import kernel, leaf
+from netpos.estimation.engine import Filter, FilterOptions
+from netpos.estimation.factor import factor
+from netpos.estimation.gate import accepted_rows, gate_groups
+from netpos.estimation.measurement import GROUP, KIND, VALUE, VARIANCE, Kind
+from netpos.estimation.sensors.row import group_end
+from netpos.estimation.sigma import innovation_cov, regress
 from netpos.messages.values import Array
-from netpos.tracking import engine
-from netpos.tracking.engine import Filter, FilterOptions
 from netpos.tracking.phase_fix import TWO_PI, admissible, init_hypothesis, nearest_turns, to_fix
 
 Ints = npt.NDArray[np.int64]

@@ -7,17 +7,17 @@ import math
 
 import numpy as np
 
-from netpos.filters import ekf
-from netpos.filters.compile import leaf
-from netpos.filters.measurement import BIAS, COMMON, GROUP, KIND, Kind
-from netpos.filters.state import N_CORE, POSITION, X
+from netpos.estimation import ekf, engine
+from netpos.estimation.compile import leaf
+from netpos.estimation.measurement import BIAS, COMMON, GROUP, KIND, Kind
+from netpos.estimation.protection import protection_level
+from netpos.estimation.state import N_CORE, POSITION, X
 from netpos.messages.values import Array, TrackMode
-from netpos.tracking import engine, sector_bank
+from netpos.tracking import sector_bank
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimates import OneModel
 from netpos.tracking.models import augmented, initial_extra_sd, motions_of, options_of
 from netpos.tracking.phase_fix import TWO_PI, init_hypothesis, phase_scale
-from netpos.tracking.protection import protection_level
 from netpos.tracking.sector_bank import Bank, BankResult
 
 _DOUBT = 0.9  # a decision is taken back below this probability

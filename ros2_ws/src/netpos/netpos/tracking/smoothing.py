@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netpos.filters import smooth
+from netpos.estimation import smooth
 from netpos.messages.values import Array, Odometry
 from netpos.tracking import output
 from netpos.tracking.config import TrackerConfig

@@ -8,6 +8,7 @@ from operator import attrgetter
 
 import numpy as np
 
+from netpos.estimation.protection import NisWindow
 from netpos.messages.values import Array
 from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
 from netpos.tracking.epoch_rows import EpochRows
@@ -17,7 +18,6 @@ from netpos.tracking.networks.secondary import OwnNoise
 from netpos.tracking.nlos_rate import NlosRate
 from netpos.tracking.phase_start import PhaseStart
 from netpos.tracking.pose_wait import PoseWait
-from netpos.tracking.protection import NisWindow
 from netpos.tracking.rsus import BiasStates
 
 

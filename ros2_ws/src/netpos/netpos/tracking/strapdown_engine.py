@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from netpos.filters.compile import kernel
-from netpos.filters.error_state import (
+from netpos.estimation.compile import kernel
+from netpos.estimation.engine import Epochs
+from netpos.estimation.error_state import (
     MEMORY,
     Imu,
     Sensors,
@@ -16,12 +17,11 @@ from netpos.filters.error_state import (
     correct,
     doubt_standstill,
 )
-from netpos.filters.measurement import GROUP, KIND, ORIGIN, ROW_WIDTH, VALUE, VARIANCE, Kind
-from netpos.filters.position_fix import fix_position, start_of
-from netpos.filters.state import Nav
+from netpos.estimation.measurement import GROUP, KIND, ORIGIN, ROW_WIDTH, VALUE, VARIANCE, Kind
+from netpos.estimation.position_fix import fix_position, start_of
+from netpos.estimation.state import Nav
 from netpos.inertial.strapdown import ERR, NAV
 from netpos.messages.values import Array
-from netpos.tracking.engine import Epochs
 
 Ints = NDArray[np.int64]
 _PLACE = int(Kind.PLACE)

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from scipy.linalg import block_diag
 
-from netpos.filters.error_state import Constraints, Sensors, SlowErrors
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS
-from netpos.filters.state import (
+from netpos.estimation.error_state import Constraints, Sensors, SlowErrors
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
+from netpos.estimation.state import (
     ERR_ACCEL_BIAS,
     ERR_BIASES,
     ERR_GYRO_BIAS,

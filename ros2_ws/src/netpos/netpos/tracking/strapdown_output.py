@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from netpos.filters.state import (
+from netpos.estimation.state import (
     ERR_ATTITUDE,
     ERR_GYRO_BIAS,
     ERR_POSITION,

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from netpos.filters.measurement import GATE_VARIANCE, Kind
-from netpos.filters.rows import UNCOUPLED, rsu_rows
-from netpos.filters.sensors.table import readings
-from netpos.filters.space import direction_rows, linearise_in_space, place_rows
+from netpos.estimation.measurement import GATE_VARIANCE, Kind
+from netpos.estimation.rows import UNCOUPLED, rsu_rows
+from netpos.estimation.sensors.table import readings
+from netpos.estimation.space import direction_rows, linearise_in_space, place_rows
 from netpos.messages.values import Array, Field, GroundSpeed, RsuMeasurement
 from netpos.tracking.epoch_rows import EpochRows, reference_place, shared_references
 from netpos.tracking.rsus import BiasStates, Rsu

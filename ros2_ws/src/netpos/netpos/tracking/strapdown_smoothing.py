@@ -17,7 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from netpos.filters.error_state import (
+from netpos.estimation.engine import Epochs
+from netpos.estimation.error_state import (
     MEMORY,
     Chunk,
     Imu,
@@ -27,12 +28,11 @@ from netpos.filters.error_state import (
     doubt_standstill,
     predict_chunk,
 )
-from netpos.filters.factor import factor, solve_factored
-from netpos.filters.measurement import GROUP
-from netpos.filters.state import ERR_BIASES
+from netpos.estimation.factor import factor, solve_factored
+from netpos.estimation.measurement import GROUP
+from netpos.estimation.state import ERR_BIASES
 from netpos.inertial.strapdown import ACCEL_BIAS, ATTITUDE_ERR, QUATERNION, inject
 from netpos.messages.values import Array
-from netpos.tracking.engine import Epochs
 from netpos.tracking.strapdown_models import augmented_3d
 
 

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from netpos.filters.chi_square import chi_square_bound
-from netpos.filters.measurement import BIAS, COMMON, GROUP, KIND, LEVER, VARIANCE, Kind
-from netpos.filters.position_fix import FixStatus, fix_position, start_of
-from netpos.filters.space import linearise_in_space
-from netpos.filters.state import NAV_POSITION, Err, Nav
+from netpos.estimation.chi_square import chi_square_bound
+from netpos.estimation.measurement import BIAS, COMMON, GROUP, KIND, LEVER, VARIANCE, Kind
+from netpos.estimation.position_fix import FixStatus, fix_position, start_of
+from netpos.estimation.space import linearise_in_space
+from netpos.estimation.state import NAV_POSITION, Err, Nav
 from netpos.inertial.alignment import fit_course, way_of
 from netpos.inertial.strapdown import ERR, NAV
 from netpos.messages.values import Array, ImuSample

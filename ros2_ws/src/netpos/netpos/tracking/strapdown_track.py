@@ -15,12 +15,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from netpos.filters.conditioning import Robust
-from netpos.filters.error_state import MEMORY, Imu, Sensors, advance, correct, doubt_standstill
-from netpos.filters.measurement import GROUP, KIND, VARIANCE, Kind
-from netpos.filters.space import place_rows
-from netpos.filters.space_conditioning import reweight_3d
-from netpos.filters.state import ERR_BIASES, ERR_CLOCK_DRIFT, NAV_CLOCK_DRIFT, POSITION
+from netpos.estimation.conditioning import Robust
+from netpos.estimation.error_state import MEMORY, Imu, Sensors, advance, correct, doubt_standstill
+from netpos.estimation.measurement import GROUP, KIND, VARIANCE, Kind
+from netpos.estimation.protection import NisWindow, protection_level
+from netpos.estimation.space import place_rows
+from netpos.estimation.space_conditioning import reweight_3d
+from netpos.estimation.state import ERR_BIASES, ERR_CLOCK_DRIFT, NAV_CLOCK_DRIFT, POSITION
 from netpos.inertial.strapdown import ERR, NAV
 from netpos.messages.values import Array, InitialPose, Odometry, RsuMeasurement, TrackStatus
 from netpos.tracking import output
@@ -33,7 +34,6 @@ from netpos.tracking.models import gate_thresholds, robust_options_of
 from netpos.tracking.nlos_rate import NlosRate
 from netpos.tracking.observations import FittedEpoch
 from netpos.tracking.pose_wait import PoseWait
-from netpos.tracking.protection import NisWindow, protection_level
 from netpos.tracking.report import (
     EpochResult,
     EstimateStatus,

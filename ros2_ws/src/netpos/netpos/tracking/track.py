@@ -9,9 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from netpos.filters.chi_square import chi_square_bound
-from netpos.filters.measurement import VARIANCE
-from netpos.filters.state import N_CORE, POSITION, VELOCITY
+from netpos.estimation.chi_square import chi_square_bound
+from netpos.estimation.measurement import VARIANCE
+from netpos.estimation.protection import FusedEpoch
+from netpos.estimation.state import N_CORE, POSITION, VELOCITY
 from netpos.messages.values import (
     Array,
     InitialPose,
@@ -51,8 +52,8 @@ from netpos.tracking.networks.secondary import Secondary
 from netpos.tracking.nlos_rate import NlosRate
 from netpos.tracking.observations import FittedEpoch
 from netpos.tracking.phase_start import PhaseStart, corrections, with_sectors
-from netpos.tracking.protection import FusedEpoch
 from netpos.tracking.report import (
+    LEVEL_MAX_M,
     EpochResult,
     EstimateStatus,
     TrackOutput,
@@ -65,9 +66,9 @@ from netpos.tracking.sequencer import Epoch, Item
 from netpos.tracking.shared_errors import SharedErrors
 from netpos.tracking.smoothing import FixedLag, Posterior, Smoother
 from netpos.tracking.snapshot import TrackSnapshot
+from netpos.tracking.unnoticed import level_of_epochs
 
 _IMU_HOLE_S = 0.05
-_LEVEL_MAX_M = 1e6
 _RECENT = 5  # epochs
 _POSE_SD_MIN_M = 1.0  # an initial pose is no surer than this when it is weighed
 _BLIND_GYRO = 1.0  # rad/s/sqrt(Hz): what the heading does while the IMU is silent
@@ -441,6 +442,15 @@ class Track:
         )
         if math.isnan(undetected_m):
             return False
+        if math.isinf(undetected_m):
+            heard = [(then_ns, rows.rows) for then_ns, rows in state.recent]
+            undetected_m = level_of_epochs(
+                [*heard, (stamp_ns, epoch_rows.rows)],
+                stamp_ns,
+                (prior_mean, prior_cov),
+                estimate.cov,
+                self._options,
+            )
         state.undetected_m = undetected_m
         nis, dof = with_refused(epoch_rows, accepted, self._gate, nis, dof)
         if math.isfinite(nis):
@@ -549,5 +559,5 @@ class Track:
         level = state.nis_window.inflation() * radius_m
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
         moved = state.undetected_m + config.manoeuvre_sd_mps * unheard_s
-        level = max(level, min(moved, _LEVEL_MAX_M))
+        level = max(level, min(moved, LEVEL_MAX_M))
         return estimate.radius(level)

@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netpos.filters.factor import eigenvalues
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS
-from netpos.filters.rows import rsu_axes
-from netpos.filters.sensors.model import Reading, Refusal
-from netpos.filters.sensors.table import readings
+from netpos.estimation.factor import eigenvalues
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
+from netpos.estimation.rows import rsu_axes
+from netpos.estimation.sensors.model import Reading, Refusal
+from netpos.estimation.sensors.table import readings
 from netpos.messages.fields import MAP_FRAME, bad_stamp, malformed_nanosec, stamp_fault
 from netpos.messages.topics import is_vue_id
 from netpos.messages.values import (

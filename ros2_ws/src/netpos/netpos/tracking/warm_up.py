@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 
-from netpos.filters.motion import NO_BIAS
-from netpos.filters.rows import linear_rows
+from netpos.estimation.motion import NO_BIAS
+from netpos.estimation.rows import linear_rows
 from netpos.messages.values import Field, GroundSpeed, InitialPose, RsuInfo, RsuMeasurement
 from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig

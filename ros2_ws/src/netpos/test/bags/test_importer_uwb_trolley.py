@@ -16,8 +16,8 @@ from netpos.bags.importers import import_uwb_trolley
 from netpos.bags.importers.common import UWB_DATA_SHEET
 from netpos.bags.importers.uwb_trolley import TAGS_M
 from netpos.messages.values import Field, Odometry
+from netpos.scenario.settings import bag_settings
 from netpos.tracking import TrackerConfig
-from netpos.tracking.settings import bag_settings
 
 DATA = Path(os.environ.get("NETPOS_DATA", Path(__file__).parents[6] / "shared" / "data"))
 DISTANCES = [round(2.0 + 0.1 * link, 1) for link in range(24)]

@@ -16,7 +16,7 @@ from netpos.cli.main import app
 from netpos.evaluation import evaluate_bag
 from netpos.messages.topics import RSU_INFO, RSU_LEARNED
 from netpos.messages.values import AngleConvention, Field, Odometry, RsuInfo, RsuMeasurement
-from netpos.tracking.replay import replay_bag
+from netpos.scenario.replay import replay_bag
 from typer.testing import CliRunner
 
 S = 1_000_000_000

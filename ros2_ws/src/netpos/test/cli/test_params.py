@@ -7,8 +7,8 @@ from pathlib import Path
 
 import yaml
 from netpos.cli.main import app
+from netpos.scenario.settings import settings_from
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.settings import settings_from
 from typer.testing import CliRunner
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from netpos.evaluation.reproduce import frame
-from netpos.evaluation.reproduce.frame import Outcome, at_most, shown
 from netpos.evaluation.work import Work
+from netpos.reproduction import frame
+from netpos.reproduction.frame import Outcome, at_most, shown
 from typer.testing import Result
 
 Netpos = Callable[..., Result]

@@ -46,8 +46,8 @@ def test_figures_replace_figures_and_nothing_else(
 @pytest.mark.parametrize(
     ("command", "work"),
     [
-        (("reproduce", "fokin2020"), "netpos.evaluation.reproduce.reproduce"),
-        (("bench",), "netpos.evaluation.bench.bench"),
+        (("reproduce", "fokin2020"), "netpos.reproduction.reproduce"),
+        (("bench",), "netpos.bench.bench"),
     ],
 )
 def test_a_folder_for_figures_is_told_before_the_work(

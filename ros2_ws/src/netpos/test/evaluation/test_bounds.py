@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from netpos.estimation.measurement import KIND, ROW_WIDTH, VARIANCE, Kind
+from netpos.estimation.motion import NO_BIAS, ProcessNoise, motion_parameters
+from netpos.estimation.rows import linear_rows, rsu_axes, rsu_rows, speed_row
+from netpos.estimation.state import POSITION, VELOCITY, X
 from netpos.evaluation.bounds import bound_covariances, bound_rmse, run_bound
-from netpos.filters.measurement import KIND, ROW_WIDTH, VARIANCE, Kind
-from netpos.filters.motion import NO_BIAS, ProcessNoise, motion_parameters
-from netpos.filters.rows import linear_rows, rsu_axes, rsu_rows, speed_row
-from netpos.filters.state import POSITION, VELOCITY, X
 from netpos.messages.values import Field, RsuInfo, RsuMeasurement
 from scipy.linalg import solve_discrete_are
 

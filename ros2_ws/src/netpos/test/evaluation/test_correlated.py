@@ -12,9 +12,9 @@ from netpos.evaluation.consistency import (
     whitened,
 )
 from netpos.evaluation.correlated import DRAWS, cosine_variances, mean_square_given_shape
-from netpos.evaluation.reproduce.experiment import setup_of
-from netpos.evaluation.reproduce.fokin2020 import WANDER
 from netpos.messages.values import Array
+from netpos.reproduction.experiment import setup_of
+from netpos.reproduction.fokin2020.paper import WANDER
 from scipy.fft import dct
 from scipy.linalg import solve_discrete_are, toeplitz
 from scipy.signal import lfilter

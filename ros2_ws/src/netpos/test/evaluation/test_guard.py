@@ -27,7 +27,7 @@ from netpos.evaluation.metrics import Figures
 from netpos.messages.values import RsuMeasurement
 from netpos.scenario import load_scenario
 from netpos.scenario.offline import simulate_to_bag
-from netpos.tracking.replay import replay_bag
+from netpos.scenario.replay import replay_bag
 
 COMMITTED = Path(__file__).parents[5] / "tests" / "baselines"
 NOTHING: Pooled = dict.fromkeys(LEAST)

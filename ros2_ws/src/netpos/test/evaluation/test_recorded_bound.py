@@ -12,12 +12,12 @@ from netpos.evaluation.bounds import bound_rmse
 from netpos.evaluation.evaluate import evaluate_bag
 from netpos.evaluation.pairing import Trajectory
 from netpos.evaluation.recorded_bound import recorded_bound_m
-from netpos.evaluation.reproduce.experiment import Experiment, Setup
 from netpos.messages.values import Beacon, Odometry, RsuMeasurement
+from netpos.reproduction.experiment import Experiment, Setup
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.offline import simulate_to_bag
+from netpos.scenario.replay import replay_bag
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.replay import replay_bag
 
 CHANGES = {"max_duration_s": 20.0}
 

@@ -10,7 +10,7 @@ from netpos.cli.main import app
 from netpos.messages import topics
 from netpos.scenario import load_scenario
 from netpos.scenario.offline import simulate_to_bag
-from netpos.tracking.replay import replay_bag
+from netpos.scenario.replay import replay_bag
 from typer.testing import CliRunner, Result
 
 

@@ -14,7 +14,7 @@ from netpos.evaluation.report import write_report
 from netpos.messages import topics
 from netpos.scenario import load_scenario
 from netpos.scenario.offline import simulate_to_bag
-from netpos.tracking.replay import replay_bag
+from netpos.scenario.replay import replay_bag
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 

@@ -17,7 +17,7 @@ from netpos.evaluation import Survey, assess_bag, survey_bag
 from netpos.evaluation.residuals import correlation_s
 from netpos.evaluation.survey import SurveyedVue
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
-from netpos.tracking.replay import replay_bag
+from netpos.scenario.replay import replay_bag
 from rosbags.typesys import Stores, get_typestore
 from typer.testing import CliRunner
 

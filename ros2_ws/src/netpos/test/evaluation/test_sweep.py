@@ -13,7 +13,7 @@ from netpos.evaluation.sweep import Plan, draw_sweep, means, sweep
 from netpos.evaluation.work import Work
 from netpos.scenario import load_scenario
 from netpos.scenario.offline import simulate_to_bag
-from netpos.tracking.replay import replay_bag
+from netpos.scenario.replay import replay_bag
 from typer.testing import CliRunner
 
 SHORT = {"max_duration_s": (3.0,)}

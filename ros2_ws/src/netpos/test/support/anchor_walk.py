@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from netpos.filters.rows import linear_rows, rsu_axes, rsu_rows
+from netpos.estimation.rows import linear_rows, rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement, Velocity
 from netpos.tracking import Tracker, TrackerConfig, TrackOutput
 from scipy.spatial.transform import Rotation

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 from filter_rows import row
-from netpos.filters.measurement import (
+from netpos.estimation.measurement import (
     VARIANCE,
     Kind,
     curvature_variance,
     linearise,
 )
-from netpos.filters.state import X
+from netpos.estimation.state import X
 from netpos.messages.values import Array
 
 

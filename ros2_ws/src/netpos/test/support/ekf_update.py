@@ -5,8 +5,8 @@ from __future__ import annotations
 from fractions import Fraction
 
 import numpy as np
-from netpos.filters import ekf
-from netpos.filters.measurement import GROUP
+from netpos.estimation import ekf
+from netpos.estimation.measurement import GROUP
 from netpos.messages.values import Array
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from netpos.filters.error_state import MEMORY, UNCONSTRAINED, Constraints, Imu, Sensors, advance
-from netpos.filters.space import innovation_at
-from netpos.filters.state import NAV_POSITION, NAV_QUATERNION, NAV_VELOCITY, Nav
+from netpos.estimation.error_state import MEMORY, UNCONSTRAINED, Constraints, Imu, Sensors, advance
+from netpos.estimation.space import innovation_at
+from netpos.estimation.state import NAV_POSITION, NAV_QUATERNION, NAV_VELOCITY, Nav
 from netpos.inertial.strapdown import ERR, NAV, InertialNoise, rotation_of, still_earth
 from netpos.messages.values import Array
 from scipy.spatial.transform import Rotation

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from netpos.filters.measurement import (
+from netpos.estimation.measurement import (
     AXES,
     BIAS,
     COMMON,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from netpos.filters.rows import rsu_rows
+from netpos.estimation.rows import rsu_rows
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.initialise import Initialiser

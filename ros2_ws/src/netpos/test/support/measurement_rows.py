@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from filter_rows import row
-from netpos.filters.measurement import AXES, COMMON, HEADING, KIND, LEVER, ORIGIN, Kind
-from netpos.filters.rows import rsu_axes
-from netpos.filters.sensors.table import SENSORS
-from netpos.filters.state import POSITION, X
+from netpos.estimation.measurement import AXES, COMMON, HEADING, KIND, LEVER, ORIGIN, Kind
+from netpos.estimation.rows import rsu_axes
+from netpos.estimation.sensors.table import SENSORS
+from netpos.estimation.state import POSITION, X
 from netpos.messages.values import AngleConvention, Array, RsuInfo
 from scipy.spatial.transform import Rotation
 

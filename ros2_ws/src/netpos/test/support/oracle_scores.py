@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from netpos.estimation.protection import protection_level
 from netpos.evaluation.consistency import MeanTest, nees_over_runs
 from netpos.messages.values import Array
 from netpos.tracking import Tracker, TrackerConfig
-from netpos.tracking.protection import protection_level
 from oracle_problems import PROBLEMS, Case, Step, draw
 from particle_filter import ParticleFilter
 from posterior import Cloud, Modes

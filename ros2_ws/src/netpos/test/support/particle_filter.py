@@ -1,6 +1,6 @@
 """A bootstrap particle filter of a device in the plane, with models of its own.
 
-It shares no code with ``netpos.filters``: it is the yardstick for them. A particle is
+It shares no code with ``netpos.estimation``: it is the yardstick for them. A particle is
 [x, y, vx, vy] in m and m/s. Velocities do a random walk (white acceleration); a velocity may turn
 by 90 degrees to either side at random times. The clock offset [m] and drift [m/s] are linear and
 Gaussian given the path of a particle: each particle has a mean of its own, all share one

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from netpos.evaluation.reproduce.experiment import VUE, Setup
 from netpos.messages.values import Beacon, InitialPose
+from netpos.reproduction.experiment import VUE, Setup
 from netpos.tracking import Tracker, TrackOutput
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from netpos.filters.state import POSITION
+from netpos.estimation.state import POSITION
 from netpos.messages.values import Array, InitialPose
 from netpos.tracking import TrackOutput
 

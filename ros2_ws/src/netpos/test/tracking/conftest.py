@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters.state import POSITION, X
+from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking import Tracker, TrackerConfig, TrackOutput
 from scipy.constants import speed_of_light

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters.motion import NO_BIAS
-from netpos.filters.rows import linear_rows
-from netpos.filters.state import POSITION, X
+from netpos.estimation.motion import NO_BIAS
+from netpos.estimation.rows import linear_rows
+from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array, Field, GroundSpeed, ImuSample
 from netpos.tracking import TrackerConfig, TrackOutput, estimates
 from netpos.tracking.models import motions_of

@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters import conditioning
-from netpos.filters.measurement import GATE_VARIANCE, VARIANCE, Kind
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS
-from netpos.filters.rows import Coupling, rsu_axes, rsu_rows
+from netpos.estimation import conditioning
+from netpos.estimation.measurement import GATE_VARIANCE, VARIANCE, Kind
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
+from netpos.estimation.rows import Coupling, rsu_axes, rsu_rows
 from netpos.messages.values import (
     AngleConvention,
     Array,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters.measurement import Kind
+from netpos.estimation.measurement import Kind
 from netpos.tracking.health import HealthConfig, RsuHealth
 from netpos.tracking.health_words import mean_nis, medians, off, rate_hz, words
 from netpos.tracking.observations import Observation

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from netpos.filters.state import POSITION
+from netpos.estimation.state import POSITION
 from netpos.messages.values import (
     Array,
     Field,

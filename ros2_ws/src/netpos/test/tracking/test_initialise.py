@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from first_fix import at, measure, rsu, solve
-from netpos.filters.rows import linear_rows, speed_row
+from netpos.estimation.rows import linear_rows, speed_row
 from netpos.messages.values import AngleConvention, Array, Field
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.initialise import (

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 from first_fix import at, measure, rsu, solve
-from netpos.filters.measurement import Kind, linearise
-from netpos.filters.rows import speed_row
+from netpos.estimation.measurement import Kind, linearise
+from netpos.estimation.rows import speed_row
 from netpos.messages.values import AngleConvention, Array, Field
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.initialise import (

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters.conditioning import RobustOptions
-from netpos.filters.motion import Model, Parameter, ProcessNoise
-from netpos.filters.state import POSITION
+from netpos.estimation.conditioning import RobustOptions
+from netpos.estimation.engine import GATE_SIZE, Filter, FilterOptions
+from netpos.estimation.motion import Model, Parameter, ProcessNoise
+from netpos.estimation.state import POSITION
 from netpos.tracking.config import FILTERS, ROBUST, TrackerConfig
-from netpos.tracking.engine import GATE_SIZE, Filter, FilterOptions
 from netpos.tracking.models import (
     FILTER_ITERATIONS,
     augmented,

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters.measurement import BLOCKED, KIND, Kind
-from netpos.filters.rows import rsu_axes, rsu_rows
+from netpos.estimation.measurement import BLOCKED, KIND, Kind
+from netpos.estimation.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Field, RsuInfo, RsuMeasurement
 from netpos.tracking import TrackerConfig
 from netpos.tracking.epoch_rows import EpochRows

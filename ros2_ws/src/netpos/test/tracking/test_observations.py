@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from netpos.filters.measurement import GROUP, KIND, ROW_WIDTH, Kind
+from netpos.estimation.measurement import GROUP, KIND, ROW_WIDTH, Kind
 from netpos.messages.values import GroundSpeed, RsuMeasurement
 from netpos.tracking.health import RsuHealth
 from netpos.tracking.observations import FittedEpoch

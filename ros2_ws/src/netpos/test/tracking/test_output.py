@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 import pytest
-from netpos.filters.state import CLOCK_DRIFT, POSITION, VELOCITY, X
+from netpos.estimation.protection import protection_level
+from netpos.estimation.state import CLOCK_DRIFT, POSITION, VELOCITY, X
 from netpos.messages.values import Array, TrackState
 from netpos.tracking import TrackerConfig, output
-from netpos.tracking.protection import protection_level
 from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from netpos.filters.measurement import (
+from netpos.estimation.measurement import (
     BIAS,
     COMMON,
     GATE_VARIANCE,
@@ -18,8 +18,8 @@ from netpos.filters.measurement import (
     Kind,
     predict_row,
 )
-from netpos.filters.rows import rsu_axes, rsu_rows
-from netpos.filters.state import POSITION, VELOCITY
+from netpos.estimation.rows import rsu_axes, rsu_rows
+from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.phase_fix import (
     admissible,

@@ -20,9 +20,9 @@ from antenna_square import (
     tracker,
     yaw_of,
 )
-from netpos.filters.measurement import HEADING, LEVER, linearise
-from netpos.filters.rows import Coupling, rsu_axes, rsu_rows
-from netpos.filters.state import POSITION
+from netpos.estimation.measurement import HEADING, LEVER, linearise
+from netpos.estimation.rows import Coupling, rsu_axes, rsu_rows
+from netpos.estimation.state import POSITION
 from netpos.messages.values import (
     AngleConvention,
     Array,

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from netpos.filters.measurement import Kind
+from netpos.estimation.measurement import Kind
 from netpos.messages.values import AngleConvention, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.rsus import BiasStates, Rsu
 from scipy.spatial.transform import Rotation

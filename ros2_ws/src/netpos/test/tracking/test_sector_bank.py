@@ -18,9 +18,9 @@ from anchor_walk import (
     true_values,
     wrap,
 )
-from netpos.filters.measurement import KIND, VALUE, VARIANCE, Kind
-from netpos.filters.motion import NO_BIAS
-from netpos.filters.sigma import innovation_cov, regress
+from netpos.estimation.measurement import KIND, VALUE, VARIANCE, Kind
+from netpos.estimation.motion import NO_BIAS
+from netpos.estimation.sigma import innovation_cov, regress
 from netpos.messages.values import Array
 from netpos.tracking import TrackerConfig, sector_bank
 from netpos.tracking.models import options_of, pose_state

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from anchor_walk import Walk, rows_at
 from engine_cases import opened
-from netpos.filters import ekf
-from netpos.filters.measurement import KIND, VALUE, VARIANCE, Kind, predict_row
-from netpos.filters.motion import NO_BIAS
-from netpos.filters.rows import linear_rows
-from netpos.filters.sigma import innovation_cov, regress
+from netpos.estimation import ekf, engine
+from netpos.estimation.engine import GATE_SIZE
+from netpos.estimation.measurement import KIND, VALUE, VARIANCE, Kind, predict_row
+from netpos.estimation.motion import NO_BIAS
+from netpos.estimation.rows import linear_rows
+from netpos.estimation.sigma import innovation_cov, regress
 from netpos.messages.values import Array
-from netpos.tracking import TrackerConfig, engine, sector_bank
-from netpos.tracking.engine import GATE_SIZE
+from netpos.tracking import TrackerConfig, sector_bank
 from netpos.tracking.models import motions_of, options_of
 from netpos.tracking.phase_fix import init_hypothesis, place
 from netpos.tracking.sector_bank import Bank, BankResult

@@ -24,8 +24,8 @@ from anchor_walk import (
     true_values,
     wrap,
 )
-from netpos.filters.rows import rsu_axes, rsu_rows
-from netpos.filters.state import POSITION
+from netpos.estimation.rows import rsu_axes, rsu_rows
+from netpos.estimation.state import POSITION
 from netpos.messages.values import (
     Field,
     InitialPose,

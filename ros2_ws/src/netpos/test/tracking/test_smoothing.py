@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters.state import POSITION, X
+from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array, Odometry, RsuMeasurement
 from netpos.tracking import Tracker, TrackerConfig
 from netpos.tracking.smoothing import FixedLag, Posterior, Smoother

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters.state import X
+from netpos.estimation.state import X
 from netpos.tracking import Tracker
 from street_run import epochs, fed, ran, truth
 

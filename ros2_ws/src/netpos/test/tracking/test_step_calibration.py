@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters.measurement import BIAS, COMMON, KIND, Kind
-from netpos.filters.state import POSITION, VELOCITY
+from netpos.estimation.measurement import BIAS, COMMON, KIND, Kind
+from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import Array, Field, StepCalibration, Velocity
 from netpos.tracking import TrackerConfig
 from netpos.tracking.epoch_rows import epoch_rows_of

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 import pytest
-from netpos.filters.position_fix import FixStatus
-from netpos.filters.rows import rsu_axes, rsu_rows
+from netpos.estimation.engine import Epochs
+from netpos.estimation.position_fix import FixStatus
+from netpos.estimation.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
-from netpos.tracking.engine import Epochs
 from netpos.tracking.strapdown_engine import fix_each
 from scipy.optimize import least_squares
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from netpos.filters.error_state import MEMORY
+from netpos.estimation.error_state import MEMORY
 from netpos.inertial.strapdown import ERR, NAV
 from netpos.messages.values import (
     Array,

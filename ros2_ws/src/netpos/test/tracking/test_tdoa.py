@@ -18,8 +18,8 @@ from netpos.evaluation import evaluate_bag
 from netpos.messages.values import Array, Field, InitialPose, Odometry, RsuInfo, RsuMeasurement
 from netpos.scenario import load_scenario
 from netpos.scenario.offline import simulate_to_bag
+from netpos.scenario.replay import replay_bag
 from netpos.tracking import Tracker, TrackerConfig
-from netpos.tracking.replay import replay_bag
 from scipy.optimize import least_squares
 
 C = 299_792_458.0

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters.state import X
+from netpos.estimation.state import X
 from netpos.messages.values import (
     Array,
     Field,

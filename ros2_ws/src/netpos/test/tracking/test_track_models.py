@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.filters.state import POSITION, VELOCITY
+from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import (
     Array,
     Field,

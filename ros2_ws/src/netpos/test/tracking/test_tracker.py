@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from netpos.filters.state import X
+from netpos.estimation.state import X
 from netpos.messages.values import (
     AngleConvention,
     Field,

@@ -13,10 +13,10 @@ from netpos.bags import BagReader, BagWriter, codec
 from netpos.bags.rsus_file import rsus_text
 from netpos.messages import topics
 from netpos.messages.values import Field, RsuInfo, RsuMeasurement
+from netpos.scenario.replay import replay_bag
+from netpos.scenario.settings import TrackerSettings, bag_settings
 from netpos.tracking import Tracker, TrackerConfig
 from netpos.tracking.diagnosis import Level
-from netpos.tracking.replay import replay_bag
-from netpos.tracking.settings import TrackerSettings, bag_settings
 
 T0 = 1_000_000_000
 TRUE = np.array([12.0, 31.0])

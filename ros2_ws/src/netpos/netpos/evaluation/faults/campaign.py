@@ -19,8 +19,8 @@ from netpos.evaluation.pairing import Trajectory
 from netpos.evaluation.work import Work
 from netpos.messages.values import RsuInfo, RsuMeasurement
 from netpos.scenario import Simulation, load_scenario
+from netpos.scenario.settings import settings_from
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.settings import settings_from
 
 
 @dataclass(frozen=True, slots=True)

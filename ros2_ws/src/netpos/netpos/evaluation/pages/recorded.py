@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from netpos.evaluation.bench.common import quantity
+from netpos.common.quantity import quantity
 
 Value = float | str | None
 

@@ -19,8 +19,8 @@ from netpos.evaluation.summary import (
     verdict_rows,
 )
 from netpos.evaluation.survey import Survey, VueSurvey
+from netpos.scenario.settings import SCENARIO_FACT, TRACKER_FACT, not_usual
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.settings import SCENARIO_FACT, TRACKER_FACT, not_usual
 
 Table = dict[str, Any]
 _OVERVIEW = (

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from netpos.bags import BagReader, codec
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.evaluation.yardsticks.observations import Kind, Observations
-from netpos.filters.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages import topics
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from netpos.filters.chi_square import chi_square_bound
+from netpos.estimation.chi_square import chi_square_bound
 from netpos.messages.values import Array
 from netpos.tracking.networks.common_instant import Moved
 from netpos.tracking.networks.config import FusionConfig

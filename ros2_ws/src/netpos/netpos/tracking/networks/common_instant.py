@@ -8,8 +8,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from netpos.filters.motion import NO_BIAS, Model, motion_parameters, noise, transition
-from netpos.filters.state import X
+from netpos.estimation.motion import NO_BIAS, Model, motion_parameters, noise, transition
+from netpos.estimation.state import X
 from netpos.messages.values import Array, NetworkTrack
 
 # Entries of the state of ``filters.motion`` that a network's track has.

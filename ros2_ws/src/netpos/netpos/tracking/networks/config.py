@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from netpos.common.parameters import check_fields, choice, from_mapping, real
-from netpos.filters.intersection import METHODS
+from netpos.estimation.intersection import METHODS
 
 ASSOCIATIONS = ("motion", "names")
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netpos.filters import kf
-from netpos.filters.motion import Parameter, add_velocity_step, transition
+from netpos.estimation import kf
+from netpos.estimation.motion import Parameter, add_velocity_step, transition
 from netpos.messages.values import Array, NetworkTrack
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimates import Estimate

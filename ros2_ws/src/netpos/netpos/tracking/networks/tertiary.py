@@ -14,15 +14,15 @@ from typing import cast
 
 import numpy as np
 
-from netpos.filters.intersection import fuse_pair
-from netpos.filters.state import POSITION
+from netpos.estimation.intersection import fuse_pair
+from netpos.estimation.protection import protection_level
+from netpos.estimation.state import POSITION
 from netpos.messages.values import Array, NetworkTrack, TrackState, TrackStatus
 from netpos.tracking import output
 from netpos.tracking.networks.association import Association, Slots, by_name
 from netpos.tracking.networks.common_instant import Moved, at_common_instant
 from netpos.tracking.networks.config import FusionConfig
 from netpos.tracking.networks.validation import network_track_fault
-from netpos.tracking.protection import protection_level
 from netpos.tracking.report import TrackOutput
 from netpos.tracking.sequencer import Epoch, Item, Sequencer
 

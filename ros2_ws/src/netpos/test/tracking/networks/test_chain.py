@@ -10,8 +10,8 @@ from netpos.bags import BagReader
 from netpos.messages.topics import of_vue
 from netpos.scenario import load_scenario
 from netpos.scenario.offline import simulate_to_bag
-from netpos.tracking.replay import replay_bag
-from netpos.tracking.settings import bag_settings, settings_from
+from netpos.scenario.replay import replay_bag
+from netpos.scenario.settings import bag_settings, settings_from
 
 
 @pytest.fixture(scope="module")

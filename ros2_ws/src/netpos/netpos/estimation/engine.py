@@ -1,0 +1,313 @@
+"""One epoch of one component, compiled: predict, gate, update, recover. The same kernel serves the
+live track, the replay and Monte Carlo runs of thousands of routes."""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from netpos.estimation import conditioning, ekf, kf, srukf, ukf
+from netpos.estimation.compile import kernel, leaf
+from netpos.estimation.conditioning import Robust, RobustOptions
+from netpos.estimation.manoeuvre import add_manoeuvre, detection_delay_s
+from netpos.estimation.measurement import GROUP
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS, Parameter, add_velocity_step
+from netpos.estimation.state import X
+from netpos.messages.values import Array
+
+Ints = npt.NDArray[np.int64]
+
+GATE_SIZE = 65
+_FARTHEST_M = 1e9  # no measurement may say more
+_ROUNDING = 1e-15  # of turned axes
+
+
+class Filter(IntEnum):
+    """``FilterOptions.filter``, in the order of ``config.FILTERS``."""
+
+    EKF = 0
+    IEKF = 1
+    UKF = 2
+    SRUKF = 3
+    KF = 4
+
+
+class FilterOptions(NamedTuple):
+    """What a filter is told once; ``models.options_of`` makes it from the parameters."""
+
+    filter: int  # Filter
+    iterations: int
+    height_m: float  # of the device
+    inflate_after: int  # epochs rejected in a row
+    lost_after: int  # epochs rejected in a row
+    initial_speed_sd: float  # [m/s] to which the velocity opens then
+    manoeuvre_speed_sd: float  # [m/s] of a manoeuvre; 0: none
+    coast_after_s: float  # a longer silence may leave the device anywhere
+    integrity_risk: float  # share of errors that may exceed the protection level
+    robust: RobustOptions
+    gain_floor: Array  # (3,) as for ``kf.update``
+    gate_nis: Array  # (GATE_SIZE,) largest accepted NIS for 0, 1, ... degrees of freedom
+
+
+class EpochInput(NamedTuple):
+    """What one epoch brings: seconds since the last one and since the last accepted measurement,
+    epochs rejected in a row before it, and rows (m, ROW_WIDTH), groups numbered 0, 1, ..."""
+
+    dt_s: float
+    unheard_s: float
+    rejected_in_row: int
+    rows: Array
+
+
+class StepResult(NamedTuple):
+    """What came of an epoch: NIS of the accepted rows, their number, that of accepted groups."""
+
+    nis: float
+    used: int
+    groups: int
+
+
+class Scratch(NamedTuple):
+    """Memory of ``step``: of ``ekf.workspace``, groups accepted (groups,) and the prediction (n,),
+    (n, n)."""
+
+    work: Array
+    accepted: Array
+    prior_mean: Array
+    prior_cov_or_sqrt: Array
+
+
+class Epochs(NamedTuple):
+    """The epochs of a run: stamps_ns (N,) increasing; epoch k has the rows row_start[k] to
+    row_start[k + 1], none or more."""
+
+    stamps_ns: Ints
+    row_start: Ints  # (N + 1,)
+    rows: Array  # (M, ROW_WIDTH)
+
+
+class Run(NamedTuple):
+    """What a filter made of N epochs: means (N, n), covs (N, n, n) of the mixture; of the accepted
+    rows nis (N,), dof (N,) their number and groups (N,) that of their groups; radius (N,) [m] that
+    a mixture leaves with the integrity risk, 0 where there is one component."""
+
+    means: Array
+    covs: Array
+    nis: Array
+    dof: Array
+    groups: Array
+    radius: Array
+
+
+@kernel
+def scratch(n: int, m: int) -> Scratch:
+    """Memory for ``step`` with ``n`` states and up to ``m`` rows."""
+    return Scratch(ekf.workspace(n, m), np.zeros(m), np.zeros(n), np.zeros((n, n)))
+
+
+def to_cov_or_sqrt(cov: Array, options: FilterOptions) -> Array:
+    """What the filter carries instead of the covariance: its lower Cholesky factor where it is a
+    square-root filter, a copy otherwise."""
+    if options.filter == Filter.SRUKF:
+        factor: Array = srukf.factor(cov)
+        return factor
+    return cov.copy()
+
+
+def to_cov(cov_or_sqrt: Array, options: FilterOptions) -> Array:
+    """Covariance (n, n) of what the filter carries."""
+    if options.filter == Filter.SRUKF:
+        cov: Array = srukf.covariance(cov_or_sqrt)
+        return cov
+    return cov_or_sqrt
+
+
+@leaf
+def predict(
+    mean: Array, cov_or_sqrt: Array, dt: float, motion: Array, bias: Array, options: FilterOptions
+) -> None:
+    """Move mean (n,) and cov_or_sqrt (n, n) by ``dt`` seconds in place; nothing happens for dt <=
+    0. A velocity step noted in ``motion`` is over."""
+    motion[Parameter.VELOCITY_STEP_SD] = 0.0
+    kind = options.filter
+    if kind == Filter.UKF:
+        ukf.predict(mean, cov_or_sqrt, dt, motion, bias)
+    elif kind == Filter.SRUKF:
+        srukf.predict(mean, cov_or_sqrt, dt, motion, bias)
+    else:
+        ekf.predict(mean, cov_or_sqrt, dt, motion, bias)
+
+
+@leaf
+def update(
+    mean: Array,
+    cov_or_sqrt: Array,
+    rows: Array,
+    options: FilterOptions,
+    accepted: Array,
+    work: Array,
+) -> tuple[float, int]:
+    """Gate and apply one epoch, in place: NIS of the accepted rows and their number; ``accepted``
+    (groups,) is filled."""
+    kind, height_m, gate = options.filter, options.height_m, options.gate_nis
+    if kind == Filter.UKF:
+        nis, used = ukf.update(mean, cov_or_sqrt, rows, height_m, gate, accepted)
+    elif kind == Filter.SRUKF:
+        nis, used = srukf.update(mean, cov_or_sqrt, rows, height_m, gate, accepted)
+    elif kind == Filter.KF:
+        nis, used = kf.update(
+            mean, cov_or_sqrt, rows, height_m, gate, accepted, options.gain_floor
+        )
+    else:
+        iterations = options.iterations
+        nis, used = ekf.update(mean, cov_or_sqrt, rows, height_m, gate, iterations, accepted, work)
+    return nis, used
+
+
+@leaf
+def open_velocity(cov_or_sqrt: Array, sd: float, unheard_s: float, options: FilterOptions) -> None:
+    """Add, in place, a velocity step of ``sd`` [m/s] per axis at some time in the last
+    ``unheard_s`` seconds, and the position it leads to."""
+    if options.filter == Filter.SRUKF:
+        _open_factor(cov_or_sqrt, sd, unheard_s)
+        return
+    add_velocity_step(sd, unheard_s, 0.0, cov_or_sqrt)
+
+
+@kernel
+def _open_factor(cov_or_sqrt: Array, sd: float, unheard_s: float) -> None:
+    for p in range(2):
+        x = np.zeros(cov_or_sqrt.shape[0])
+        x[X.PX + p], x[X.VX + p] = sd * unheard_s, sd
+        srukf.cholesky_update(cov_or_sqrt, x, 1.0)
+
+
+@kernel
+def manoeuvre_s(
+    mean: Array, cov: Array, rows: Array, unheard_s: float, options: FilterOptions
+) -> float:
+    """Time [s] in which a manoeuvre may have begun, seen from the prediction mean (n,), cov (n,
+    n): since the last accepted measurement, or for as long as it goes unnoticed. A step of the
+    velocity that its own sd allows for is followed, and no manoeuvre."""
+    h, height_m = np.empty(mean.size), options.height_m
+    speed, gate = options.manoeuvre_speed_sd, options.gate_nis[2]
+    if 2.0 * speed * speed <= cov[X.VX, X.VX] + cov[X.VY, X.VY]:
+        return unheard_s
+    typical_s, _ = detection_delay_s(mean, cov, rows, height_m, gate, speed, h)
+    return max(unheard_s, typical_s if math.isfinite(typical_s) else 0.0)
+
+
+@kernel
+def inflate_for_manoeuvre(cov_or_sqrt: Array, within_s: float, options: FilterOptions) -> None:
+    """Add, in place, a velocity step of the manoeuvre speed at any time of the last ``within_s``
+    seconds."""
+    speed = options.manoeuvre_speed_sd
+    if options.filter != Filter.SRUKF:
+        add_manoeuvre(speed, within_s, cov_or_sqrt)
+        return
+    _open_factor(cov_or_sqrt, speed, within_s / 2.0)
+    for p in range(2):
+        x = np.zeros(cov_or_sqrt.shape[0])
+        x[X.PX + p] = speed * within_s / math.sqrt(12.0)
+        srukf.cholesky_update(cov_or_sqrt, x, 1.0)
+
+
+@leaf
+def set_velocity_step_noise(
+    motion: Array, opened_sd: float, unheard_s: float, manoeuvre_sd: float, within_s: float
+) -> None:
+    """Leave in ``motion`` the velocity steps allowed for, one ``unheard_s`` ago and one at any
+    time of the last ``within_s`` seconds, as one."""
+    opened2, manoeuvre2 = opened_sd * opened_sd, manoeuvre_sd * manoeuvre_sd
+    speed2 = opened2 + manoeuvre2
+    motion[Parameter.VELOCITY_STEP_SD] = math.sqrt(speed2)
+    if speed2 == 0.0:
+        return
+    time_s = (opened2 * unheard_s + manoeuvre2 * within_s / 2.0) / speed2
+    position2 = opened2 * unheard_s * unheard_s + manoeuvre2 * within_s * within_s / 3.0
+    motion[Parameter.VELOCITY_STEP_AGE] = time_s
+    motion[Parameter.VELOCITY_STEP_POSITION_SD] = math.sqrt(
+        max(position2 - speed2 * time_s * time_s, 0.0)
+    )
+
+
+@leaf
+def is_sound(mean: Array, cov: Array) -> bool:
+    """Whether the state can be a device's: on earth, slower than light, its position and velocity
+    covariances definite in whatever axes they are told."""
+    if not (abs(mean[X.PX]) < _FARTHEST_M and abs(mean[X.PY]) < _FARTHEST_M):
+        return False
+    if not math.hypot(mean[X.VX], mean[X.VY]) < SPEED_OF_LIGHT_MPS:
+        return False
+    for p in (X.PX, X.VX):
+        a, b, c = cov[p, p], cov[p, p + 1], cov[p + 1, p + 1]
+        if not (a > 0.0 and a * c - b * b > _ROUNDING * (a + c) ** 2):
+            return False
+    return True
+
+
+@leaf
+def _copy(mean: Array, cov_or_sqrt: Array, to_mean: Array, to_cov_or_sqrt: Array) -> None:
+    for a in range(mean.size):
+        to_mean[a] = mean[a]
+        for b in range(mean.size):
+            to_cov_or_sqrt[a, b] = cov_or_sqrt[a, b]
+
+
+@leaf
+def _count(accepted: Array, groups: int) -> int:
+    taken = 0
+    for g in range(groups):
+        taken += int(accepted[g])
+    return taken
+
+
+@leaf
+def step(
+    mean: Array,
+    cov_or_sqrt: Array,
+    epoch: EpochInput,
+    motion: Array,
+    bias: Array,
+    options: FilterOptions,
+    scratch: Scratch,
+) -> StepResult:
+    """Predict and apply one epoch to one component, in place.
+
+    After ``inflate_after`` epochs rejected in a row the velocity opens to its initial sd. Nothing
+    accepted leaves the prediction. ``scratch`` keeps the prediction, and 0 or 1 of each group in
+    ``accepted``. The robust options re-weight the rows in place. The velocity step allowed for is
+    left in ``motion`` (``set_velocity_step_noise``), for a smoother to know.
+    """
+    rows, unheard_s = epoch.rows, epoch.unheard_s
+    groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
+    predict(mean, cov_or_sqrt, epoch.dt_s, motion, bias, options)
+    _copy(mean, cov_or_sqrt, scratch.prior_mean, scratch.prior_cov_or_sqrt)
+    opened = epoch.rejected_in_row >= options.inflate_after
+    opened_sd = options.initial_speed_sd if opened else 0.0
+    if opened:
+        open_velocity(cov_or_sqrt, opened_sd, unheard_s, options)
+    if options.robust.kind != Robust.NONE or options.robust.nlos_probability > 0.0:
+        reweight(mean, cov_or_sqrt, rows, options, scratch.work)
+    nis, used = update(mean, cov_or_sqrt, rows, options, scratch.accepted, scratch.work)
+    taken = _count(scratch.accepted, groups)
+    if taken == 0:
+        _copy(scratch.prior_mean, scratch.prior_cov_or_sqrt, mean, cov_or_sqrt)
+    else:
+        set_velocity_step_noise(motion, opened_sd, unheard_s, 0.0, 0.0)
+    return StepResult(nis, used, taken)
+
+
+@kernel
+def reweight(
+    mean: Array, cov_or_sqrt: Array, rows: Array, options: FilterOptions, work: Array
+) -> None:
+    """Re-weight the rows in place as the robust options say."""
+    cov = cov_or_sqrt
+    if options.filter == Filter.SRUKF:
+        cov = srukf.covariance(cov_or_sqrt)
+    conditioning.reweight(mean, cov, rows, options.height_m, options.robust, work[0])

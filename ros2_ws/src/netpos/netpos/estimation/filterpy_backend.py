@@ -1,0 +1,187 @@
+"""The same filters on FilterPy's objects, as a reference for the compiled ones: same models, same
+gate, FilterPy's algebra. FilterPy is imported on first use only."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from netpos.estimation.measurement import (
+    GATE_VARIANCE,
+    GROUP,
+    VALUE,
+    VARIANCE,
+    curvature_variance,
+    is_cyclic,
+    linearise,
+    predict_row,
+    wrap,
+)
+from netpos.estimation.motion import noise, propagate, transition
+from netpos.estimation.sigma import ALPHA, BETA, kappa
+from netpos.messages.values import Array
+
+# A FilterPy filter holding mean, cov after fusing rows with given variances.
+_Update = Callable[[Array, Array, Array, Array, float], Any]
+
+
+def _library() -> Any:
+    from filterpy import kalman  # noqa: PLC0415
+
+    return kalman
+
+
+def _noise(mean: Array, dt: float, motion: Array, bias: Array) -> Array:
+    Q = np.empty((mean.size, mean.size))
+    noise(mean, dt, motion, bias, Q)
+    return Q
+
+
+def _moved(mean: Array, dt: float, motion: Array, bias: Array) -> Array:
+    x = mean.copy()
+    propagate(x, dt, motion, bias)
+    return x
+
+
+def _values(rows: Array, x: Array, height_m: float) -> Array:
+    h = np.empty(x.size)
+    return np.array([predict_row(row, x, height_m, h) for row in rows])
+
+
+def _difference(rows: Array) -> Callable[[Array, Array], Array]:
+    angle = np.array([is_cyclic(row) for row in rows])
+
+    def difference(a: Array, b: Array) -> Array:
+        y = a - b
+        y[angle] = [wrap(value) for value in y[angle]]
+        return y
+
+    return difference
+
+
+def ekf_predict(mean: Array, cov: Array, dt: float, motion: Array, bias: Array) -> None:
+    """``ekf.predict`` on FilterPy's ``ExtendedKalmanFilter``."""
+    if dt <= 0.0:
+        return
+
+    reference = _library().ExtendedKalmanFilter(dim_x=mean.size, dim_z=1)
+    reference.P = cov.copy()
+    transition(mean, dt, motion, bias, reference.F)
+    moved = _moved(mean, dt, motion, bias)
+    reference.Q = _noise(moved, dt, motion, bias)
+    reference.predict()  # of the covariance; FilterPy moves means by F x only
+    mean[:], cov[:] = moved, reference.P
+
+
+def _ekf(mean: Array, cov: Array, rows: Array, variance: Array, height_m: float) -> Any:
+    reference = _library().ExtendedKalmanFilter(dim_x=mean.size, dim_z=len(rows))
+    reference.x, reference.P = mean.copy(), cov.copy()
+    curvature = [curvature_variance(row, mean, cov, height_m) for row in rows]
+    reference.update(
+        rows[:, VALUE],
+        lambda x: linearise(rows, x, height_m)[1],
+        lambda x: _values(rows, x, height_m),
+        R=np.diag(variance + curvature),
+        residual=_difference(rows),
+    )
+    return reference
+
+
+def ekf_update(
+    mean: Array, cov: Array, rows: Array, height_m: float, gate_nis: Array, accepted: Array
+) -> tuple[float, int]:
+    """``ekf.update`` with one iteration on FilterPy's ``ExtendedKalmanFilter``."""
+    return _update(_ekf, mean, cov, rows, height_m, gate_nis, accepted)
+
+
+def _points(n: int) -> Any:
+    return _library().MerweScaledSigmaPoints(n, ALPHA, BETA, kappa(n))
+
+
+def ukf_predict(mean: Array, cov: Array, dt: float, motion: Array, bias: Array) -> None:
+    """``ukf.predict`` on FilterPy's ``UnscentedKalmanFilter``; ``cov`` has to be positive
+    definite, else ``LinAlgError``."""
+    if dt <= 0.0:
+        return
+    reference = _library().UnscentedKalmanFilter(
+        mean.size, 1, dt, None, lambda x, dt: _moved(x, dt, motion, bias), _points(mean.size)
+    )
+    reference.x, reference.P = mean.copy(), cov.copy()
+    reference.Q = np.zeros_like(cov)
+    reference.predict()
+    mean[:], cov[:] = reference.x, reference.P + _noise(reference.x, dt, motion, bias)
+
+
+def _ukf(mean: Array, cov: Array, rows: Array, variance: Array, height_m: float) -> Any:
+    difference = _difference(rows)
+
+    def average(values: Array, weights: Array) -> Array:
+        result: Array = values[0].copy()
+        for value, weight in zip(values, weights, strict=True):
+            result += weight * difference(value, values[0])
+        return result
+
+    reference = _library().UnscentedKalmanFilter(
+        mean.size,
+        len(rows),
+        0.0,
+        lambda x: _values(rows, x, height_m),
+        None,
+        _points(mean.size),
+        z_mean_fn=average,
+        residual_z=difference,
+    )
+    reference.x, reference.P = mean.copy(), cov.copy()
+    reference.sigmas_f = _points(mean.size).sigma_points(mean, cov)
+    reference.update(rows[:, VALUE], R=np.diag(variance))
+    return reference
+
+
+def ukf_update(
+    mean: Array, cov: Array, rows: Array, height_m: float, gate_nis: Array, accepted: Array
+) -> tuple[float, int]:
+    """``ukf.update`` on FilterPy's ``UnscentedKalmanFilter``; ``cov`` has to be positive definite,
+    else ``LinAlgError``."""
+    return _update(_ukf, mean, cov, rows, height_m, gate_nis, accepted)
+
+
+def _update(
+    fused: _Update,
+    mean: Array,
+    cov: Array,
+    rows: Array,
+    height_m: float,
+    gate_nis: Array,
+    accepted: Array,
+) -> tuple[float, int]:
+    keep = np.zeros(len(rows), dtype=bool)
+    for group in np.unique(rows[:, GROUP]):
+        members = rows[:, GROUP] == group
+        part = rows[members]
+        nis = fused(mean, cov, part, part[:, GATE_VARIANCE], height_m).mahalanobis ** 2
+        passes = nis <= gate_nis[min(len(part), len(gate_nis) - 1)]
+        accepted[int(group)] = passes
+        keep[members] = passes
+    if not keep.any():
+        return 0.0, 0
+
+    def together(chosen: Array) -> float:
+        some = rows[chosen]
+        fit = fused(mean, cov, some, some[:, GATE_VARIANCE], height_m)
+        return float(fit.mahalanobis**2)
+
+    nis = together(keep)
+    groups = np.unique(rows[keep, GROUP])
+    if keep.sum() < len(gate_nis) and nis > gate_nis[keep.sum()] and groups.size > 2:
+        rests = [(together(keep & (rows[:, GROUP] != g)), g) for g in groups]
+        best = [(d, g) for d, g in rests if d <= gate_nis[(keep & (rows[:, GROUP] != g)).sum()]]
+        if best:
+            nis, odd = min(best)
+            accepted[int(odd)] = 0.0
+            keep &= rows[:, GROUP] != odd
+    kept = rows[keep]
+    posterior = fused(mean, cov, kept, kept[:, VARIANCE], height_m)
+    mean[:], cov[:] = posterior.x, posterior.P
+    return float(nis), int(keep.sum())

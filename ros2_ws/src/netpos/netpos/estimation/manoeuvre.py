@@ -1,0 +1,80 @@
+"""A manoeuvre nobody has noticed yet: how long it may have been going on, and what it does.
+
+A device that turns leaves its prediction slowly at first. Until a measurement fails its gate the
+filter follows in part, in the directions that are measured, and goes on straight in the others.
+The step of the velocity lies anywhere in the time in which it stays unnoticed, not in the last
+interval.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from netpos.estimation.compile import kernel, leaf
+from netpos.estimation.factor import eigenvalues
+from netpos.estimation.measurement import GATE_VARIANCE, innovation_row, innovation_variance
+from netpos.estimation.motion import add_velocity_step
+from netpos.estimation.state import X
+from netpos.messages.values import Array
+
+# The filter follows a manoeuvre as long as its gate passes it, so that it is noticed later.
+_FOLLOWED = 2.0
+
+
+@leaf
+def detection_delay_s(
+    mean: Array, cov: Array, rows: Array, height_m: float, gate: float, speed: float, h: Array
+) -> tuple[float, float]:
+    """Time [s] until a velocity step of ``speed`` [m/s] takes ``rows`` (m, ROW_WIDTH) as far off
+    the prediction mean (n,), cov (n, n) as ``gate``, a squared Mahalanobis distance, allows: for
+    a step in any direction, and for one in the direction they know least (inf: not at all). A
+    measured velocity shows the step at once, the longest time is then an upper bound.
+
+    h : (n,) scratch
+    """
+    xx = xy = yy = 0.0
+    velocity_xx = velocity_xy = velocity_yy = 0.0
+    for i in range(rows.shape[0]):
+        innovation_row(rows[i], mean, height_m, h)
+        noise = rows[i, GATE_VARIANCE]
+        variance = innovation_variance(rows[i], mean, cov, height_m, noise, h)
+        xx += h[X.PX] * h[X.PX] / variance
+        xy += h[X.PX] * h[X.PY] / variance
+        yy += h[X.PY] * h[X.PY] / variance
+        velocity_xx += h[X.VX] * h[X.VX] / variance
+        velocity_xy += h[X.VX] * h[X.VY] / variance
+        velocity_yy += h[X.VY] * h[X.VY] / variance
+    least, _ = eigenvalues(xx, xy, yy)
+    least_velocity, _ = eigenvalues(velocity_xx, velocity_xy, velocity_yy)
+    step2 = speed * speed
+    left = max(2.0 * gate - step2 * (velocity_xx + velocity_yy), 0.0)
+    left_least = max(gate - step2 * max(least_velocity, 0.0), 0.0)
+    typical = longest = math.inf
+    if left == 0.0 or xx + yy > 0.0:
+        typical = math.sqrt(left / (xx + yy)) / speed if left > 0.0 else 0.0
+    if left_least == 0.0 or least > 1e-12 * (xx + yy):
+        longest = math.sqrt(left_least / least) / speed if left_least > 0.0 else 0.0
+    return _FOLLOWED * typical, longest
+
+
+@kernel
+def measures_velocity(mean: Array, rows: Array, height_m: float) -> bool:
+    """Whether ``rows`` (m, ROW_WIDTH), about mean (n,), measure both axes of the velocity."""
+    h = np.empty(mean.size)
+    xx = xy = yy = 0.0
+    for i in range(rows.shape[0]):
+        innovation_row(rows[i], mean, height_m, h)
+        xx += h[X.VX] * h[X.VX]
+        xy += h[X.VX] * h[X.VY]
+        yy += h[X.VY] * h[X.VY]
+    least, largest = eigenvalues(xx, xy, yy)
+    return bool(least > 1e-6 * largest)
+
+
+@leaf
+def add_manoeuvre(speed: float, within_s: float, cov: Array) -> None:
+    """Add, in place, a velocity step of sd ``speed`` [m/s] per axis at any time of the last
+    ``within_s`` seconds, and the position it led to."""
+    add_velocity_step(speed, within_s / 2.0, speed * within_s / math.sqrt(12.0), cov)

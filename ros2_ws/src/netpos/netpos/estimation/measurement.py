@@ -1,0 +1,260 @@
+"""Rows of measurements in a planar filter: predicted values, gradients, innovations.
+
+A row (``sensors.row``) is of one sensor (``sensors.table``). With the antenna at a and d = a - RSU
+the value of a row is a function of d, or of the state; to it come the device's clock offset where
+the sensor has it (fokin2020:eq.41), and the states BIAS and COMMON of the row.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from netpos.estimation.compile import inlined, kernel, leaf
+from netpos.estimation.sensors.dispatch import choose, is_one_of
+from netpos.estimation.sensors.geometry import turned_lever
+from netpos.estimation.sensors.model import Wraps
+from netpos.estimation.sensors.row import (
+    AXES,
+    BIAS,
+    BLOCKED,
+    COMMON,
+    GATE_VARIANCE,
+    GROUP,
+    HEADING,
+    KIND,
+    LEVER,
+    ORIGIN,
+    ROW_WIDTH,
+    VALUE,
+    VARIANCE,
+)
+from netpos.estimation.sensors.table import SENSORS, Kind
+from netpos.estimation.state import X
+from netpos.messages.values import Array
+
+__all__ = [
+    "AXES",
+    "BIAS",
+    "BLOCKED",
+    "COMMON",
+    "GATE_VARIANCE",
+    "GROUP",
+    "HEADING",
+    "KIND",
+    "LEVER",
+    "ORIGIN",
+    "ROW_WIDTH",
+    "VALUE",
+    "VARIANCE",
+    "Kind",
+    "curvature_variance",
+    "has_clock",
+    "innovation_row",
+    "innovation_variance",
+    "is_angle",
+    "is_cyclic",
+    "is_range",
+    "linearise",
+    "of_offset",
+    "predict_row",
+    "second_order_of_offset",
+    "second_order_variance",
+    "wrap",
+]
+
+
+@inlined
+def _no_value(
+    _row: Array, _dx: float, _dy: float, _dz: float
+) -> tuple[float, float, float, float]:
+    return math.nan, math.nan, math.nan, math.nan
+
+
+@inlined
+def _no_state_value(_row: Array, _mean: Array, _h: Array) -> float:
+    return math.nan
+
+
+@inlined
+def _no_second_order(
+    _row: Array, _dx: float, _dy: float, _dz: float, _cov: Array, _axes: int
+) -> float:
+    return 0.0
+
+
+@inlined
+def _no_state_second_order(_row: Array, _mean: Array, _cov: Array) -> float:
+    return 0.0
+
+
+of_offset = choose([(s.kind, s.of_offset) for s in SENSORS], _no_value)
+"""``(kind, row, dx, dy, dz)``: value and gradient (3) in map for an offset d = antenna - RSU."""
+second_order_of_offset = choose(
+    [(s.kind, s.second_order) for s in SENSORS if s.of_offset], _no_second_order
+)
+"""``(kind, row, dx, dy, dz, cov, axes)``: variance of what linearising leaves out, or a bound."""
+_exact_second_order = choose([(s.kind, s.exact_second_order) for s in SENSORS], _no_second_order)
+_of_state = choose([(s.kind, s.of_state) for s in SENSORS], _no_state_value)
+_state_second_order = choose(
+    [(s.kind, s.second_order) for s in SENSORS if s.of_state], _no_state_second_order
+)
+
+_has_state_model = is_one_of(s.kind for s in SENSORS if s.of_state)
+_has_exact_second_order = is_one_of(s.kind for s in SENSORS if s.exact_second_order)
+_adds_biases = is_one_of(s.kind for s in SENSORS if s.adds_biases)
+_has_clock = is_one_of(s.kind for s in SENSORS if s.has_clock)
+_is_angle = is_one_of(s.kind for s in SENSORS if s.wraps == Wraps.ALWAYS)
+_is_cyclic = is_one_of(s.kind for s in SENSORS if s.wraps != Wraps.NEVER)
+_is_range = is_one_of(s.kind for s in SENSORS if s.is_range)
+
+
+@inlined
+def wrap(angle: float) -> float:
+    """Angle wrapped to [-pi, pi); constant time for any finite input."""
+    if -math.pi <= angle < math.pi:
+        return angle
+    wrapped = (angle + math.pi) % (2.0 * math.pi) - math.pi
+    return -math.pi if wrapped >= math.pi else wrapped
+
+
+@inlined
+def is_angle(row: Array) -> bool:
+    """Whether differences of the row's predictions are wrapped."""
+    return bool(_is_angle(int(row[KIND])))
+
+
+@inlined
+def is_cyclic(row: Array) -> bool:
+    """Whether innovations of the row are wrapped: an angle, or a phase known but for whole
+    turns."""
+    return bool(_is_cyclic(int(row[KIND])))
+
+
+@inlined
+def is_range(row: Array) -> bool:
+    """Whether the row is a distance, by a two-way range or a time of arrival: what a blocked path
+    makes late."""
+    return bool(_is_range(int(row[KIND])))
+
+
+@inlined
+def has_clock(row: Array) -> bool:
+    """Whether the device's clock offset is part of the row's value."""
+    return bool(_has_clock(int(row[KIND])))
+
+
+@inlined
+def _lever(row: Array, mean: Array) -> tuple[float, float]:
+    """Horizontal lever arm in map; 0 where no heading turns it."""
+    if row[HEADING] >= 0.0:
+        lx, ly = turned_lever(row, mean)
+        return lx, ly
+    return 0.0, 0.0
+
+
+@inlined
+def _from_rsu(kind: int, row: Array, mean: Array, height_m: float, h: Array) -> float:
+    """Value of a sensor of the offset between the RSU and the device's antenna."""
+    lx, ly = _lever(row, mean)
+    dx = mean[X.PX] + lx - row[ORIGIN]
+    dy = mean[X.PY] + ly - row[ORIGIN + 1]
+    dz = height_m + row[LEVER + 2] - row[ORIGIN + 2]
+    value, h[X.PX], h[X.PY], _ = of_offset(kind, row, dx, dy, dz)
+    if has_clock(row):
+        h[X.CLOCK] = 1.0
+        value += mean[X.CLOCK]
+    heading = int(row[HEADING])
+    if heading >= 0:
+        h[heading] = h[X.PY] * lx - h[X.PX] * ly
+    return float(value)
+
+
+@inlined
+def predict_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
+    """Predicted value of one row at ``mean`` (n,); fills its Jacobian ``h`` (n,). ``height_m``:
+    device height in map. NaN for a kind that no sensor has."""
+    for i in range(mean.size):
+        h[i] = 0.0
+    kind = int(row[KIND])
+    if _has_state_model(kind):
+        value = float(_of_state(kind, row, mean, h))
+    else:
+        value = _from_rsu(kind, row, mean, height_m, h)
+    if _adds_biases(kind):
+        for column in (BIAS, COMMON):
+            index = int(row[column])
+            if index >= 0:
+                h[index] = 1.0
+                value += mean[index]
+    return value
+
+
+@inlined
+def innovation_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
+    """Measured minus predicted value of one row, wrapped where it is an angle; fills ``h``."""
+    innovation = row[VALUE] - predict_row(row, mean, height_m, h)
+    return wrap(innovation) if is_cyclic(row) else float(innovation)
+
+
+@inlined
+def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> float:
+    """Variance of what linearising ``row`` at ``mean`` (n,) leaves out, for a prior ``cov`` (n,
+    n).
+
+    Half the trace of (h'' P)^2 of the second-order extended Kalman filter (Bar-Shalom, Li and
+    Kirubarajan 2001, eq. 10.3.3-12): exact for ranges and times, with the largest curvature of the
+    quantity for angles and phases. It keeps a device that may be anywhere around an RSU from being
+    placed on top of it.
+    """
+    kind = int(row[KIND])
+    if _has_state_model(kind):
+        return float(_state_second_order(kind, row, mean, cov))
+    lx, ly = _lever(row, mean)
+    dx = mean[X.PX] + lx - row[ORIGIN]
+    dy = mean[X.PY] + ly - row[ORIGIN + 1]
+    dz = height_m + row[LEVER + 2] - row[ORIGIN + 2]
+    return float(second_order_of_offset(kind, row, dx, dy, dz, cov, 2))
+
+
+@leaf
+def second_order_variance(row: Array, mean: Array, cov: Array, height_m: float) -> float:
+    """``curvature_variance`` with the true curvature of a sensor that has a bound there: an
+    azimuth does not bend along itself.
+
+    Too small for an update to rely on near an RSU, where the azimuth bends within the prior; but
+    what weighs a wide prior against a narrow one must not take the wide one for wider than it is.
+    """
+    kind = int(row[KIND])
+    if row[HEADING] >= 0.0 or not _has_exact_second_order(kind):
+        return float(curvature_variance(row, mean, cov, height_m))
+    dx, dy = mean[X.PX] - row[ORIGIN], mean[X.PY] - row[ORIGIN + 1]
+    dz = height_m + row[LEVER + 2] - row[ORIGIN + 2]
+    return float(_exact_second_order(kind, row, dx, dy, dz, cov, 2))
+
+
+@leaf
+def innovation_variance(
+    row: Array, mean: Array, cov: Array, height_m: float, variance: float, h: Array
+) -> float:
+    """Variance of the row's innovation: ``variance``, what linearising leaves out, and the prior
+    ``cov`` (n, n) along the row's Jacobian ``h`` (n,) at ``mean`` (n,)."""
+    total = variance + curvature_variance(row, mean, cov, height_m)
+    for a in range(mean.size):
+        if h[a] != 0.0:
+            for b in range(mean.size):
+                total += h[a] * cov[a, b] * h[b]
+    return float(total)
+
+
+@kernel
+def linearise(rows: Array, mean: Array, height_m: float) -> tuple[Array, Array]:
+    """Innovations (m,) and Jacobian H (m, n) of ``rows`` (m, ROW_WIDTH) at ``mean``; angle
+    innovations are wrapped."""
+    m = rows.shape[0]
+    innovation = np.empty(m)
+    H = np.empty((m, mean.size))
+    for i in range(m):
+        innovation[i] = innovation_row(rows[i], mean, height_m, H[i])
+    return innovation, H

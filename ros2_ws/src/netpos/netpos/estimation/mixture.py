@@ -1,0 +1,238 @@
+"""A Gaussian mixture over one state, for a posterior that is not one Gaussian.
+
+A component that is too wide for the tangent of a range is split: the likelihood of a range is a
+ring, and the ring is a sum of Gaussians along it, each short enough for the tangent to hold
+(Alspach and Sorenson 1972; along the direction of greatest curvature, Tuggle and Zanetti 2018).
+Components without weight are dropped; components that are alike become one by the bound of
+Runnalls 2007.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from netpos.estimation.compile import kernel
+from netpos.estimation.measurement import (
+    LEVER,
+    ORIGIN,
+    VARIANCE,
+    curvature_variance,
+    innovation_row,
+    is_range,
+)
+from netpos.messages.values import Array
+
+Ints = npt.NDArray[np.int64]
+
+_VELOCITY_END = 4  # position and velocity come first
+# A component is split where the second-order variance exceeds this share of the row's,
+_WIDE = 0.25
+# or where it reaches the RSU within so many sd; narrower components (m) never are.
+_REACH_SD, _NARROW_M = 3.0, 1.0
+_SPACING_SD = 1.2  # of Gaussians along a ring: their sum is flat to 1e-3 there
+_RING_MIN, RING_MAX = 12, 128
+_OUTLIERS = 1e-2  # of all values; those of a range lie anywhere within
+_OUTLIER_RANGE_M = 100.0
+_LEAST_WEIGHT = 1e-8
+_COMPONENTS_MAX = 64
+RING_MERGE_COST = 2e-4  # divergence (Runnalls' bound) that merging parts of a ring may cost
+_APART2 = 9.0  # squared Mahalanobis distance of means from which components are two modes
+
+
+class Mixture(NamedTuple):
+    """Components: means (K, n), covs (K, n, n), log_weights (K,), the weights of which sum to
+    one."""
+
+    means: Array
+    covs: Array
+    log_weights: Array
+
+
+@kernel
+def _fuse(mean: Array, cov: Array, h: Array, residual: float, variance: float) -> float:
+    """Fuse one linearised value in place, in Joseph form; its log likelihood."""
+    n = mean.size
+    Ph = cov @ h
+    hPh = float(h @ Ph)
+    s = hPh + variance
+    for a in range(n):
+        gain = Ph[a] / s
+        mean[a] += gain * residual
+        left = Ph[a] - gain * hPh - variance * gain  # zero but for rounding
+        for b in range(a, n):
+            cov[a, b] -= gain * Ph[b] + left * Ph[b] / s
+            cov[b, a] = cov[a, b]
+    return float(-0.5 * (residual * residual / s + math.log(2.0 * math.pi * s)))
+
+
+@kernel
+def outlier_log(rows: Array) -> float:
+    """Log density of the values of one measurement that has nothing to do with the device."""
+    total = math.log(_OUTLIERS)
+    for i in range(rows.shape[0]):
+        total -= math.log(_OUTLIER_RANGE_M if is_range(rows[i]) else 2.0 * math.pi)
+    return total
+
+
+@kernel
+def _own_variance(row: Array, cov: Array, h: Array) -> float:
+    """Variance of a row without that of position and velocity: noise, clock and slow errors."""
+    total = row[VARIANCE]
+    for a in range(_VELOCITY_END, cov.shape[0]):
+        for b in range(_VELOCITY_END, cov.shape[0]):
+            total += h[a] * cov[a, b] * h[b]
+    return float(total)
+
+
+@kernel
+def is_wide(row: Array, mean: Array, cov: Array, height_m: float) -> bool:
+    """Whether a component is to be split for a row: a range or time of arrival that narrows the
+    position, but whose tangent does not hold over the component's width."""
+    width2 = cov[0, 0] + cov[1, 1]
+    if not is_range(row) or width2 < _NARROW_M * _NARROW_M:
+        return False
+    h = np.empty(mean.size)
+    innovation_row(row, mean, height_m, h)
+    own = _own_variance(row, cov, h)
+    if own > width2:
+        return False
+    if curvature_variance(row, mean, cov, height_m) > _WIDE * own:
+        return True
+    dx, dy = mean[0] - row[ORIGIN], mean[1] - row[ORIGIN + 1]
+    return bool(_REACH_SD * _REACH_SD * width2 > dx * dx + dy * dy)
+
+
+@kernel
+def splits(rows: Array, mean: Array, cov: Array, height_m: float) -> bool:
+    """Whether the ``rows`` of one measurement split a component: a range alone that ``is_wide``.
+    An angle measured with it tells where on the ring the device is."""
+    return bool(rows.shape[0] == 1 and is_wide(rows[0], mean, cov, height_m))
+
+
+@kernel
+def split_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Mixture:
+    """The product of the Gaussian ``mean`` (n,), ``cov`` (n, n) and the likelihood of a range or
+    time of arrival: components along the ring, their log weights not normalised."""
+    n = mean.size
+    h, at, along = np.empty(n), mean.copy(), np.zeros(n)
+    residual = innovation_row(row, mean, height_m, h)
+    dx, dy = mean[0] - row[ORIGIN], mean[1] - row[ORIGIN + 1]
+    dz = height_m + row[LEVER + 2] - row[ORIGIN + 2]
+    slant = math.sqrt(dx * dx + dy * dy + dz * dz) + residual  # measured, less clock and biases
+    own = _own_variance(row, cov, h)
+    radius = math.sqrt(max(slant * slant - dz * dz, 0.25 * own, 1e-4))
+    sd = math.sqrt(radius * math.sqrt(2.0 * _WIDE * own))  # whose second-order variance is own
+    wanted = math.ceil(2.0 * math.pi * radius / (_SPACING_SD * sd))
+    count = int(min(max(wanted, _RING_MIN), RING_MAX))
+    arc = 2.0 * math.pi * radius / count
+    sd = arc / _SPACING_SD
+    means, covs, logs = np.empty((count, n)), np.empty((count, n, n)), np.empty(count)
+    for k in range(count):
+        angle = 2.0 * math.pi * (k + 0.5) / count
+        c, s = math.cos(angle), math.sin(angle)
+        at[0], at[1] = row[ORIGIN] + radius * c, row[ORIGIN + 1] + radius * s
+        means[k], covs[k] = mean, cov
+        residual = innovation_row(row, at, height_m, h)
+        residual -= h[0] * (mean[0] - at[0]) + h[1] * (mean[1] - at[1])
+        logs[k] = math.log(arc) + _fuse(means[k], covs[k], h, residual, row[VARIANCE])
+        along[0], along[1] = -s, c
+        residual = c * (at[1] - means[k, 1]) - s * (at[0] - means[k, 0])
+        logs[k] += _fuse(means[k], covs[k], along, residual, sd * sd)
+    return Mixture(means, covs, logs)
+
+
+@kernel
+def _log_det(cov: Array) -> float:
+    """Log determinant of the covariance of position and velocity."""
+    end = _VELOCITY_END
+    return float(np.linalg.slogdet(cov[:end, :end].copy())[1])
+
+
+@kernel
+def _merged(
+    i: int, j: int, means: Array, covs: Array, weights: Array
+) -> tuple[float, Array, Array]:
+    """Weight, mean and covariance of two components as one, which keeps their moments."""
+    total = weights[i] + weights[j]
+    a, b = weights[i] / total, weights[j] / total
+    away = means[i] - means[j]
+    mean = a * means[i] + b * means[j]
+    return total, mean, a * covs[i] + b * covs[j] + a * b * np.outer(away, away)
+
+
+@kernel
+def _merge_cost(
+    i: int, j: int, means: Array, covs: Array, weights: Array, log_dets: Array
+) -> float:
+    """Runnalls 2007, eq. 21: what the merging of two components adds to the divergence, at most;
+    by position and velocity."""
+    end = _VELOCITY_END
+    total, _, cov = _merged(i, j, means[:, :end], covs[:, :end, :end], weights)
+    parts = weights[i] * log_dets[i] + weights[j] * log_dets[j]
+    return float(0.5 * (total * _log_det(cov) - parts))
+
+
+@kernel
+def reduced(components: Mixture, merge_cost: float) -> Mixture:
+    """The mixture normalised, without components of no weight; components are merged while that
+    costs at most ``merge_cost`` (Runnalls' bound of the divergence)."""
+    means, covs, log_weights = components
+    top = log_weights.max()
+    logs = log_weights - (top + math.log(np.exp(log_weights - top).sum()))
+    kept = np.flatnonzero(logs > math.log(_LEAST_WEIGHT))
+    means, covs, weights = means[kept], covs[kept], np.exp(logs[kept])
+    count = left = kept.size
+    costs, log_dets = np.full((count, count), np.inf), np.empty(count)
+    for k in range(count):
+        log_dets[k] = _log_det(covs[k])
+    for i in range(count):
+        for j in range(i + 1, count):
+            costs[i, j] = _merge_cost(i, j, means, covs, weights, log_dets)
+    while left > 1:
+        i, j = divmod(int(np.argmin(costs)), count)
+        if costs[i, j] > merge_cost and left <= _COMPONENTS_MAX:
+            break
+        weights[i], means[i], covs[i] = _merged(i, j, means, covs, weights)
+        weights[j], log_dets[i], left = 0.0, _log_det(covs[i]), left - 1
+        costs[j, :] = costs[:, j] = np.inf
+        for k in range(count):
+            if weights[k] > 0.0 and k != i:
+                low, high = min(i, k), max(i, k)
+                costs[low, high] = _merge_cost(low, high, means, covs, weights, log_dets)
+    alive = np.flatnonzero(weights > 0.0)
+    weights = weights[alive] / weights[alive].sum()
+    return Mixture(means[alive], covs[alive], np.log(weights))
+
+
+@kernel
+def mode_of(components: Mixture) -> Ints:
+    """Number of the mode (K,) each component belongs to, 0 the mode of the most probable one.
+
+    Components belong to one mode where a chain of them leads from one to the other, each within
+    3 sd (of both together) of the next.
+    """
+    means, covs, log_weights = components
+    count = log_weights.size
+    order = np.argsort(-log_weights)
+    modes, found = np.full(count, -1), 0
+    waiting = np.empty(count, dtype=np.int64)
+    for first in order:
+        if modes[first] >= 0:
+            continue
+        modes[first], waiting[0], left = found, first, 1
+        while left > 0:
+            left -= 1
+            i = waiting[left]
+            for j in range(count):
+                if modes[j] >= 0:
+                    continue
+                away = means[j, :2] - means[i, :2]
+                cov = covs[i, :2, :2] + covs[j, :2, :2]
+                if float(away @ np.linalg.solve(cov, away)) < _APART2:
+                    modes[j], waiting[left], left = found, j, left + 1
+        found += 1
+    return modes

@@ -1,0 +1,35 @@
+"""The columns of a measurement row.
+
+A row is a float vector of ``ROW_WIDTH`` entries, so that an epoch of any mixture of sensors is one
+array a compiled kernel can take:
+
+    KIND, VALUE, VARIANCE (for the update), GATE_VARIANCE (of a single value: smaller where
+    successive errors are correlated),
+    BIAS, COMMON (state indices of the biases in it, or -1), GROUP (rows of one group are accepted
+    or rejected together),
+    ORIGIN 3 (RSU position, m), AXES 9 (rotation map -> RSU axes, row-major),
+    HEADING (state index of the device's heading, or -1), LEVER 3 (of the antenna in the device, m;
+    forward and left count only where there is a heading), BLOCKED (probability that the path was
+    blocked; 0: the option's)
+
+A sensor may keep other figures in ORIGIN and AXES; its module says which.
+"""
+
+from __future__ import annotations
+
+from netpos.estimation.compile import inlined
+from netpos.messages.values import Array
+
+KIND, VALUE, VARIANCE, GATE_VARIANCE, BIAS, COMMON, GROUP, ORIGIN = range(8)
+AXES = 10
+HEADING, LEVER, BLOCKED = 19, 20, 23
+ROW_WIDTH = 24
+
+
+@inlined
+def group_end(rows: Array, start: int) -> int:
+    """Index after the last row of the group that begins at ``start``."""
+    stop = start + 1
+    while stop < rows.shape[0] and rows[stop, GROUP] == rows[start, GROUP]:
+        stop += 1
+    return stop

@@ -1,0 +1,162 @@
+"""Square-root unscented Kalman filter: carries the lower factor L of P = L L'. In place.
+
+The same filter as ``ukf``, with twice its digits: nothing is ever squared, so variances 1e20 apart
+live side by side. Prediction is a QR decomposition of the weighted deviations and the noise's
+factor by rotations (one Cholesky up-date per deviation: petukhov:eq.22). The update rotates
+
+    [ chol(E E' + R)   G ]      [ chol(S)             0  ]
+    [ 0                L ]  to  [ L G' chol(S)^-T     L+ ]
+
+which gives the factor that down-dating L by the columns of K chol(S) gives (petukhov:eq.26, which
+omits chol(S)). A down-date fails where rounding makes its result indefinite; a rotation cannot:
+each diagonal entry of L is multiplied by a cosine that is positive while R is.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from netpos.estimation.compile import inlined, kernel, leaf
+from netpos.estimation.factor import factor
+from netpos.estimation.gate import gate_groups, select_rows
+from netpos.estimation.measurement import GATE_VARIANCE, VARIANCE
+from netpos.estimation.motion import noise
+from netpos.estimation.sigma import innovation_cov, move, regress
+from netpos.messages.values import Array
+
+__all__ = ["cholesky_update", "covariance", "factor", "predict", "update"]
+
+
+@kernel
+def covariance(L: Array) -> Array:
+    """P = L L' of its factor (n, n)."""
+    return L @ L.T
+
+
+@kernel
+def cholesky_update(L: Array, x: Array, sign: float) -> bool:
+    """Factor of L L' + sign x x' in place of ``L`` (n, n), for sign 1 or -1; ``x`` (n,) is used
+    up.
+
+    False, and L as it was, where the down-dated matrix would not be positive definite.
+    """
+    if sign < 0.0:
+        return bool(_down_date(L, x))
+    _up_date(L, x)
+    return True
+
+
+@leaf
+def _up_date(L: Array, x: Array) -> None:
+    """The rotations that turn [L x] into a factor."""
+    n = x.size
+    for k in range(n):
+        if x[k] == 0.0:
+            continue
+        length = math.hypot(L[k, k], x[k])
+        c, s = L[k, k] / length, x[k] / length
+        L[k, k] = length
+        for i in range(k + 1, n):
+            below = L[i, k]
+            L[i, k] = c * below + s * x[i]
+            x[i] = c * x[i] - s * below
+
+
+@kernel
+def _down_date(L: Array, x: Array) -> bool:
+    """The rotations that lift x = L p out of L: LINPACK's dchdd."""
+    n = x.size
+    rest = 1.0
+    for k in range(n):
+        for j in range(k):
+            x[k] -= L[k, j] * x[j]
+        if L[k, k] > 0.0:
+            x[k] /= L[k, k]
+            rest -= x[k] * x[k]
+        elif x[k] != 0.0:
+            return False
+    if rest <= 0.0:
+        return False
+    top = math.sqrt(rest)
+    lifted = np.zeros(n)
+    for k in range(n - 1, -1, -1):
+        length = math.hypot(top, x[k])
+        _rotate(lifted, L[:, k], k, top / length, x[k] / length)
+        top = length
+    return True
+
+
+@inlined
+def _rotate(first: Array, second: Array, start: int, c: float, s: float) -> None:
+    """Rotate two columns from entry ``start`` on."""
+    for i in range(start, first.size):
+        a, b = first[i], second[i]
+        first[i] = c * a + s * b
+        second[i] = c * b - s * a
+
+
+@kernel
+def predict(mean: Array, L: Array, dt: float, motion: Array, bias: Array) -> None:
+    """Move mean (n,) and factor ``L`` (n, n) by ``dt`` seconds; as ``ukf.predict``."""
+    if dt <= 0.0:
+        return
+    D = move(mean, L, dt, motion, bias)
+    Q = np.empty_like(L)
+    noise(mean, dt, motion, bias, Q)
+    L[:] = factor(Q)
+    for j in range(D.shape[0]):
+        _up_date(L, D[j])
+
+
+@kernel
+def update(
+    mean: Array, L: Array, rows: Array, height_m: float, gate_nis: Array, accepted: Array
+) -> tuple[float, int]:
+    """One epoch, in place; as ``ukf.update`` with the factor ``L`` (n, n) for cov."""
+    innovation, G, E = regress(mean, L, rows, height_m)
+    S = innovation_cov(G, E, rows[:, GATE_VARIANCE].copy())
+    gate_groups(rows, innovation, S, gate_nis, accepted)
+    index, nis = select_rows(rows, innovation, S, gate_nis, accepted)
+    if index.size == 0:
+        return 0.0, 0
+    if index.size < rows.shape[0]:
+        innovation, G, E = innovation[index], G[index], E[index]
+    fuse(mean, L, innovation, G, E, rows[index, VARIANCE])
+    return nis, index.size
+
+
+@kernel
+def fuse(mean: Array, L: Array, innovation: Array, G: Array, E: Array, variance: Array) -> None:
+    """Update mean (n,) and factor (n, n) with rows as ``sigma.regress`` returns them; ``G`` and
+    ``innovation`` are used up."""
+    n, m = mean.size, innovation.size
+    S = np.zeros((m, m))  # the factor: first of E E' + R, then of the whole
+    for i in range(m):
+        S[i, i] = math.sqrt(variance[i])
+    column, gain = np.empty(m), np.empty(n)
+    for j in range(E.shape[1]):
+        column[:] = E[:, j]
+        _up_date(S, column)
+    for i in range(m):
+        _eliminate(i, S, G, L, gain)
+        for k in range(i):
+            innovation[i] -= S[i, k] * innovation[k]
+        innovation[i] /= S[i, i]
+        for a in range(n):
+            mean[a] += gain[a] * innovation[i]
+
+
+@leaf
+def _eliminate(i: int, S: Array, G: Array, L: Array, gain: Array) -> None:
+    """Rotate row ``i`` of G (m, n) into S (m, m), and what of the factor goes with it into
+    ``gain`` (n,)."""
+    gain[:] = 0.0
+    for j in range(gain.size - 1, -1, -1):
+        if G[i, j] == 0.0:
+            continue
+        length = math.hypot(S[i, i], G[i, j])
+        c, s = S[i, i] / length, G[i, j] / length
+        _rotate(S[:, i], G[:, j], i, c, s)
+        _rotate(gain, L[:, j], j, c, s)

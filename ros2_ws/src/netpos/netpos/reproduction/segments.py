@@ -1,0 +1,212 @@
+"""The track of a whole run: from its start to its loss, then from a first fix on, to the end."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from netpos.estimation import engine
+from netpos.estimation.components import Dynamics, run_epochs
+from netpos.estimation.engine import Run
+from netpos.estimation.measurement import BIAS
+from netpos.estimation.state import N_CORE
+from netpos.evaluation.metrics import NS
+from netpos.messages.values import Array, ImuSample
+from netpos.reproduction.integrity import levels
+from netpos.tracking import estimates
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.imu_buffer import ImuBuffer
+from netpos.tracking.initialise import Initialiser
+from netpos.tracking.models import augmented, initial_extra_sd, motions_of, options_of
+from netpos.tracking.rsus import Rsu
+
+Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+
+class Epochs(NamedTuple):
+    """Epochs of a run: stamps_ns (N,), row_start (N + 1,), rows (M, ROW_WIDTH), biases (2, k) in
+    the rows, and the RSUs (N, nearest) as indices, -1 where none."""
+
+    stamps_ns: Ints
+    row_start: Ints
+    rows: Array
+    bias: Array
+    rsu: Ints
+
+    @property
+    def measured(self) -> engine.Epochs:
+        """What the engine takes of them."""
+        return engine.Epochs(self.stamps_ns, self.row_start, self.rows)
+
+    def since(self, first: int, *, fixed: bool) -> Epochs:
+        """The epochs from ``first`` on; without the rows of that one where a first fix has used
+        them (``fixed``)."""
+        row_start = self.row_start[first:].copy()
+        if fixed:
+            row_start[0] = row_start[1]
+        return Epochs(self.stamps_ns[first:], row_start, self.rows, self.bias, self.rsu[first:])
+
+
+class Followed(NamedTuple):
+    """What an estimator makes of the N epochs of a run.
+
+    means (N, n), covs (N, n, n), level (N,) [m]: NaN while there is no track; nis, dof and groups
+    (N,): of the accepted rows, their number and the number of accepted RSUs; motions (1 or N,
+    Parameter); tracked (N,); losses: how often the track was lost
+    """
+
+    means: Array
+    covs: Array
+    level: Array
+    nis: Array
+    dof: Array
+    groups: Array
+    motions: Array
+    tracked: Flags
+    losses: int
+
+
+def _empty_run(epochs: int, n: int) -> Run:
+    figures = np.zeros((4, epochs))
+    return Run(np.full((epochs, n), np.nan), np.full((epochs, n, n), np.nan), *figures)
+
+
+def _part(run: Run, first: int, end: int | None = None) -> Run:
+    return Run(*(array[first:end] for array in run))
+
+
+class Follower:
+    """A tracker for whole runs: it starts where it is told, and after a loss by a first fix as
+    ``tracking.track`` does."""
+
+    def __init__(self, config: TrackerConfig, rsus: tuple[Rsu, ...]) -> None:
+        self._config = config
+        self._rsus = rsus
+        self._options = options_of(config)
+        self._extra_sd = initial_extra_sd(config)
+        self._motions = motions_of(config)
+
+    @property
+    def first_bias(self) -> int:
+        """Index of the first state of an RSU's slow error."""
+        return N_CORE + self._extra_sd.size
+
+    def augmented(self, mean: Array, cov: Array, bias: Array) -> tuple[Array, Array]:
+        """A start (6,), (6, 6) with the motion model's own states and the biases (2, k)."""
+        return augmented(mean, cov, np.append(self._extra_sd, bias[0]))
+
+    def follow(
+        self, epochs: Epochs, mean: Array, cov: Array, samples: list[ImuSample] | None
+    ) -> Followed:
+        """Estimates of a run from ``mean`` (6,) and ``cov`` (6, 6) at its first epoch on.
+
+        ``samples`` of the IMU for a motion model that uses one, None for every other.
+        """
+        count = epochs.stamps_ns.size
+        run = _empty_run(count, self.first_bias + epochs.bias.shape[1])
+        level, tracked = np.full(count, np.nan), np.zeros(count, dtype=np.bool_)
+        motions, imu = self._run_motions(count, samples is not None), _buffer(samples)
+        start: tuple[int, Array, Array] | None = (0, mean, cov)
+        losses = 0
+        while start is not None:
+            first, mean, cov = start
+            part, own = epochs.since(first, fixed=losses > 0), _part(run, first)
+            own_motions = motions[first:] if imu is not None else motions
+            if imu is None and self._config.motion_model != "interacting":
+                done = self._compiled(part, mean, cov, own)
+            else:
+                done = self._stepped(part, mean, cov, own, imu, own_motions)
+            end = first + done
+            level[first:end] = levels(
+                part.measured, _part(own, 0, done), own_motions, part.bias, self._options
+            )
+            lost = end < count
+            tracked[first : end - lost] = True  # nothing is published of the epoch of the loss
+            losses += lost
+            start = self._first_fix(epochs, end) if lost else None
+        for array in (run.means, run.covs, level):
+            array[~tracked] = np.nan
+        return Followed(
+            run.means, run.covs, level, run.nis, run.dof, run.groups, motions, tracked, losses
+        )
+
+    def _run_motions(self, count: int, driven: bool) -> Array:
+        """(1 or N, Parameter): the N of a run that the IMU drives are filled on the way. Of models
+        that interact, bound and level know one: straight on."""
+        if driven:
+            return np.tile(self._motions[0], (count, 1))
+        return self._motions[1:2] if self._config.motion_model == "interacting" else self._motions
+
+    def _compiled(self, epochs: Epochs, mean: Array, cov: Array, run: Run) -> int:
+        """Epochs done: all in one kernel."""
+        mean, cov = self.augmented(mean, cov, epochs.bias)
+        done: int = run_epochs(
+            epochs.measured, mean, cov, Dynamics(self._motions[0], epochs.bias), self._options, run
+        )
+        return done
+
+    def _stepped(
+        self,
+        epochs: Epochs,
+        mean: Array,
+        cov: Array,
+        run: Run,
+        imu: ImuBuffer | None,
+        motions: Array,
+    ) -> int:
+        """As ``_compiled``, epoch by epoch; ``motions`` (N, Parameter) are filled where an IMU
+        drives the filter. A slow error becomes a state when it is first heard of, as in a tracker:
+        until then it is in the results only."""
+        config, first = self._config, self.first_bias
+        sd = np.append(self._extra_sd, epochs.bias[0])
+        heard_ns, rejected, known = int(epochs.stamps_ns[0]), 0, first
+        estimate = estimates.start(config, heard_ns, *augmented(mean, cov, self._extra_sd))
+        for k, stamp in enumerate(epochs.stamps_ns.tolist()):
+            rows = epochs.rows[epochs.row_start[k] : epochs.row_start[k + 1]].copy()
+            if rows.size:
+                known = max(known, int(rows[:, BIAS].max()) + 1)
+                estimate.augment(sd[: known - N_CORE])
+                if imu is not None:
+                    yaw, speed, _ = imu.increments(estimate.stamp_ns, stamp)
+                    estimate.set_imu_increment(yaw, speed, config.gyro_noise_density)
+                unheard_s, bias = (stamp - heard_ns) / NS, epochs.bias[:, : known - first].copy()
+                step = estimate.step(stamp, unheard_s, rejected, rows, bias)
+                run.nis[k], run.dof[k], taken = step
+                run.groups[k] = taken.sum()
+                rejected = 0 if 2 * taken.sum() >= taken.size else rejected + 1
+                heard_ns = stamp if run.dof[k] else heard_ns
+            run.means[k], run.covs[k] = augmented(estimate.mean, estimate.cov, sd)
+            run.radius[k] = estimate.radius(0.0)
+            if imu is not None:
+                motions[k] = estimate.motion
+            if rejected >= config.max_rejected_epochs:
+                return k + 1
+        return epochs.stamps_ns.size
+
+    def _first_fix(self, epochs: Epochs, first: int) -> tuple[int, Array, Array] | None:
+        """Epoch, mean (6,) and covariance (6, 6) of a first fix by the rows from ``first`` on;
+        None where they do not suffice."""
+        initialiser = Initialiser(self._config)
+        variance = np.append(epochs.bias[0] ** 2, 0.0)  # the last: no bias
+        for k in range(first, epochs.stamps_ns.size):
+            rows = epochs.rows[epochs.row_start[k] : epochs.row_start[k + 1]]
+            index = rows[:, BIAS].astype(int)
+            bias_var = variance[np.where(index < 0, -1, index - self.first_bias)]
+            heard = tuple(self._rsus[i] for i in epochs.rsu[k] if i >= 0)
+            initialiser.add(int(epochs.stamps_ns[k]), rows, bias_var, heard)
+            solution = initialiser.solve()
+            if solution is not None:
+                return k, *solution
+        return None
+
+
+def _buffer(samples: list[ImuSample] | None) -> ImuBuffer | None:
+    if samples is None:
+        return None
+    imu = ImuBuffer()
+    for sample in samples:
+        imu.add(sample)
+    return imu

@@ -1,0 +1,171 @@
+"""docs/adding_a_sensor.md adds a sensor: one file and one line in the table of a copy."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import netpos
+import pytest
+from scipy import stats
+
+PAGE = Path(__file__).resolve().parents[6] / "docs/adding_a_sensor.md"
+EPOCHS = 81
+
+_RUN = """
+import json
+import numpy as np
+from dataclasses import replace
+from netpos.estimation.measurement import Kind
+from netpos.messages.values import Beacon, InitialPose, Odometry
+from netpos.scenario import Scenario, Simulation
+from netpos.tracking import Tracker, TrackerConfig
+from netpos.tracking.validation import explanation
+
+scenario = Scenario.model_validate(
+    {
+        "name": "toy", "description": "toy", "seed": 3,
+        "rsus": {"units": [
+            {"id": "a", "position": [0.0, -15.0, 4.0]},
+            {"id": "b", "position": [30.0, 20.0, 4.0]},
+            {"id": "c", "position": [60.0, -20.0, 4.0]},
+        ]},
+        "measurement": {
+            "quantities": ["log_range"], "nearest": 3,
+            "errors": {"model": "fixed", "range_sd_m": 1.0},
+        },
+        "devices": [{
+            "route": {"kind": "waypoints", "points": [[0.0, 0.0], [60.0, 0.0]]},
+            "speed_mps": 7.5, "beacon_interval_s": 0.1, "initial_pose_sd_m": 5.0,
+        }],
+    }
+)
+simulation = Simulation(scenario)
+config = TrackerConfig(
+    hold_s=0.0, require_initial_pose=True, initial_speed_sd_mps=8.0,
+    process_noise="continuous", accel_density_mps2_sqrthz=0.1,
+)
+tracker = Tracker(config)
+for info in simulation.rsus:
+    tracker.add_rsu(info)
+truth, outputs, refused, kinds = {}, [], [], set()
+for event in simulation.events():
+    if isinstance(event, Odometry):
+        truth[event.stamp_ns] = event.position
+    if isinstance(event, InitialPose):
+        tracker.add(event)
+    if isinstance(event, Beacon):
+        measured = simulation.measure(event)
+        bad = replace(measured[0], range_m=-1.0)
+        reason = tracker.add(bad)
+        refused.append([reason, explanation(bad, reason)])
+        for m in measured:
+            assert tracker.add(m) is None, m
+    outputs += tracker.process()
+outputs += tracker.flush()
+errors, sds, nis, dof = [], [], [], []
+for output in outputs:
+    if output.odometry is not None:
+        error = output.odometry.position - truth[output.odometry.stamp_ns]
+        errors.append(float(np.linalg.norm(error[:2])))
+        sds.append(float(np.sqrt(np.diag(output.odometry.pose_cov)[:2].sum())))
+    nis.append(output.status.nis)
+    dof.append(output.status.nis_dof)
+print(json.dumps({
+    "kind": int(Kind.LOG_RANGE), "refused": refused, "errors": errors, "sds": sds, "nis": nis,
+    "dof": dof, "names": [r.rsu_id for r in tracker.rsu_reports()],
+}))
+"""
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Copy of the library with the sensor of the page."""
+    root = tmp_path_factory.mktemp("with_a_toy")
+    package = root / "netpos"
+    here = Path(netpos.__file__).parent
+    shutil.copytree(here, package, ignore=shutil.ignore_patterns("__pycache__"))
+    module, line = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    sensors = package / "estimation/sensors"
+    (sensors / "log_range.py").write_text(module, encoding="utf-8")
+    table = sensors / "table.py"
+    before = table.read_text(encoding="utf-8")
+    importing, entry = (text.strip() for text in line.split("\n\n"))
+    after = before.replace(
+        "from netpos.estimation.sensors import (",
+        f"{importing}\nfrom netpos.estimation.sensors import (",
+    )
+    after = after.replace(
+        "    *body_motion.SENSORS,\n", f"    *body_motion.SENSORS,\n    {entry}\n"
+    )
+    assert len(after.splitlines()) == len(before.splitlines()) + 2
+    table.write_text(after, encoding="utf-8")
+    return root
+
+
+def run(library: Path, *arguments: str) -> str:
+    """Output of Python on the copy, without the compiler."""
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    paths = [str(library), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    environment["PYTHONPATH"] = os.pathsep.join(paths)
+    command = [sys.executable, "-W", "ignore", *arguments]
+    result = subprocess.run(
+        command, capture_output=True, text=True, env=environment, check=False, cwd=library
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def drive(library: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(run(library, "-c", _RUN))
+    return found
+
+
+def test_its_rows_have_its_number(drive: dict[str, Any]) -> None:
+    assert drive["kind"] == 15
+
+
+def test_a_bad_value_is_refused_with_value_and_remedy(drive: dict[str, Any]) -> None:
+    sentence = "range_m is -1 m; send a distance above 0 m"
+    assert drive["refused"] == [["distance_not_positive", sentence]] * EPOCHS
+
+
+def test_its_track_converges(drive: dict[str, Any]) -> None:
+    """From 5 m of the initial pose; the error is one that its covariance allows."""
+    assert len(drive["errors"]) >= EPOCHS - 1
+    assert max(drive["errors"][-40:]) < 2.0
+    assert max(drive["sds"][-40:]) < 1.0
+    ratio = [(e / s) ** 2 for e, s in zip(drive["errors"], drive["sds"], strict=True)]
+    assert sum(ratio[-40:]) / 40 < 3.0
+
+
+def test_its_innovations_are_as_large_as_they_should_be(drive: dict[str, Any]) -> None:
+    """NIS of the whole drive within 99.9 % of chi-square."""
+    low, high = stats.chi2(sum(drive["dof"])).ppf([0.0005, 0.9995])
+    assert sum(drive["dof"]) > 200
+    assert low < sum(drive["nis"]) < high
+
+
+def test_it_passes_the_tests_of_all_sensors(library: Path) -> None:
+    """Gradient and second-order term against finite differences."""
+    tests = Path(__file__).with_name("test_models.py")
+    root = PAGE.parents[1]
+    output = run(
+        library,
+        "-m",
+        "pytest",
+        "-q",
+        f"--rootdir={root}",
+        f"-c={root}/pyproject.toml",
+        "-k",
+        "LOG_RANGE or 15",
+        str(tests),
+    )
+    assert int(re.findall(r"(\d+) passed", output)[0]) >= 10

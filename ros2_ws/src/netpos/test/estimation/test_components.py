@@ -1,0 +1,340 @@
+"""The Gaussian mixture against densities on a grid, the plain filter and its own moments."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from filter_rows import make_cov, row
+from netpos.estimation import components, ekf, mixture
+from netpos.estimation.components import moments, one_component
+from netpos.estimation.engine import EpochInput
+from netpos.estimation.measurement import GROUP, VARIANCE, Kind
+from netpos.estimation.motion import NO_BIAS
+from netpos.estimation.rows import linear_rows
+from netpos.messages.values import Array
+from netpos.tracking import TrackerConfig
+from netpos.tracking.estimates import KalmanEstimate
+from netpos.tracking.models import motions_of, options_of
+from scipy.stats import multivariate_normal
+
+OPTIONS = options_of(TrackerConfig(filter="ekf"))
+ANCHORS = np.array([[2.6, 0.0, 1.0], [0.0, 2.6, 1.0], [-2.6, 0.0, 1.0], [0.0, -2.6, 1.0]])
+
+
+def prior(
+    mean: tuple[float, float], sd: tuple[float, float], rho: float = 0.0
+) -> tuple[Array, Array]:
+    """Position and velocity that hang together by ``rho``; a clock that nobody sees."""
+    x = np.array([*mean, 0.3, -0.2, 0.0, 0.0])
+    P = np.diag([sd[0] ** 2, sd[1] ** 2, 1.0, 1.0, 1.0, 1.0])
+    for a in (0, 1):
+        P[a, a + 2] = P[a + 2, a] = rho * sd[a]
+    return x, P
+
+
+def after(parts: mixture.Mixture, *rows: Array) -> tuple[mixture.Mixture, int]:
+    """The mixture after one epoch, and the number of rows taken."""
+    epoch = EpochInput(0.0, 0.0, 0, np.array(rows))
+    found = components.apply_epoch(parts, epoch, OPTIONS, 0.0, np.zeros(len(rows)))
+    return found.components, found.used
+
+
+def on_grid(
+    x: Array, P: Array, rows: list[Array], reach_m: float, step_m: float
+) -> tuple[float, Array, Array]:
+    """Evidence, mean and covariance of the position by summing prior times likelihoods."""
+    axis = np.arange(-reach_m, reach_m, step_m)
+    grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    away = grid - x[:2]
+    log = -0.5 * np.einsum("ni,ij,nj->n", away, np.linalg.inv(P[:2, :2]), away)
+    log -= np.log(2 * np.pi) + 0.5 * np.log(np.linalg.det(P[:2, :2]))
+    for r in rows:
+        d = np.linalg.norm(np.column_stack([grid, np.zeros(len(grid))]) - r[7:10], axis=1)
+        log -= 0.5 * ((r[1] - d) ** 2 / r[2] + np.log(2 * np.pi * r[2]))
+    weight = np.exp(log)
+    total = weight.sum()
+    mean = weight @ grid / total
+    centred = grid - mean
+    return float(total * step_m**2), mean, (centred * weight[:, None]).T @ centred / total
+
+
+@pytest.mark.parametrize("centre", [(0.0, 0.0), (12.0, 3.0), (35.0, -10.0)])
+@pytest.mark.parametrize("sd", [(12.0, 12.0), (20.0, 4.0)])
+def test_a_ring_is_the_product_of_prior_and_range(
+    centre: tuple[float, float], sd: tuple[float, float]
+) -> None:
+    """Evidence and moments of the position, also where the prior lies on the RSU."""
+    x, P = prior(centre, sd)
+    measured = row(Kind.RANGE, 15.0, 0.3**2)
+    parts = mixture.split_along_ring(x, P, measured, 0.0)
+    evidence, mean, cov = on_grid(x, P, [measured], 30.0, 0.1)
+    assert np.exp(parts[2]).sum() == pytest.approx(evidence, rel=0.03)
+    parts = mixture.Mixture(parts[0], parts[1], parts[2] - np.log(np.exp(parts[2]).sum()))
+    found, found_cov = moments(parts)
+    scale = np.sqrt(np.trace(cov))
+    np.testing.assert_allclose(found[:2], mean, atol=0.03 * scale)
+    np.testing.assert_allclose(found_cov[:2, :2], cov, atol=0.05 * scale**2)
+
+
+def test_the_other_states_follow_the_position() -> None:
+    """A velocity that hangs together with the position is told by it, component by component."""
+    x, P = prior((14.0, 0.0), (6.0, 6.0), rho=0.8)
+    means, covs, logs = mixture.split_along_ring(x, P, row(Kind.RANGE, 15.0, 0.3**2), 0.0)
+    gain = P[2:4, :2] @ np.linalg.inv(P[:2, :2])
+    np.testing.assert_allclose(means[:, 2:4] - x[2:4], (means[:, :2] - x[:2]) @ gain.T, atol=1e-9)
+    rest = P[2:4, 2:4] - gain @ P[:2, 2:4]
+    expected = rest + gain @ covs[:, :2, :2] @ gain.T
+    np.testing.assert_allclose(covs[:, 2:4, 2:4], expected, atol=1e-9)
+    assert np.isfinite(logs).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ranges_of_four_near_anchors_after_silence(seed: int) -> None:
+    """A device 25 m from anchors that are 5 m apart, known to 20 m: the posterior of eight
+    asynchronous ranges against the grid."""
+    rng = np.random.default_rng(seed)
+    truth = rng.uniform(-20.0, 20.0, 2)
+    x, P = prior(tuple(truth + 8.0 * rng.normal(size=2)), (20.0, 20.0))
+    rows = []
+    for k in range(8):
+        anchor = ANCHORS[k % 4] * (1.0, 1.0, 0.0)
+        value = np.linalg.norm(np.append(truth, 0.0) - anchor) + 0.2 * rng.normal()
+        rows.append(row(Kind.RANGE, value, 0.2**2, origin=anchor))
+    parts = one_component(x, P)
+    for r in rows:
+        parts, used = after(parts, r)
+        assert used == 1
+    _, mean, cov = on_grid(x, P, rows, 60.0, 0.1)
+    found, found_cov = moments(parts)
+    assert np.linalg.norm(found[:2] - mean) < 0.15 * np.sqrt(np.trace(cov))
+    assert np.trace(found_cov[:2, :2]) == pytest.approx(np.trace(cov), rel=0.15)
+    assert not mixture.mode_of(parts).any()
+
+
+def test_two_anchors_leave_two_modes_of_equal_weight() -> None:
+    x, P = prior((0.0, 0.0), (25.0, 25.0))
+    truth = np.array([4.0, 18.0])
+    parts = one_component(x, P)
+    for anchor in np.tile([[2.5, 0.0, 0.0], [-2.5, 0.0, 0.0]], (4, 1)):
+        value = np.linalg.norm(np.append(truth, 0.0) - anchor)
+        r = row(Kind.RANGE, value, 0.2**2, origin=anchor)
+        parts, _ = after(parts, r)
+    mode, weights = mixture.mode_of(parts), np.exp(parts[2])
+    assert set(mode.tolist()) == {0, 1}
+    np.testing.assert_allclose(np.bincount(mode, weights), 0.5, atol=0.05)
+    for side in (0, 1):
+        place = np.average(parts[0][mode == side, :2], axis=0, weights=weights[mode == side])
+        np.testing.assert_allclose(np.abs(place), np.abs(truth), atol=2.0)
+
+
+def test_one_narrow_component_is_the_extended_filter() -> None:
+    rng = np.random.default_rng(2)
+    x, P = np.array([3.0, 4.0, 1.0, 0.0, 0.0, 0.0]), make_cov(rng, 6, 0.01)
+    rows = np.vstack(
+        [
+            row(Kind.RANGE, 5.1, 0.04, 0),
+            row(Kind.AZIMUTH, 0.95, 1e-4, 1),
+            row(Kind.SPEED, 1.1, 0.01, 2),
+        ]
+    )
+    accepted = np.zeros(3)
+    epoch = EpochInput(0.0, 0.0, 0, rows)
+    found = components.apply_epoch(one_component(x, P), epoch, OPTIONS, 0.0, accepted)
+    means, covs, logs = found.components
+    assert (logs.tolist(), found.used, accepted.tolist()) == ([0.0], 3, [1.0, 1.0, 1.0])
+    expected, expected_cov, work = x.copy(), P.copy(), ekf.workspace(6, 3)
+    nis, _ = ekf.update(expected, expected_cov, rows, 0.0, OPTIONS.gate_nis, 1, np.zeros(3), work)
+    np.testing.assert_allclose(means[0], expected, atol=1e-12)
+    np.testing.assert_allclose(covs[0], expected_cov, atol=1e-12)
+    assert found.nis == pytest.approx(nis)
+
+
+def test_merging_keeps_the_moments_and_what_is_alike_becomes_one() -> None:
+    rng = np.random.default_rng(4)
+    means = rng.normal(0.0, 0.01, (6, 6)) + np.repeat([[0.0] * 6, [50.0] * 6], 3, axis=0)
+    covs = np.array([make_cov(rng, 6, 4.0)] * 6)
+    logs = np.log(np.full(6, 1.0 / 6.0)) + 3.0  # not normalised
+    parts = mixture.reduced(mixture.Mixture(means, covs, logs), mixture.RING_MERGE_COST)
+    assert parts[2].size == 2
+    np.testing.assert_allclose(np.exp(parts[2]).sum(), 1.0)
+    for ours, expected in zip(
+        moments(parts), moments(mixture.Mixture(means, covs, logs - 3.0)), strict=True
+    ):
+        np.testing.assert_allclose(ours, expected, rtol=1e-10, atol=1e-10)
+
+
+def test_components_without_weight_go_and_never_too_many_stay() -> None:
+    rng = np.random.default_rng(5)
+    means = np.column_stack([100.0 * np.arange(100.0), *rng.normal(size=(5, 100))])
+    covs, logs = np.tile(np.eye(6), (100, 1, 1)), np.zeros(100)
+    logs[7] = -30.0
+    kept, _, weights = mixture.reduced(mixture.Mixture(means, covs, logs), mixture.RING_MERGE_COST)
+    assert weights.size == 64
+    assert not (np.abs(kept[:, 0] - 700.0) < 1.0).any()
+
+
+def test_an_outlier_leaves_the_wide_prior_as_it_was_with_its_weight() -> None:
+    """A first range that is 40 m wrong: the ranges of the other anchors find the device."""
+    x, P = prior((5.0, 12.0), (15.0, 15.0))
+    truth = np.array([3.0, 16.0])
+    parts = one_component(x, P)
+    for k in range(12):
+        anchor = ANCHORS[k % 4] * (1.0, 1.0, 0.0)
+        value = np.linalg.norm(np.append(truth, 0.0) - anchor) + (40.0 if k == 0 else 0.0)
+        r = row(Kind.RANGE, value, 0.2**2, origin=anchor)
+        parts, _ = after(parts, r)
+    found, cov = moments(parts)
+    assert np.linalg.norm(found[:2] - truth) < 3.0 * np.sqrt(np.trace(cov[:2, :2]))
+    assert np.trace(cov[:2, :2]) < 4.0
+
+
+@pytest.mark.parametrize(
+    ("distance", "sd", "wide"),
+    [
+        # range sd 0.2 m at 30 m: 0.5 (sd^2 / 30)^2 = 0.04 / 4 at sd = 2.06 m
+        (30.0, 2.05, False),
+        (30.0, 2.07, True),
+        (30.0, 0.5, False),
+        (1.0, 0.7, False),  # narrow, however it bends
+    ],
+)
+def test_a_component_is_wide_where_the_tangent_costs_a_quarter_of_the_noise(
+    distance: float, sd: float, wide: bool
+) -> None:
+    x, P = prior((distance, 0.0), (0.1, sd))
+    assert mixture.is_wide(row(Kind.RANGE, distance, 0.04), x, P, 0.0) is wide
+    assert not mixture.is_wide(row(Kind.AZIMUTH, 0.0, 0.04), x, P, 0.0)
+
+
+def test_modes_are_chains_of_components() -> None:
+    means = np.zeros((5, 6))
+    means[:, 0] = 0.0, 3.0, 6.0, 9.0, 40.0
+    covs = np.tile(np.eye(6), (5, 1, 1))
+    mode = mixture.mode_of(mixture.Mixture(means, covs, np.log([0.1, 0.1, 0.1, 0.1, 0.6])))
+    assert mode.tolist() == [1, 1, 1, 1, 0]
+
+
+# a measurement that the gate refuses
+
+TURNING = options_of(TrackerConfig(filter="ekf", manoeuvre_speed_sd_mps=5.0))
+H = np.eye(2, 6)
+R = np.diag([0.04, 0.09])
+
+
+def updated(z: Array, mean: Array, cov: Array) -> tuple[float, Array, Array]:
+    """Log likelihood of a fix and the Kalman filter's answer."""
+    S = H @ cov @ H.T + R
+    K = np.linalg.solve(S, H @ cov).T
+    density = multivariate_normal(H @ mean, S).logpdf(z)
+    return float(density), mean + K @ (z - H @ mean), cov - K @ S @ K.T
+
+
+def with_turn(cov: Array, within_s: float) -> Array:
+    """A velocity step of 5 m/s per axis at any time of the last ``within_s`` seconds."""
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    total = cov.copy()
+    for s, w in zip(within_s * (nodes + 1.0) / 2.0, weights / 2.0, strict=True):
+        G = np.zeros((6, 2))
+        G[[0, 1], [0, 1]], G[[2, 3], [0, 1]] = s, 1.0
+        total += w * 25.0 * G @ G.T
+    return total
+
+
+@pytest.mark.parametrize(("off_m", "unheard_s"), [(1.8, 0.4), (2.5, 0.4), (6.0, 3.0)])
+def test_a_refused_fix_is_an_outlier_a_tail_or_a_turn(off_m: float, unheard_s: float) -> None:
+    """Weights and moments of the three explanations, by the Kalman filter's own formulas."""
+    x, P = prior((1.0, 2.0), (0.2, 0.3), rho=0.5)
+    P[2:4, 2:4] *= 0.25
+    P[0:2, 2:4] *= 0.5
+    P[2:4, 0:2] *= 0.5
+    z = x[:2] + off_m * np.array([1.0, 0.0])
+    rows, accepted = linear_rows(z, R, H, 0), np.zeros(1)
+    epoch = EpochInput(0.1, unheard_s, 0, rows)
+    found = components.apply_epoch(one_component(x, P), epoch, TURNING, 0.0, accepted)
+    S = H @ P @ H.T + R
+    delay_s = 2.0 * np.sqrt(2.0 * TURNING.gate_nis[2] / np.trace(np.linalg.inv(S))) / 5.0
+    within_s = max(unheard_s, delay_s)
+    whitened = np.linalg.slogdet(np.linalg.cholesky(R))[1]  # rows are decorrelated fixes
+    outlier = np.log(1e-2) - 2.0 * np.log(2.0 * np.pi)
+    tail, turn = updated(z, x, P), updated(z, x, with_turn(P, within_s))
+    logs = np.array([outlier, tail[0] + whitened, turn[0] + whitened + np.log(within_s / 30.0)])
+    weights = np.exp(logs - logs.max())
+    weights /= weights.sum()
+    means, covs = np.array([x, tail[1], turn[1]]), np.array([P, tail[2], turn[2]])
+    mean, cov = moments(mixture.Mixture(means, covs, np.log(weights)))
+    ours, our_cov = moments(found.components)
+    np.testing.assert_allclose(ours, mean, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(our_cov, cov, rtol=1e-5, atol=1e-6)
+    assert found.turned == pytest.approx(weights[2], abs=1e-6)
+    assert found.within_s == pytest.approx(within_s)
+    assert accepted[0] == (0.0 if np.argmax(weights) == 0 else 1.0)
+
+
+def test_a_fix_within_the_gate_leaves_one_component_and_without_manoeuvres_so_does_any() -> None:
+    x, P = prior((1.0, 2.0), (0.2, 0.3))
+    for options, off_m in ((TURNING, 0.5), (OPTIONS, 6.0)):
+        rows = linear_rows(x[:2] + off_m * np.array([1.0, 0.0]), R, H, 0)
+        rows = np.vstack([rows, linear_rows(x[:2], R, H, 1)])
+        epoch = EpochInput(0.1, 0.1, 0, rows)
+        found = components.apply_epoch(one_component(x, P), epoch, options, 9.0, np.zeros(2))
+        assert found.components.log_weights.size == 1
+        assert found.turned == 0.0
+
+
+@pytest.mark.parametrize(("since_s", "begins"), [(0.249, False), (0.251, True)])
+def test_one_rsu_lets_a_turn_begin_every_quarter_of_a_second(since_s: float, begins: bool) -> None:
+    x, P = prior((1.0, 2.0), (0.2, 0.3))
+    rows = linear_rows(x[:2], R, H, 0)
+    epoch = EpochInput(0.1, 0.1, 0, rows)
+    found = components.apply_epoch(one_component(x, P), epoch, TURNING, since_s, np.zeros(1))
+    assert found.begun is begins
+    assert (found.components.log_weights.size > 1) is begins
+    if begins:
+        wide = with_turn(P, since_s)
+        turn = updated(x[:2], x, wide)[0] - updated(x[:2], x, P)[0] + np.log(since_s / 30.0)
+        assert found.turned == pytest.approx(1.0 / (1.0 + np.exp(-turn)), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["ekf", "iekf", "ukf", "srukf"])
+def test_every_filter_follows_a_turn_and_forgets_an_outlier(name: str) -> None:
+    """Straight on at 4 m/s with fixes of 0.2 m; one fix 5 m off, then a turn by 90 degrees."""
+    config = TrackerConfig(filter=name, manoeuvre_speed_sd_mps=5.0, accel_density_mps2_sqrthz=0.1)
+    rng = np.random.default_rng(3)
+    truth, velocity = np.array([0.0, 0.0]), np.array([4.0, 0.0])
+    start = np.diag([0.04, 0.04, 0.04, 0.04, 1.0, 1.0])
+    estimate = KalmanEstimate(config, 0, np.array([0.0, 0.0, 4.0, 0.0, 0.0, 0.0]), start)
+    errors = []
+    for k in range(1, 120):
+        velocity = np.array([4.0, 0.0]) if k < 80 else np.array([0.0, 4.0])
+        truth = truth + 0.1 * velocity
+        z = truth + 0.2 * rng.normal(size=2) + ([0.0, 5.0] if k == 40 else [0.0, 0.0])
+        rows = linear_rows(z, 0.04 * np.eye(2), H, 0)
+        rows = np.vstack(
+            [rows, linear_rows(truth + 0.5 * rng.normal(size=2), np.eye(2) / 4, H, 1)]
+        )
+        estimate.step(k * 100_000_000, 0.1, 0, rows, NO_BIAS)
+        errors.append(float(np.hypot(*(estimate.mean[:2] - truth))))
+    assert max(errors[30:40]) < 0.5
+    assert max(errors[41:78]) < 0.6  # one epoch later the outlier is one
+    assert max(errors[79:]) < 2.0
+    assert max(errors[95:]) < 0.6
+    assert estimate.modes == ()
+    assert rows[-1, GROUP] == 1
+
+
+@pytest.mark.parametrize("name", ["ekf", "srukf"])
+def test_rows_are_reweighted_by_the_most_probable_component(name: str) -> None:
+    """Huber's factor of a fix 4 m off the heavier of two components, and 40 m off the other."""
+    config = TrackerConfig(
+        filter=name, robust="huber", robust_parameter=1.5, manoeuvre_speed_sd_mps=5.0
+    )
+    x, P = prior((1.0, 2.0), (0.2, 0.3))
+    two = mixture.Mixture(np.array([x + 40.0, x]), np.array([P, P]), np.log(np.array([0.1, 0.9])))
+    off = np.array([4.0, 0.0])
+    rows = linear_rows(x[:2] + off, R, H, 0)
+    variance = rows[:, VARIANCE].copy()
+    dynamics = components.Dynamics(motions_of(config)[0], NO_BIAS)
+    epoch = EpochInput(0.0, 0.1, 0, rows)
+    components.moved_to_epoch(two, epoch, dynamics, options_of(config))
+    distance = np.sqrt(off @ np.linalg.solve(H @ P @ H.T + R, off) / 2.0)
+    np.testing.assert_allclose(rows[:, VARIANCE] / variance, distance / 1.5, rtol=1e-9)

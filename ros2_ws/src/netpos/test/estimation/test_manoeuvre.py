@@ -1,0 +1,100 @@
+"""How long a velocity step goes unnoticed, against the distance it has to grow to."""
+
+from __future__ import annotations
+
+import math
+
+import filter_rows
+import numpy as np
+import pytest
+from netpos.estimation.manoeuvre import add_manoeuvre, detection_delay_s, measures_velocity
+from netpos.estimation.measurement import GATE_VARIANCE, Kind, curvature_variance, linearise
+from netpos.estimation.rows import linear_rows
+from netpos.messages.values import Array
+
+MEAN = np.array([30.0, 20.0, 5.0, -1.0, 0.0, 0.0])
+GATE, SPEED = 13.8, 3.0
+
+
+def problem(seed: int) -> tuple[Array, Array]:
+    """Covariance, and rows of two RSUs; in the gate counts the gate's variance."""
+    rng = np.random.default_rng(seed)
+    rows = [
+        filter_rows.row(kind, 0.3, 9.0, 0, rng.uniform(-20, 20, 3), gate_variance=variance)
+        for kind, variance in ((Kind.AZIMUTH, 1e-3), (Kind.RANGE, 0.2), (Kind.AZIMUTH, 4e-3))
+    ]
+    return filter_rows.make_cov(rng, 6, 0.5), np.array(rows)
+
+
+def known(cov: Array, rows: Array) -> Array:
+    """What rows tell of the place (2, 2), the prior's own uncertainty taken for noise."""
+    _, H = linearise(rows, MEAN, 1.0)
+    noise = rows[:, GATE_VARIANCE] + [curvature_variance(r, MEAN, cov, 1.0) for r in rows]
+    variance = np.einsum("ij,jk,ik->i", H, cov, H) + noise
+    information: Array = (H[:, :2] / variance[:, None]).T @ H[:, :2]
+    return information
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_step_is_noticed_where_it_reaches_the_gate(seed: int) -> None:
+    """In the direction known least, by search over all; twice as long as in the mean over them,
+    for as long as that the filter follows."""
+    cov, rows = problem(seed)
+    typical_s, longest_s = detection_delay_s(MEAN, cov, rows, 1.0, GATE, SPEED, np.empty(6))
+    angles = np.linspace(0.0, math.pi, 20001)
+    ways = np.array([np.cos(angles), np.sin(angles)])
+    reached = np.einsum("in,ij,jn->n", ways, known(cov, rows), ways)  # of a step of one metre
+    assert longest_s == pytest.approx(math.sqrt(GATE / reached.min()) / SPEED, rel=1e-6)
+    typical = 2.0 * math.sqrt(GATE / reached[:-1].mean()) / SPEED
+    assert typical_s == pytest.approx(typical, rel=1e-6)
+
+
+def test_what_no_row_tells_is_never_noticed() -> None:
+    """One bearing leaves its own direction open, and no rows everything."""
+    cov, rows = problem(1)
+    some_s, longest_s = detection_delay_s(MEAN, cov, rows[:1], 1.0, GATE, SPEED, np.empty(6))
+    assert math.isfinite(some_s)
+    assert longest_s == math.inf
+    assert detection_delay_s(MEAN, cov, rows[:0], 1.0, GATE, SPEED, np.empty(6)) == (
+        math.inf,
+        math.inf,
+    )
+
+
+def test_a_step_at_any_time_moves_the_place_by_half_of_it() -> None:
+    """Position and velocity of steps drawn, the time of each any in the last two seconds."""
+    rng, cov = np.random.default_rng(2), np.zeros((6, 6))
+    step, since_s = rng.normal(0.0, SPEED, 400_000), rng.uniform(0.0, 2.0, 400_000)
+    add_manoeuvre(SPEED, 2.0, cov)
+    drawn = np.cov(step * since_s, step)
+    for axis in (0, 1):
+        found = cov[np.ix_([axis, axis + 2], [axis, axis + 2])]
+        np.testing.assert_allclose(found, drawn, rtol=0.01)
+    cov[:4, :4] -= np.kron(found, np.eye(2))
+    np.testing.assert_allclose(cov, 0.0, atol=1e-12)
+
+
+def velocities(sd: float) -> Array:
+    """A measured velocity: two linear rows of variance sd²."""
+    return linear_rows(np.zeros(2), sd**2 * np.eye(2), np.eye(2, 6, 2), 0)
+
+
+def test_a_measured_velocity_shows_a_step_at_once() -> None:
+    cov, rows = 0.01 * np.eye(6), velocities(0.1)
+    assert detection_delay_s(MEAN, cov, rows, 1.0, GATE, SPEED, np.empty(6)) == (0.0, 0.0)
+    assert measures_velocity(MEAN, rows, 1.0)
+    assert not measures_velocity(MEAN, rows[:1], 1.0)
+    assert not measures_velocity(MEAN, problem(1)[1], 1.0)
+
+
+def test_a_velocity_too_uncertain_to_show_a_step_leaves_it_to_the_positions() -> None:
+    """At sd so large that the step is far within the gate, the delay is that of the other rows."""
+    cov, rows = problem(2)
+    alone = detection_delay_s(MEAN, cov, rows, 1.0, GATE, SPEED, np.empty(6))
+    with_both = np.concatenate([rows, velocities(1e6)])
+    both = detection_delay_s(MEAN, cov, with_both, 1.0, GATE, SPEED, np.empty(6))
+    np.testing.assert_allclose(both, alone, rtol=1e-6)
+    assert detection_delay_s(MEAN, cov, velocities(1e6), 1.0, GATE, SPEED, np.empty(6)) == (
+        math.inf,
+        math.inf,
+    )
