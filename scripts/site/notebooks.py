@@ -18,7 +18,8 @@ def executed(path: Path, folder: Path) -> nbformat.NotebookNode:
     Raises ``nbclient.exceptions.CellExecutionError`` where a cell fails.
     """
     notebook = nbformat.read(path, as_version=4)
-    os.environ.setdefault("MPLBACKEND", "module://matplotlib_inline.backend_inline")
+    # The kernel inherits it; another one, as of a machine without a screen, would draw nothing.
+    os.environ["MPLBACKEND"] = "module://matplotlib_inline.backend_inline"
     resources = {"metadata": {"path": str(folder)}}
     with tempfile.TemporaryDirectory() as sockets:  # no port is opened
         place = f"{sockets}/kernel"
