@@ -29,7 +29,7 @@ def level_of_epochs(
     options: FilterOptions,
 ) -> float:
     """Radius [m] as ``manoeuvre_level``, of the newest epochs together: as few as see every
-    direction, inf where all do not.
+    direction, inf where all do not, or there is no gate.
 
     recent : stamps and rows (m, ROW_WIDTH), oldest first, the newest of ``stamp_ns``
     prediction : mean (n,) and covariance (n, n) at ``stamp_ns``; cov : (n, n) after it
@@ -39,6 +39,9 @@ def level_of_epochs(
     goes unnoticed for at most sqrt(k) times as long as one epoch with all rows would let it, and
     the age of the oldest. What it does to the position is added to ``cov``.
     """
+    gate = float(options.gate_nis[2])
+    if math.isinf(gate):
+        return math.inf
     mean, prior_cov = prediction
     information = np.zeros((2, 2))
     for k, (then_ns, rows) in enumerate(reversed(recent), start=1):
@@ -47,7 +50,7 @@ def level_of_epochs(
         if least <= _BLIND * most:
             continue
         speed = options.manoeuvre_speed_sd
-        longest_s = math.sqrt(k * float(options.gate_nis[2]) / least) / speed
+        longest_s = math.sqrt(k * gate / least) / speed
         within_s = longest_s + 1e-9 * (stamp_ns - then_ns)
         moved2 = (speed * within_s) ** 2 / 3.0  # a step at any time in it
         return float(

@@ -27,7 +27,7 @@ PRIOR, POSTERIOR = np.diag([0.16, 0.16, 1.0, 1.0, 1.0, 1.0]), np.diag([0.09, 0.0
 
 def range_from(x: float, y: float) -> Array:
     """A range to an RSU far away, so that its line is straight."""
-    return filter_rows.row(Kind.RANGE, math.hypot(x, y), SD_M, 0, (x, y, 0.0))[None]
+    return filter_rows.row(Kind.RANGE, math.hypot(x, y), SD_M**2, 0, (x, y, 0.0))[None]
 
 
 EAST, NORTH = range_from(1e6, 0.0), range_from(0.0, 1e6)
