@@ -44,8 +44,10 @@ ARRAYS: dict[str, tuple[float, float, float]] = {
 }
 
 
-# A walking person: v^2 / T for 0.5 m/s and turns of some seconds, sqrt(0.05) m/s^2/sqrt(Hz).
+# A walking person: v^2 / T for 0.5 m/s and turns of some seconds, sqrt(0.05) m/s^2/sqrt(Hz), which
+# leaves nothing for manoeuvres.
 TRACKER = {
+    "manoeuvre_speed_sd_mps": 0.0,
     "device_height_m": TAG_HEIGHT_M,
     "accel_density_mps2_sqrthz": 0.22,
     "initial_speed_sd_mps": 0.5,

@@ -72,10 +72,10 @@ def test_a_second_process_compiles_nothing() -> None:
 def test_a_changed_sensor_has_kernels_of_its_own(tmp_path: Path, name: str) -> None:
     """Columns, the table and indices of states are compiled into kernels of other files."""
     root = tmp_path / "netpos"
-    filters = Path("filters")
-    shutil.copytree(Path(netpos.__file__).parent / filters, root / filters)
+    room = Path("estimation")
+    shutil.copytree(Path(netpos.__file__).parent / room, root / room)
     before = cache_folder(root)
     assert cache_folder(root) == before
-    with (root / filters / f"{name}.py").open("a", encoding="utf-8") as file:
+    with (root / room / f"{name}.py").open("a", encoding="utf-8") as file:
         file.write("# one line more\n")
     assert cache_folder(root) != before
