@@ -114,6 +114,26 @@ def test_every_topic_is_described() -> None:
     assert [name for name in names if f"`{name}`" not in text and name != "/<vue>/mag"] == []
 
 
+DECISIONS = sorted((DOCS / "decisions").glob("0*.md"))
+
+
+@pytest.mark.parametrize("path", DECISIONS, ids=lambda path: path.stem[:4])
+def test_a_decision_has_a_status_and_a_row_in_the_table(path: Path) -> None:
+    """A decision is accepted or void since a later one; the table has its title and status."""
+    title, _, status, *_ = path.read_text(encoding="utf-8").splitlines()
+    number = path.stem[:4]
+    assert title.startswith(f"# {number}: ")
+    state = re.match(r"Status: (accepted|void since \[(\d{4})\])", status)
+    assert state is not None
+    table = (DOCS / "decisions" / "README.md").read_text(encoding="utf-8")
+    (row,) = [line for line in table.splitlines() if f"]({path.name})" in line]
+    _, cell, name, now, about, _ = row.split("|")
+    assert cell.strip() == f"[{number}]({path.name})"
+    assert name.strip() == title.removeprefix(f"# {number}: ")
+    assert now.strip().startswith(f"void since {state[2]}" if state[2] else "accepted")
+    assert about.strip()
+
+
 def test_the_readme_is_two_screens() -> None:
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
     assert len(lines) <= README_LINES

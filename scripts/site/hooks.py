@@ -21,7 +21,7 @@ _LIBRARY = "ros2_ws/src/netpos/netpos"
 _PAGES = {
     "README.md": "index.md",
     "CHANGELOG.md": "changes.md",
-    "docs/decisions": "decisions/index.md",
+    "docs/decisions": "decisions/README.md",
     "ros2_ws/src/netpos_msgs/msg": "reference/messages.md",
     f"{_LIBRARY}/tracking/config.py": "reference/parameters.md",
     f"{_LIBRARY}/tracking/networks/config.py": "reference/parameters.md",
@@ -36,7 +36,6 @@ def on_files(files: Files, config: Any) -> Files:
     pages = {
         "index.md": of_site((ROOT / "README.md").read_text(encoding="utf-8"), ROOT),
         "changes.md": of_site((ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), ROOT),
-        "decisions/index.md": decisions(),
         "reference/parameters.md": reference.parameters_page(),
         "reference/messages.md": reference.messages_page(),
         "reference/commands.md": reference.commands_page(),
@@ -47,33 +46,34 @@ def on_files(files: Files, config: Any) -> Files:
     for file in [f for f in files if f.src_uri.endswith(".ipynb")]:
         files.remove(file)
         page, pictures = notebook_page(Path(str(file.abs_src_path)))
-        place = file.src_uri.removesuffix(".ipynb")
-        files.append(File.generated(config, f"{place}.md", content=page))
+        page_uri = file.src_uri.removesuffix(".ipynb")
+        files.append(File.generated(config, f"{page_uri}.md", content=page))
         for name, data in pictures.items():
-            files.append(File.generated(config, f"{Path(place).parent}/{name}", content=data))
+            files.append(File.generated(config, f"{Path(page_uri).parent}/{name}", content=data))
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Links to files of the checkout become links to their pages."""
-    place = DOCS / page.file.src_uri
-    return of_site(markdown, place.parent) if place.exists() else markdown
+    path = DOCS / page.file.src_uri
+    return of_site(markdown, path.parent) if path.exists() else markdown
 
 
 def of_site(text: str, folder: Path) -> str:
     """A document of ``folder`` with links that lead to pages of the site; of a link to a file that
     has no page the words are left."""
-    own = os.path.relpath(folder, DOCS) if folder.is_relative_to(DOCS) else "."
+    page_folder = os.path.relpath(folder, DOCS) if folder.is_relative_to(DOCS) else "."
 
-    def link(found: re.Match[str]) -> str:
-        mark, words, target = found.groups()
+    def link(match: re.Match[str]) -> str:
+        mark, words, target = match.groups()
         if re.match(r"[a-z]+:|#", target):
-            return found.group(0)
+            return match.group(0)
         name, _, anchor = target.partition("#")
         page = page_of((folder / name).resolve())
         if page is None:
             return words
-        return f"{mark}[{words}]({os.path.relpath(page, own)}{'#' + anchor if anchor else ''})"
+        link_target = os.path.relpath(page, page_folder) + ("#" + anchor if anchor else "")
+        return f"{mark}[{words}]({link_target})"
 
     pieces = _CODE.split(text)
     pieces[::2] = [_LINK.sub(link, piece) for piece in pieces[::2]]
@@ -89,14 +89,3 @@ def page_of(path: Path) -> str | None:
     if not path.is_relative_to(DOCS):
         return None
     return path.relative_to(DOCS).as_posix().replace(".ipynb", ".md")
-
-
-def decisions() -> str:
-    """The list of decisions, the newest first."""
-    lines = []
-    for path in sorted((ROOT / "docs" / "decisions").glob("0*.md"), reverse=True):
-        title = path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
-        title = re.sub(rf"^{path.name[:4]}[.:]?\s*(?:—\s*)?", "", title)
-        lines.append(f"- [{path.name[:4]}]({path.name}) {title}")
-    intro = "Why things are as they are: context, decision, consequence and figures of each."
-    return "\n".join(["# Decisions", "", intro, "", *lines, ""])
