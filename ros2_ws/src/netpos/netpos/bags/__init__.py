@@ -1,6 +1,6 @@
 """Bags: rosbag2 folders with MCAP storage, written and read without ROS.
 
-``BagWriter`` and ``BagReader`` hold the ordinary case, ``netpos.bags.recover`` saves what a
+``BagWriter`` and ``BagReader`` are for the ordinary case, ``netpos.bags.recover`` saves what a
 killed recorder left, ``netpos.bags.importers`` turn other people's recordings into bags.
 """
 

@@ -25,10 +25,10 @@ _MESSAGE = struct.Struct("<BQHIQQ")
 _INDEX = struct.Struct("<BQHI")
 _FIXED = _MESSAGE.size - _HEAD.size  # bytes of a message's record between its length and its data
 
-Found = tuple[int, int, str, bytes]  # log time, place in the file, topic, payload
+StoredMessage = tuple[int, int, str, bytes]  # log time, position in the file, topic, payload
 
 
-def messages_in_order(storage: Any, topics: Mapping[int, str]) -> Iterator[Found]:
+def messages_in_order(storage: Any, topics: Mapping[int, str]) -> Iterator[StoredMessage]:
     """Messages of an indexed file in log-time order, ties in the order of the file.
 
     ``storage`` is the file, opened by rosbags or ``SingleFile``; ``topics`` those wanted, by
@@ -38,7 +38,7 @@ def messages_in_order(storage: Any, topics: Mapping[int, str]) -> Iterator[Found
     ------
     ValueError, struct.error, EOFError  a chunk is damaged
     """
-    waiting: list[Found] = []
+    waiting: list[StoredMessage] = []
     chunks = sorted(enumerate(storage.chunks), key=lambda item: item[1].message_start_time)
     for number, chunk in chunks:
         if not chunk.message_index_offsets or topics.keys() & chunk.message_index_offsets:
@@ -48,28 +48,32 @@ def messages_in_order(storage: Any, topics: Mapping[int, str]) -> Iterator[Found
     yield from waiting
 
 
-def _messages_of(file: Any, chunk: Any, number: int, topics: Mapping[int, str]) -> list[Found]:
+def _messages_of(
+    file: Any, chunk: Any, number: int, topics: Mapping[int, str]
+) -> list[StoredMessage]:
     file.seek(chunk.chunk_start_offset + _HEAD.size)
     record = Chunk.read(ReadDataStream(BytesIO(file.read(chunk.chunk_length - _HEAD.size))))
     raw = unpack(record)
     # Without a checksum, records that follow one another to the end are the only proof of them.
     sound = record.uncompressed_crc and chunk.message_index_offsets
     offsets = _indexed(file, chunk, topics) if sound else _walked(raw)
-    found: list[Found] = []
-    place = number << 40
-    for at in offsets:
-        opcode, size, channel, _, time, _ = _MESSAGE.unpack_from(raw, at)
-        end = at + _HEAD.size + size
+    messages: list[StoredMessage] = []
+    chunk_position = number << 40
+    for offset in offsets:
+        opcode, size, channel, _, time, _ = _MESSAGE.unpack_from(raw, offset)
+        end = offset + _HEAD.size + size
         if opcode != Opcode.MESSAGE or end > len(raw):
             raise ValueError("the index of a chunk does not fit it")
         if channel in topics:
-            found.append((time, place + at, topics[channel], raw[at + _MESSAGE.size : end]))
-    return found
+            messages.append(
+                (time, chunk_position + offset, topics[channel], raw[offset + _MESSAGE.size : end])
+            )
+    return messages
 
 
 def _indexed(file: Any, chunk: Any, channels: Container[int]) -> set[int]:
-    """Where the messages of ``channels`` begin in the records of a chunk, by its index."""
-    found: set[int] = set()
+    """Offsets of the messages of ``channels`` in the records of a chunk, from its index."""
+    positions: set[int] = set()
     for channel, offset in chunk.message_index_offsets.items():
         if channel not in channels:
             continue
@@ -77,22 +81,22 @@ def _indexed(file: Any, chunk: Any, channels: Container[int]) -> set[int]:
         opcode, _, owner, size = _INDEX.unpack(file.read(_INDEX.size))
         if (opcode, owner) != (Opcode.MESSAGE_INDEX, channel):
             raise ValueError("a chunk has no index where it should be")
-        found.update(struct.unpack(f"<{size // 8}Q", file.read(size))[1::2])
-    return found
+        positions.update(struct.unpack(f"<{size // 8}Q", file.read(size))[1::2])
+    return positions
 
 
 def _walked(raw: bytes) -> set[int]:
-    """Where the messages begin in the records of a chunk."""
-    found: set[int] = set()
+    """Offsets of the messages in the records of a chunk."""
+    positions: set[int] = set()
     position = 0
     while position < len(raw):
         opcode, size = _HEAD.unpack_from(raw, position)
         if opcode == Opcode.MESSAGE:
-            found.add(position)
+            positions.add(position)
         position += _HEAD.size + size
     if position != len(raw):
         raise ValueError("a record exceeds its chunk")
-    return found
+    return positions
 
 
 class _Index:
@@ -114,7 +118,7 @@ class _Index:
 
 
 class _Chunk:
-    """In place of mcap's builder of chunks, with the attributes its writer uses."""
+    """Replaces mcap's builder of chunks; has the attributes that its writer uses."""
 
     def __init__(self, statistics: Any) -> None:
         self._statistics = statistics  # of the file, brought up to date with each whole chunk

@@ -1,4 +1,4 @@
-"""What goes wrong with bags."""
+"""Errors of bags and recordings."""
 
 from __future__ import annotations
 
@@ -12,4 +12,4 @@ class BagError(ValueError):
 def require_file(file: Path) -> None:
     """BagError for a pipe, a device or a folder: reading it may never end."""
     if not file.is_file():
-        raise BagError(f"{file} is no regular file; give the path of a recording on a disk")
+        raise BagError(f"{file} is not a regular file; give the path of a recording on a disk")

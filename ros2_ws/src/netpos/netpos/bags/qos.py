@@ -33,7 +33,7 @@ def profile(*, reliable: bool = True, latched: bool = False, depth: int = 1000) 
 
 def default_profile(topic: str) -> Qos:
     """What the nodes of netpos offer on ``topic``: all reliable; /rsu/info, initial poses and
-    what is said of the run latched."""
+    facts of the run latched."""
     if topic == CLOCK:
         return profile(depth=10)
     latched = topic in (RSU_INFO, *RUN_TOPICS) or split(topic)[1] == INITIAL_POSE

@@ -16,7 +16,7 @@ from rosbags.rosbag2 import Reader, ReaderError
 from rosbags.serde import SerdeError
 
 from netpos.bags import layout
-from netpos.bags.chunks import Found, messages_in_order
+from netpos.bags.chunks import StoredMessage, messages_in_order
 from netpos.bags.errors import BagError, require_file
 from netpos.bags.run_facts import run_of_description, run_of_records, texts
 from netpos.bags.scan import run_of_attachments, summary_is_sound
@@ -95,7 +95,7 @@ class BagReader:
 
     def _describe(self) -> None:
         if self._file is not None:
-            self.topics = {name: _info(*told) for name, told in self._file.topics.items()}
+            self.topics = {name: _info(*entry) for name, entry in self._file.topics.items()}
             self.start_ns, self.end_ns = self._file.start_ns, self._file.end_ns
             self.metadata = texts(self._file.custom)
             self._compare([self._file.file])
@@ -146,7 +146,7 @@ class BagReader:
         self._check_summaries()
 
     def _check_metadata(self) -> None:
-        """Before anybody reads it."""
+        """Check metadata.yaml before it is read."""
         file = self.path / layout.METADATA_FILE
         if not self.path.is_dir():
             return
@@ -198,8 +198,8 @@ class BagReader:
             if len(files) == 1 and any(copy != copies[0] for copy in copies):
                 raise self._damaged("its copies of the run's metadata differ")
             for channel in index.channels.values() if index is not None else ():
-                told, schema = self.topics.get(channel.topic), index.schemas[channel.schema_id]
-                if told is None or told.type_name != schema.name:
+                info, schema = self.topics.get(channel.topic), index.schemas[channel.schema_id]
+                if info is None or info.type_name != schema.name:
                     raise self._damaged(
                         f"{layout.METADATA_FILE} does not know {channel.topic} as {schema.name}"
                     )
@@ -239,17 +239,17 @@ class BagReader:
 
     @cached_property
     def facts(self) -> dict[str, tuple[str, ...]]:
-        """What is known of the run, by name: the metadata, and what nodes said on its topics.
+        """Facts of the run, by name: the metadata, and what nodes published on its topics.
 
         Several values where they do not agree.
         """
-        found = {key: [value] for key, value in self.metadata.items()}
+        values_by_key = {key: [value] for key, value in self.metadata.items()}
         for entry in self.messages(self.topics.keys() & set(RUN_TOPICS)):
-            said = entry.message
-            values = found.setdefault(str(said.key), [])
-            if said.value not in values:
-                values.append(str(said.value))
-        return {key: tuple(values) for key, values in found.items()}
+            message = entry.message
+            values = values_by_key.setdefault(str(message.key), [])
+            if message.value not in values:
+                values.append(str(message.value))
+        return {key: tuple(values) for key, values in values_by_key.items()}
 
     def decode(self, topic: str, cdr: bytes) -> Any:
         """A message of a topic; ``BagError`` where it is not of the topic's type."""
@@ -296,14 +296,14 @@ class BagReader:
             if counts[topic] != info.count:
                 raise self._damaged(f"{topic}: {counts[topic]} of {info.count} messages found")
 
-    def _by_message(self, wanted: Collection[str]) -> Iterator[Found]:
+    def _by_message(self, wanted: Collection[str]) -> Iterator[StoredMessage]:
         connections = [c for c in self._reader.connections if c.topic in wanted]
         if connections:  # rosbags takes none for all
             for connection, log_time_ns, cdr in self._reader.messages(connections):
                 yield log_time_ns, 0, connection.topic, bytes(cdr)
 
-    def _by_chunk(self, wanted: Collection[str]) -> Iterator[Found] | None:
-        """The short way, for a single MCAP file with an index."""
+    def _by_chunk(self, wanted: Collection[str]) -> Iterator[StoredMessage] | None:
+        """The faster way, for a single MCAP file with an index."""
         if self._file is not None:
             wanted_by_channel = {c: t for c, t in self._file.channels.items() if t in wanted}
             return messages_in_order(self._file, wanted_by_channel)

@@ -1,4 +1,4 @@
-"""A recording made in Python becomes a bag, and a bag becomes values in Python."""
+"""Write values from Python as a bag, and read a bag as values."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from netpos.messages.values import (
     TrackStatus,
 )
 
-# Metadata of an import that whoever reads the figures must know.
+# Metadata of an import that a reader of the figures must know.
 TRUTH_ALIGNMENT = "truth_alignment"
 SKIPPED = "skipped"
 
@@ -53,7 +53,7 @@ def write_bag(
 ) -> dict[str, int]:
     """Write a recording as a bag that ``netpos replay`` tracks; every input may be in any order.
 
-    Measurements of one stamp and device are taken as one beacon: they get its number, and
+    Measurements of one stamp and device count as one beacon: they get its number, and
     ``expected`` is how many there are.
 
     Parameters
@@ -98,7 +98,7 @@ def write_bag(
 class Recording:
     """What a bag holds, in recorded order; truth, odometry, status and clock by device.
 
-    facts : what the bag says of how it was made, by name (``scenario``, ``tracker``, ``lost``);
+    facts : how the bag was made, by name (``scenario``, ``tracker``, ``lost``);
     several values where they do not agree
     """
 
@@ -127,7 +127,7 @@ def read_bag(path: Path | str) -> Recording:
         CLOCK_STATE: convert.clock_state_from_msg,
         TRACK_STATUS: convert.track_status_from_msg,
     }
-    found: dict[tuple[str, str], list[Any]] = defaultdict(list)
+    values_by_topic: dict[tuple[str, str], list[Any]] = defaultdict(list)
     with BagReader(Path(path)) as bag:
         names = {topic: split(topic) if split(topic)[0] else ("", topic) for topic in bag.topics}
         wanted = [topic for topic, (_, name) in names.items() if name in read]
@@ -137,15 +137,17 @@ def read_bag(path: Path | str) -> Recording:
                 value = read[name](entry.message)
             except (AttributeError, TypeError) as error:
                 raise BagError(f"{path}: {entry.topic} holds {entry.type_name}") from error
-            found[name, vue].append(value)
+            values_by_topic[name, vue].append(value)
         facts = bag.facts
 
     def of(name: str) -> dict[str, tuple[Any, ...]]:
-        return {vue: tuple(v) for (kind, vue), v in sorted(found.items()) if kind == name}
+        return {
+            vue: tuple(v) for (kind, vue), v in sorted(values_by_topic.items()) if kind == name
+        }
 
     return Recording(
-        rsus=tuple(found[RSU_INFO, ""]),
-        measurements=tuple(found[RSU_MEASUREMENTS, ""]),
+        rsus=tuple(values_by_topic[RSU_INFO, ""]),
+        measurements=tuple(values_by_topic[RSU_MEASUREMENTS, ""]),
         imu=tuple(sample for samples in of(IMU).values() for sample in samples),
         truth=of(GROUND_TRUTH),
         odometry=of(ODOMETRY),
@@ -168,7 +170,7 @@ def _check(rsus: Sequence[RsuInfo], measurements: Sequence[RsuMeasurement]) -> N
         )
     first_ns = min(m.stamp_ns for m in measurements)
     if first_ns <= 0:
-        raise BagError(f"stamp {first_ns} ns is no stamp; add a constant so that all are > 0")
+        raise BagError(f"stamp {first_ns} ns is not > 0; add a constant to all stamps")
 
 
 def number_beacons(measurements: Sequence[RsuMeasurement]) -> list[RsuMeasurement]:

@@ -1,4 +1,4 @@
-"""RSUs and their errors as a small file: written from a bag, put into another one."""
+"""RSUs and their errors as a small file: written from a bag, loaded into another bag."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _DIGITS = 6
 
 def save_rsus(bag: Path, file: Path) -> list[RsuInfo]:
     """Write the RSUs of a bag, in the form that ``read_rsus`` reads; where their errors were
-    learned, with the newest spread and time of the biases as what they declare.
+    learned, with the newest sd and correlation time of the biases as declared values.
 
     Raises
     ------
@@ -54,22 +54,22 @@ def save_rsus(bag: Path, file: Path) -> list[RsuInfo]:
                 learned[errors.rsu_id] = errors
     if not infos:
         raise BagError(f"{bag} has no {RSU_INFO}: there is nothing to save")
-    found = [
+    declared = [
         _declaring(info, learned[name]) if name in learned else info
         for name, info in sorted(infos.items())
     ]
     lines = [f"# RSUs of {bag.name}; m, rad, s, axes of map", "rsus:"]
-    for info in found:
-        said = learned.get(info.rsu_id)
-        if said is not None:
-            scatter = zip(said.quantities, said.scatter, strict=True)
+    for info in declared:
+        scatter_of = learned.get(info.rsu_id)
+        if scatter_of is not None:
+            scatter = zip(scatter_of.quantities, scatter_of.scatter, strict=True)
             text = ", ".join(f"{quantity} {value:.2f}" for quantity, value in scatter)
             lines.append(f"  # learned; scatter over the sd stated: {text}")
         entry = yaml.safe_dump(_entry(info), default_flow_style=True, width=10_000).strip()
         name = yaml.safe_dump(info.rsu_id).splitlines()[0]  # in quotes where it must be
         lines.append(f"  {name}: {entry}")
     write_text(file, "\n".join(lines) + "\n")
-    return found
+    return declared
 
 
 def rsus_text(infos: Iterable[RsuInfo]) -> str:
@@ -114,38 +114,38 @@ def load_rsus(file: Path, bag: Path, out: Path) -> list[str]:
 
 
 def _declaring(info: RsuInfo, errors: RsuErrors) -> RsuInfo:
-    """With what was learned in place of what was declared; of several quantities that share a
-    bias the larger spread and its time."""
+    """With the learned errors instead of the declared ones; of several quantities that share a
+    bias the larger sd and its time."""
     changes: dict[str, float] = {}
     largest = 0.0
-    for quantity, spread, time_s in zip(
+    for quantity, sd, time_s in zip(
         errors.quantities, errors.bias_spread, errors.correlation_time_s, strict=True
     ):
         name = _BIAS_OF.get(quantity)
         if name is None:
             continue
-        changes[name] = max(changes.get(name, 0.0), spread)
-        if spread >= largest:
-            largest, changes["bias_correlation_time_s"] = spread, time_s
+        changes[name] = max(changes.get(name, 0.0), sd)
+        if sd >= largest:
+            largest, changes["bias_correlation_time_s"] = sd, time_s
     return replace(info, **changes)  # type: ignore[arg-type]
 
 
 def _entry(info: RsuInfo, digits: int | None = _DIGITS) -> dict[str, Any]:
     """The fields that are not as by default, as plain values; ``digits`` None: unrounded."""
     plain = RsuInfo(rsu_id=info.rsu_id, position=info.position)
-    found: dict[str, Any] = {"position": _rounded(info.position, digits)}
+    content: dict[str, Any] = {"position": _rounded(info.position, digits)}
     for entry in fields(RsuInfo):
         value, default = getattr(info, entry.name), getattr(plain, entry.name)
         if entry.name in ("rsu_id", "position", "stamp_ns", "frame_id"):
             continue
         if isinstance(value, np.ndarray):
             if not np.array_equal(value, default):
-                found[entry.name] = _rounded(value, digits and 9)
+                content[entry.name] = _rounded(value, digits and 9)
         elif value != default:
-            found[entry.name] = _rounded(value, digits) if isinstance(value, float) else value
-    if "angle_convention" in found:
-        found["angle_convention"] = info.angle_convention.name
-    return found
+            content[entry.name] = _rounded(value, digits) if isinstance(value, float) else value
+    if "angle_convention" in content:
+        content["angle_convention"] = info.angle_convention.name
+    return content
 
 
 def _rounded(value: Any, digits: int | None) -> Any:

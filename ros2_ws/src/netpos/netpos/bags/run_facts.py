@@ -1,4 +1,4 @@
-"""What a bag says of its run, where several copies have to agree.
+"""Facts of a run in a bag, where several copies have to agree.
 
 No checksum of MCAP covers a metadata record, nor metadata.yaml. Bags of netpos say the same in
 two records and in metadata.yaml, newer ones also in attachments, which carry a checksum.
@@ -21,30 +21,30 @@ def texts(custom: Mapping[Any, Any]) -> Run:
 
 
 def run_of_description(text: str) -> Run | None:
-    """What metadata.yaml, or its copy in the file, says of the run; None where it cannot be
+    """Facts of the run in metadata.yaml, or its copy in the file; None where it cannot be
     read."""
     try:
-        found = load_yaml(text)
-        found = found.get("rosbag2_bagfile_information", found)
-        return texts(found["custom_data"] or {})
+        description = load_yaml(text)
+        description = description.get("rosbag2_bagfile_information", description)
+        return texts(description["custom_data"] or {})
     except (YamlError, KeyError, AttributeError):
         return None
 
 
 def agreed(copies: Sequence[Run]) -> tuple[Run, list[str]]:
-    """What at least two copies say alike, and the names of the rest, sorted."""
-    said: dict[str, list[str]] = {}
+    """Facts with equal values in at least two copies, and the names of the others, sorted."""
+    values_by_key: dict[str, list[str]] = {}
     for copy in copies:
         for key, value in copy.items():
-            said.setdefault(key, []).append(value)
-    found, doubtful = {}, []
-    for key, values in said.items():
+            values_by_key.setdefault(key, []).append(value)
+    facts, doubtful = {}, []
+    for key, values in values_by_key.items():
         often = max(values, key=values.count)
         if values.count(often) > 1:
-            found[key] = often
+            facts[key] = often
         else:
             doubtful.append(key)
-    return found, sorted(doubtful)
+    return facts, sorted(doubtful)
 
 
 def run_of_records(records: Mapping[str, Mapping[str, str]]) -> list[Run]:

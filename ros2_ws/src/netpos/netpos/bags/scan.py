@@ -67,7 +67,7 @@ _KINDS: dict[int, Any] = {
 
 @dataclass(slots=True)
 class Scan:
-    """What a walk finds; sizes in bytes. Chunks are found again in ``data``, which stays open."""
+    """Result of a walk; sizes in bytes. Chunks are found again in ``data``, which stays open."""
 
     data: bytes | mmap
     schemas: dict[int, Any] = field(default_factory=dict)
@@ -84,7 +84,7 @@ class Scan:
 
     @property
     def checked(self) -> bool:
-        """Whether the file makes checksums: something in it is under a right one."""
+        """Whether the file has checksums: at least one in it is right."""
         return bool(self._certain) or any(verified for _, verified in self.blocks)
 
     def messages(self) -> Iterator[tuple[Any, bool]]:
@@ -224,10 +224,10 @@ def _next_proven(data: bytes | mmap, position: int) -> int:
     if none."""
     marks = {bytes([opcode]): -1 for opcode in (Opcode.CHUNK, Opcode.ATTACHMENT)}
     while position < len(data):
-        for mark, place in marks.items():
-            if place < position:
-                found = data.find(mark, position)
-                marks[mark] = found if found >= 0 else len(data)
+        for mark, mark_position in marks.items():
+            if mark_position < position:
+                next_position = data.find(mark, position)
+                marks[mark] = next_position if next_position >= 0 else len(data)
         position = min(marks.values())
         if _is_proven(data, position):
             return position
@@ -236,59 +236,59 @@ def _next_proven(data: bytes | mmap, position: int) -> int:
 
 
 def scan(data: bytes | mmap) -> Scan:
-    """Everything sound in the bytes of an MCAP file; never raises for what they hold."""
-    found = Scan(data)
+    """Everything sound in the bytes of an MCAP file; no content of the bytes raises."""
+    result = Scan(data)
     position = len(MCAP0_MAGIC) if data[: len(MCAP0_MAGIC)] == MCAP0_MAGIC else 0
     while position < len(data):
-        if found.complete and data[position : position + 99] == MCAP0_MAGIC:
-            return found
-        size = 0 if found.complete else _take(found, position)
+        if result.complete and data[position : position + 99] == MCAP0_MAGIC:
+            return result
+        size = 0 if result.complete else _take(result, position)
         if size == 0:
-            found.complete = False
+            result.complete = False
             following = _next_proven(data, position + 1)
-            found.damaged_places += 1
-            found.bytes_dropped += following - position
+            result.damaged_places += 1
+            result.bytes_dropped += following - position
             position = following
         position += size
-    found.complete = False
-    return found
+    result.complete = False
+    return result
 
 
-def _take(found: Scan, position: int) -> int:
+def _take(result: Scan, position: int) -> int:
     """Note the record at ``position``; its whole size, or 0 where it is not sound."""
-    data = found.data
+    data = result.data
     if position + _HEAD.size > len(data):
         return 0
     opcode, length = _HEAD.unpack_from(data, position)
     start = position + _HEAD.size
     if start + length > len(data):
         if opcode == Opcode.CHUNK:
-            _take_cut_chunk(found, start, length)
+            _take_cut_chunk(result, start, length)
         return 0
     record = _record(data, opcode, start, length)
     if record is None:
         return 0
     if isinstance(record, Chunk):
-        if not _take_chunk(found, record, (start, length)):
+        if not _take_chunk(result, record, (start, length)):
             return 0
     elif isinstance(record, Message):
-        found.loose.append(record)
+        result.loose.append(record)
     elif isinstance(record, Header):
-        found.library = record.library
+        result.library = record.library
     elif isinstance(record, (Schema, Channel)):
-        found.define(record, verified=False)
+        result.define(record, verified=False)
     elif isinstance(record, Metadata):
-        found.metadata.setdefault(record.name, {}).update(record.metadata)
+        result.metadata.setdefault(record.name, {}).update(record.metadata)
     elif isinstance(record, Attachment) and record.name in _ATTACHMENTS:
-        _take_copy(found, record.data)
+        _take_copy(result, record.data)
     elif isinstance(record, Footer):
-        _take_summary(found, record, start)
-    found.complete = isinstance(record, Footer)
+        _take_summary(result, record, start)
+    result.complete = isinstance(record, Footer)
     return _HEAD.size + int(length)
 
 
-def _take_copy(found: Scan, compressed: bytes) -> None:
-    """A copy of a topic's schema and channel, or of what is said of the run; the attachment's CRC
+def _take_copy(result: Scan, compressed: bytes) -> None:
+    """A copy of a topic's schema and channel, or of the facts of the run; the attachment's CRC
     was checked with the record."""
     try:
         with zstandard.ZstdDecompressor().stream_reader(compressed) as stream:
@@ -297,14 +297,14 @@ def _take_copy(found: Scan, compressed: bytes) -> None:
         return
     for record in records_inside(raw):
         if isinstance(record, (Schema, Channel)):
-            found.define(record, verified=True)
+            result.define(record, verified=True)
         elif isinstance(record, Metadata) and record.name == RUN_RECORD:
-            found.proven_run.update(record.metadata)
+            result.proven_run.update(record.metadata)
 
 
 def run_of_attachments(stream: IO[bytes], index: Iterable[Any]) -> dict[str, str]:
-    """What the attachments of an indexed file say of its run; ValueError where one is damaged."""
-    found = Scan(b"")
+    """Facts of the run in the attachments of an indexed file; ValueError where one is damaged."""
+    result = Scan(b"")
     for entry in index:
         if entry.name != RUN_ATTACHMENT:
             continue
@@ -312,26 +312,26 @@ def run_of_attachments(stream: IO[bytes], index: Iterable[Any]) -> dict[str, str
         body = stream.read(min(entry.length - _HEAD.size, RECORD_MAX))
         attachment = _record(body, Opcode.ATTACHMENT, 0, len(body))
         if attachment is None:
-            raise ValueError("what it says of its run has a wrong CRC")
-        _take_copy(found, attachment.data)
-    return found.proven_run
+            raise ValueError("the facts of the run have a wrong CRC")
+        _take_copy(result, attachment.data)
+    return result.proven_run
 
 
-def _take_summary(found: Scan, footer: Any, start: int) -> None:
-    """What the index repeats is proven where its CRC is right."""
+def _take_summary(result: Scan, footer: Any, start: int) -> None:
+    """Records that the index repeats are proven if its CRC is right."""
     end = start + 16  # of what the CRC covers: all of the footer but the CRC itself
     first = footer.summary_start
     if not footer.summary_crc or not 0 < first < end or end - first > RECORD_MAX:
         return
-    summary = found.data[first:end]
+    summary = result.data[first:end]
     if zlib.crc32(summary) != footer.summary_crc:
         return
     for record in records_inside(summary):
         if isinstance(record, (Schema, Channel)):
-            found.define(record, verified=True)
+            result.define(record, verified=True)
 
 
-def _take_chunk(found: Scan, chunk: Any, place: tuple[int, int]) -> bool:
+def _take_chunk(result: Scan, chunk: Any, extent: tuple[int, int]) -> bool:
     try:
         raw = unpack(chunk)
     except ValueError:
@@ -339,26 +339,26 @@ def _take_chunk(found: Scan, chunk: Any, place: tuple[int, int]) -> bool:
     verified = bool(chunk.uncompressed_crc)
     for record in records_inside(raw):
         if isinstance(record, (Schema, Channel)):
-            found.define(record, verified)
-    found.blocks.append((place, verified))
+            result.define(record, verified)
+    result.blocks.append((extent, verified))
     return True
 
 
-def _take_cut_chunk(found: Scan, start: int, length: int) -> None:
+def _take_cut_chunk(result: Scan, start: int, length: int) -> None:
     """Keep the whole messages of a last, uncompressed chunk that the end of the file cuts."""
     fixed = struct.Struct("<QQQII")
-    if len(found.data) - start < fixed.size + 8 or length > RECORD_MAX:
+    if len(result.data) - start < fixed.size + 8 or length > RECORD_MAX:
         return
-    body = found.data[start:]
+    body = result.data[start:]
     size, compression = fixed.unpack_from(body)[2], fixed.unpack_from(body)[4]
     (stored,) = struct.unpack_from("<Q", body, fixed.size)
     if compression != 0 or stored != size or length != fixed.size + 8 + size:
         return
     for record in records_inside(body[fixed.size + 8 :]):
         if isinstance(record, (Schema, Channel)):
-            found.define(record, verified=False)
+            result.define(record, verified=False)
         elif isinstance(record, Message):
-            found.blocks.append((record, False))
+            result.blocks.append((record, False))
 
 
 def summary_is_sound(file: Path) -> bool:

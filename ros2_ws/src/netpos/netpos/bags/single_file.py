@@ -1,7 +1,7 @@
-"""The short way into a bag folder of one indexed MCAP file, the ordinary case.
+"""Fast opening of a bag folder with one indexed MCAP file, the ordinary case.
 
 rosbags reads metadata.yaml, and the profiles of each topic, with a YAML parser written in Python,
-which takes as long as reading ten seconds of measurements. Whatever is not as usual is left to
+which takes as long as reading ten seconds of measurements. Any other folder is left to
 rosbags, which also says what is wrong.
 """
 
@@ -25,21 +25,21 @@ class SingleFile:
     metadata.yaml; ``channels``: names by channel; ``start_ns`` and ``end_ns`` of the messages;
     ``custom``: what metadata.yaml holds of the run.
 
-    Raises nearly anything where the folder is not as usual.
+    Raises nearly any exception for other folders.
     """
 
     def __init__(self, folder: Path) -> None:
         text = (folder / layout.METADATA_FILE).read_text(encoding="utf-8")
-        found = load_yaml(text)["rosbag2_bagfile_information"]
-        (name,) = found["relative_file_paths"]
-        plain = found["storage_identifier"] == "mcap" and not found["compression_mode"]
-        _require(plain and found["version"] <= layout.VERSION)
-        self.custom: dict[str, Any] = found["custom_data"] or {}
+        description = load_yaml(text)["rosbag2_bagfile_information"]
+        (name,) = description["relative_file_paths"]
+        plain = description["storage_identifier"] == "mcap" and not description["compression_mode"]
+        _require(plain and description["version"] <= layout.VERSION)
+        self.custom: dict[str, Any] = description["custom_data"] or {}
         self.file = folder / Path(name).name
         self.bio = self.file.open("rb")
         try:
             self._index()
-            self._order(found)
+            self._order(description)
         except BaseException:
             self.bio.close()
             raise
@@ -68,18 +68,18 @@ class SingleFile:
                 schema.data.decode(),
             )
 
-    def _order(self, found: dict[str, Any]) -> None:
+    def _order(self, description: dict[str, Any]) -> None:
         """Put the topics in the order of metadata.yaml, which has to promise what is there."""
         promised = {}
-        for entry in found["topics_with_message_count"]:
+        for entry in description["topics_with_message_count"]:
             topic = entry["topic_metadata"]
             profiles = parse_qos(topic["offered_qos_profiles"])
             promised[topic["name"]] = (topic["type"], entry["message_count"], profiles)
-        _require(promised == {name: told[:3] for name, told in self.topics.items()})
-        start_ns = found["starting_time"]["nanoseconds_since_epoch"]
-        span = start_ns, start_ns + found["duration"]["nanoseconds"]
+        _require(promised == {name: info[:3] for name, info in self.topics.items()})
+        start_ns = description["starting_time"]["nanoseconds_since_epoch"]
+        span = start_ns, start_ns + description["duration"]["nanoseconds"]
         _require(span == (self.start_ns, self.end_ns))
-        _require(found["message_count"] == self.message_count)
+        _require(description["message_count"] == self.message_count)
         self.topics = {name: self.topics[name] for name in promised}
 
     def close(self) -> None:
@@ -93,7 +93,7 @@ def _require(usual: bool) -> None:
 
 
 def open_single_file(folder: Path) -> SingleFile | None:
-    """The one file of a folder; None where rosbags has to look."""
+    """The only file of a folder; None where rosbags has to open it."""
     try:
         return SingleFile(folder)
     except Exception:  # damaged bytes raise nearly anything

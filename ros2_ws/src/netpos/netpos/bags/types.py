@@ -99,16 +99,16 @@ def _text_of(type_name: str) -> str:
 @cache
 def _gather(type_name: str) -> tuple[tuple[str, str], ...]:
     """(type name, text of its .msg) of a type and all it is made of, the type itself first."""
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     waiting = [type_name]
     while waiting:
         name = waiting.pop(0)
-        if name in found:
+        if name in texts:
             continue
-        found[name] = _text_of(name)
-        parsed = _parse(found[name], name)
+        texts[name] = _text_of(name)
+        parsed = _parse(texts[name], name)
         waiting.extend(_nested_types(parsed[name][1]))
-    return tuple(found.items())
+    return tuple(texts.items())
 
 
 @cache
@@ -137,11 +137,11 @@ def typestore() -> Typestore:
         raise BagError(
             f"{_OWN_PACKAGE} not found; source env.sh, which names it in AMENT_PREFIX_PATH"
         )
-    own: dict[str, Any] = {}
+    definitions: dict[str, Any] = {}
     for file in sorted(folder.glob("*.msg")):
         name = f"{_OWN_PACKAGE}/msg/{file.stem}"
-        own.update(_parse(file.read_text(encoding="utf-8"), name))
-    store.register(own)
+        definitions.update(_parse(file.read_text(encoding="utf-8"), name))
+    store.register(definitions)
     return store
 
 
@@ -163,18 +163,18 @@ def require_type(type_name: str) -> Typestore:
 
 @cache
 def store_of_definition(type_name: str, text: str) -> Typestore:
-    """A store that decodes ``type_name`` as ``text`` says: the common one where both agree."""
+    """A store that decodes ``type_name`` by the definition ``text``: the common store if equal."""
     types = _parse(text, type_name)
     try:
         common = typestore()
         common.register(types)
     except TypesysError:
-        own = get_typestore(Stores.EMPTY)
+        store = get_typestore(Stores.EMPTY)
         try:
-            own.register(types)
+            store.register(types)
         except TypesysError as error:
             raise BagError(f"the definition of {type_name} cannot be used: {error}") from error
-        return own
+        return store
     return common
 
 

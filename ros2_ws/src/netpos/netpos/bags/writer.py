@@ -183,12 +183,12 @@ class BagWriter:
         entry.count += 1
 
     def note(self, key: str, value: str) -> None:
-        """Add to the metadata what is known only now."""
+        """Add facts to the metadata that are known only now."""
         self._run[key] = value
         self._say_of_run({key: value})
 
     def _say_of_run(self, run: Mapping[str, str]) -> None:
-        """In a record that readers know, and under a checksum."""
+        """Write the facts of the run in a record that readers know, and under a checksum."""
         copy = layout.run_records(run)
         with self._writing():
             self._mcap.add_metadata(layout.RUN_RECORD, dict(run))

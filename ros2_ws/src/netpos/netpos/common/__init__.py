@@ -1,1 +1,1 @@
-"""What several rooms need and none owns: declared parameters, nonlinear least squares."""
+"""Tools that several rooms share: declared parameters, files, YAML, nonlinear least squares."""

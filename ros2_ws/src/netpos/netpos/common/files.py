@@ -1,4 +1,4 @@
-"""Files that are whole or not there, and errors that name the file."""
+"""Write files completely or not at all; errors name the file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """``OSError`` of a write does not say of which file: give it ``path``."""
+    """An ``OSError`` of a write does not name the file: add ``path`` to it."""
     try:
         yield
     except OSError as error:
@@ -21,10 +21,10 @@ def naming(path: Path) -> Iterator[None]:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Where to write what becomes ``path``: a file beside it, which takes its place at the end.
+    """A temporary file beside ``path`` to write to; it replaces ``path`` at the end.
 
-    A write that fails leaves ``path`` as it was. The suffix is that of ``path``. What is no
-    regular file, such as ``/dev/stdout``, is written itself. Folders that lack are made.
+    A write that fails leaves ``path`` as it was. The suffix is that of ``path``. A path that
+    is not a regular file, such as ``/dev/stdout``, is written directly. Missing folders are made.
 
     Raises
     ------
@@ -53,12 +53,12 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def _settle(draft: Path) -> None:
-    """See it on the disk: some file systems report a full one only then."""
+    """Flush it to the disk: some file systems report a full disk only then."""
     with draft.open("rb") as stream:
         os.fsync(stream.fileno())
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text that is whole or not there; raises as ``whole_file``."""
+    """Write a text completely or not at all; raises as ``whole_file``."""
     with whole_file(path) as draft:
         draft.write_text(text, encoding="utf-8")

@@ -15,7 +15,7 @@ _LEAST = 1e-9
 
 
 class FaultsError(ValueError):
-    """One complaint or several, a line each."""
+    """One or several errors, one line each."""
 
 
 def real(default: float, low: float, high: float, text: str) -> Any:
@@ -24,12 +24,12 @@ def real(default: float, low: float, high: float, text: str) -> Any:
 
 
 def positive(default: float, text: str) -> Any:
-    """A number above 0 whose size nothing else limits."""
+    """A number above 0 without an upper limit."""
     return real(default, _LEAST, 1.0 / _LEAST, text)
 
 
 def not_negative(default: float, text: str) -> Any:
-    """A number not below 0 whose size nothing else limits."""
+    """A number >= 0 without an upper limit."""
     return real(default, 0.0, 1.0 / _LEAST, text)
 
 
@@ -51,7 +51,7 @@ def choice(default: str, choices: tuple[str, ...], text: str) -> Any:
 def described_fields(config: type[Any]) -> list[tuple[str, str, str]]:
     """Name, range or choices, and meaning of each parameter of a configuration; no choices where
     the meaning names them."""
-    found = []
+    described = []
     for entry in fields(config):
         about = entry.metadata
         if "choices" in about:
@@ -63,8 +63,8 @@ def described_fields(config: type[Any]) -> list[tuple[str, str, str]]:
             limits = "true or false"
         else:
             limits = "text" if isinstance(entry.default, str) else "numbers"
-        found.append((entry.name, limits, about["text"]))
-    return found
+        described.append((entry.name, limits, about["text"]))
+    return described
 
 
 def check_fields(config: Any, prefix: str = "") -> None:
@@ -97,8 +97,8 @@ def from_mapping(config: type[Config], values: Mapping[str, Any], what: str) -> 
     known = [entry.name for entry in fields(config)]  # type: ignore[arg-type]
     unknown = [name for name in values if name not in known]
     if unknown:
-        told = [f"unknown {what} parameter {name!r}{nearest(name, known)}" for name in unknown]
-        raise FaultsError("\n".join(told))
+        messages = [f"unknown {what} parameter {name!r}{nearest(name, known)}" for name in unknown]
+        raise FaultsError("\n".join(messages))
     plain = config()
     return config(**{name: typed(name, getattr(plain, name), v) for name, v in values.items()})
 
@@ -120,9 +120,9 @@ def typed(name: str, default: Any, value: Any) -> Any:
             raise ValueError(value)
         if kind is tuple:
             return tuple(typed(name, 0.0, number) for number in value)
-        made = kind(value)
-        if kind is int and made != float(value):
+        converted = kind(value)
+        if kind is int and converted != float(value):
             raise ValueError(value)
-        return made
+        return converted
     except (TypeError, ValueError):
         raise ValueError(f"{name} must be of type {kind.__name__}, got {value!r}") from None

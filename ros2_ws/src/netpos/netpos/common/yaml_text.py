@@ -1,7 +1,7 @@
-"""The one way to read YAML: fast, plain values only, and nothing that was made to hang a reader.
+"""The only way to read YAML: fast, plain values only, with limits against hostile documents.
 
-A few lines with aliases of aliases describe more values than memory holds, deep nesting ends the
-stack, and both come with bags and scenarios of others.
+A few lines with aliases of aliases describe more values than fit into memory, and deep nesting
+overflows the stack. Bags and scenarios of others may contain both.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ class YamlError(ValueError):
 
 
 def read_text(file: Path) -> str:
-    """The text of a file that is to be read as YAML.
+    """The text of a YAML file.
 
-    Raises ``YamlError`` for one that is no regular file, too large or not UTF-8.
+    Raises ``YamlError`` for one that is not a regular file, too large or not UTF-8.
     """
     if not file.is_file():
-        raise YamlError(f"{file} is no regular file")
+        raise YamlError(f"{file} is not a regular file")
     size = file.stat().st_size
     if size > 4 * SIZE_MAX:  # bytes of a character in UTF-8
         raise YamlError(f"{size} bytes; at most {SIZE_MAX} characters are read")
@@ -46,14 +46,14 @@ def read_text(file: Path) -> str:
 def load_yaml(text: str) -> Any:
     """Plain values of a document.
 
-    Raises ``YamlError`` for what is no YAML, holds tags that stand for objects, or exceeds the
+    Raises ``YamlError`` for a text that is no YAML, holds tags of objects, or exceeds the
     limits of size, depth and number of values.
     """
     check_limits(text)
     try:
         return yaml.load(text, Loader=_FAST)
     except yaml.YAMLError as error:
-        raise _told(error) from error
+        raise _yaml_error(error) from error
     except (ValueError, OverflowError) as error:  # a date or a number that there is not
         raise YamlError(f"not valid YAML: {error}") from error
 
@@ -64,7 +64,7 @@ def compose_yaml(text: str, loader: Any) -> yaml.Node | None:
     try:
         return yaml.compose(text, loader)
     except yaml.YAMLError as error:
-        raise _told(error) from error
+        raise _yaml_error(error) from error
 
 
 def check_limits(text: str) -> None:
@@ -97,10 +97,10 @@ def check_limits(text: str) -> None:
             if open_values[-1] > VALUES_MAX:
                 raise YamlError(f"more than {VALUES_MAX} values, aliases followed", line)
     except yaml.YAMLError as error:
-        raise _told(error) from error
+        raise _yaml_error(error) from error
 
 
-def _told(error: yaml.YAMLError) -> YamlError:
+def _yaml_error(error: yaml.YAMLError) -> YamlError:
     mark = getattr(error, "problem_mark", None)
     problem = getattr(error, "problem", None) or " ".join(str(error).split())
     return YamlError(f"not valid YAML: {problem}", None if mark is None else mark.line + 1)

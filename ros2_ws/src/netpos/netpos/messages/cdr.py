@@ -1,7 +1,7 @@
-"""Values straight from and to the bytes of their messages (little-endian XCDR1).
+"""Convert values directly from and to the bytes of their messages (little-endian XCDR1).
 
-The short way of what ``netpos.messages.codec`` and a serialiser of whole messages do, with the
-same result, for what comes and goes many times a second.
+Gives the same result as ``netpos.messages.codec`` with a serialiser of whole messages, but faster,
+for the messages that come many times a second.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def _sequence(code: str, values: Sequence[Any], phase: int) -> bytes:
 
 
 class Layout:
-    """How the fields of a message type lie in its bytes, however long its strings are.
+    """Positions of the fields of a message type in its bytes, for strings of any length.
 
     ``items`` are its fields without nesting, in the order of the definition: a code of the module
     ``struct``, an array of them (``"36d"``, as bytes), ``"string"``, or a sequence (``"Q[]"``).
@@ -127,10 +127,10 @@ class Layout:
             return None
         known = self._ends.get(len(cdr))
         if known is not None:
-            at, last = known
-            middle = self._middles.get(cdr[4 + self._first.size : at])
+            last_start, last = known
+            middle = self._middles.get(cdr[4 + self._first.size : last_start])
             if middle is not None:
-                return self._first.unpack_from(cdr, 4), middle, last.unpack_from(cdr, at)
+                return self._first.unpack_from(cdr, 4), middle, last.unpack_from(cdr, last_start)
         values = self._walk(cdr)
         if values is None:
             return None

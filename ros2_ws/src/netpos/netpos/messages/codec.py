@@ -35,7 +35,7 @@ from netpos.messages.values import (
 
 
 def _time_difference(msg: Any) -> dict[str, Any]:
-    """What a RsuMeasurement says of a TDOA; nothing where it was recorded before there was one."""
+    """The TDOA of a RsuMeasurement; nothing in recordings older than this field."""
     if not hasattr(msg, "tdoa"):
         return {}
     return {
@@ -46,7 +46,7 @@ def _time_difference(msg: Any) -> dict[str, Any]:
 
 
 class Codec(CommonCodec):
-    """Builds and reads all messages of netpos: its own, and those of common_interfaces."""
+    """Builds and reads all messages of netpos: netpos_msgs and those of common_interfaces."""
 
     def beacon_to_msg(self, beacon: Beacon) -> Any:
         """netpos_msgs/Beacon."""
@@ -288,7 +288,7 @@ class Codec(CommonCodec):
 
 
 def _modes(msg: Any) -> tuple[TrackMode, ...]:
-    """Modes of a netpos_msgs/TrackStatus; recordings may be older than that."""
+    """Modes of a netpos_msgs/TrackStatus; older recordings have none."""
     if not hasattr(msg, "mode_weights"):
         return ()
     columns = (msg.mode_weights, msg.mode_x, msg.mode_y)
@@ -299,7 +299,7 @@ def _modes(msg: Any) -> tuple[TrackMode, ...]:
 
 
 def _step_calibration(msg: Any) -> StepCalibration:
-    """What a netpos_msgs/TrackStatus says of the steps; recordings may be older than that."""
+    """The step calibration of a netpos_msgs/TrackStatus; older recordings have none."""
     if not hasattr(msg, "step_length_factor"):
         return StepCalibration()
     return StepCalibration(

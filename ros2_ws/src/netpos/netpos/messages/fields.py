@@ -36,7 +36,7 @@ def stamp_ns(time: Any) -> int:
 
 
 def malformed_nanosec(stamp_ns: int) -> int | None:
-    """The ``nanosec`` of a Time that is none; None for a stamp."""
+    """The ``nanosec`` of an invalid Time; None for a valid stamp."""
     return _MALFORMED_NS - stamp_ns if stamp_ns <= _MALFORMED_NS - NS else None
 
 
@@ -48,7 +48,7 @@ def stamp_fault(stamp_ns: int) -> str | None:
 
 
 def certain_stamp_ns(time: Any) -> int:
-    """``stamp_ns`` for messages that nobody else judges; ValueError for a Time that is none."""
+    """``stamp_ns`` for messages that are checked nowhere else; ValueError for an invalid Time."""
     ns = stamp_ns(time)
     nanosec = malformed_nanosec(ns)
     if nanosec is not None:
@@ -57,7 +57,7 @@ def certain_stamp_ns(time: Any) -> int:
 
 
 def bad_stamp(nanosec: int) -> str:
-    """Sentence about a Time that is none."""
+    """Sentence about an invalid Time."""
     return f"header.stamp.nanosec is {nanosec}; send one below {NS}"
 
 

@@ -71,16 +71,16 @@ def path_of(vue_id: str, network: str = "") -> str:
 def split(topic: str) -> tuple[str, str]:
     """Device and name of a device's topic; ("", topic) for any other."""
     parts = topic.strip("/").split("/")
-    found = len(parts) == 2 and parts[0] not in _NO_DEVICES
-    return (parts[0], parts[1]) if found else ("", topic)
+    is_of_device = len(parts) == 2 and parts[0] not in _NO_DEVICES
+    return (parts[0], parts[1]) if is_of_device else ("", topic)
 
 
 def split_network(topic: str) -> tuple[str, str, str]:
     """Network, device and name of a device's topic below a network's; ("", "", topic) for any
     other."""
     parts = topic.strip("/").split("/")
-    found = len(parts) == 4 and parts[0] == NETWORKS
-    return (parts[1], parts[2], parts[3]) if found else ("", "", topic)
+    is_of_network = len(parts) == 4 and parts[0] == NETWORKS
+    return (parts[1], parts[2], parts[3]) if is_of_network else ("", "", topic)
 
 
 def is_tracker_output(topic: str) -> bool:

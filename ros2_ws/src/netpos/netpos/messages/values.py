@@ -1,4 +1,4 @@
-"""What flows between the parts of netpos, as plain values.
+"""Plain values that the parts of netpos exchange.
 
 Stamps are integer nanoseconds of network time. Positions are metres in ``map`` (east, north, up),
 angles radians. Nobody changes a value that exists; what streams is not frozen all the same, as
@@ -47,7 +47,7 @@ class TrackState(IntEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RsuInfo:
-    """A roadside unit: where it is, which way it looks, which slow errors it has.
+    """A roadside unit: position, orientation, slow errors.
 
     position : (3,) m in ``frame_id``; quaternion : (4,) x y z w, RSU axes (x boresight, y left, z
         up) to it.

@@ -125,14 +125,16 @@ def test_an_index_that_does_not_fit_is_damage(tmp_path: Path, damage: str) -> No
     with BagReader(file) as reader:
         (chunk,) = reader._reader.storage.chunks
         assert len(list(reader.messages())) == 3
-    ((_, at),) = chunk.message_index_offsets.items()
-    place = {"opcode": at, "channel": at + 9}.get(damage, at + 15 + 8)
+    ((_, index_start),) = chunk.message_index_offsets.items()
+    damaged_byte = {"opcode": index_start, "channel": index_start + 9}.get(
+        damage, index_start + 15 + 8
+    )
     data = bytearray(file.read_bytes())
-    data[place] ^= 1
+    data[damaged_byte] ^= 1
     if damage == "beyond":
-        data[place + 6] = 1
+        data[damaged_byte + 6] = 1
     if damage == "twice":
-        data[place : place + 8] = data[place + 16 : place + 24]
+        data[damaged_byte : damaged_byte + 8] = data[damaged_byte + 16 : damaged_byte + 24]
     file.write_bytes(data)
     with BagReader(file) as reader, pytest.raises(BagError, match="netpos recover"):
         list(reader.messages())

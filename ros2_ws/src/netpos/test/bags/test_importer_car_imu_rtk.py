@@ -72,10 +72,10 @@ def test_an_import_is_a_bag_of_stations_imu_and_truth(tmp_path: Path) -> None:
     folder = write(tmp_path / "run")
     counts = import_car_drive(folder, tmp_path / "bag", fewest=2, nearest=2, seed=4)
     drive = load_car_drive(folder)
-    made = station_drive(drive, fewest=2, nearest=2, seed=4)
+    simulated = station_drive(drive, fewest=2, nearest=2, seed=4)
     assert counts == {
-        "/rsu/info": len(made.stations),
-        "/rsu/measurements": 2 * len(made.stamps_ns),
+        "/rsu/info": len(simulated.stations),
+        "/rsu/measurements": 2 * len(simulated.stamps_ns),
         "/vue_1/imu": len(drive.imu_ns),
         "/vue_1/ground_truth": len(drive.rtk_ns),
     }
@@ -85,7 +85,7 @@ def test_an_import_is_a_bag_of_stations_imu_and_truth(tmp_path: Path) -> None:
             codec().measurement_from_msg(entry.message)
             for entry in bag.messages(["/rsu/measurements"])
         ]
-    assert {m.stamp_ns for m in measured} == set(made.stamps_ns.tolist())
+    assert {m.stamp_ns for m in measured} == set(simulated.stamps_ns.tolist())
     assert all(m.lever_arm == pytest.approx((0.0, 0.05, 0.0)) for m in measured)
     with pytest.raises(FileExistsError):
         import_car_drive(folder, tmp_path / "bag")
@@ -143,9 +143,9 @@ def test_the_real_recording() -> None:
         np.unwrap(np.arctan2(velocity[moving, 1], velocity[moving, 0])), t[moving]
     )
     turned = np.cumsum(drive.rates[:, 2] * 0.01)
-    at = (drive.imu_ns - drive.rtk_ns[0]) / 1e9
+    imu_s = (drive.imu_ns - drive.rtk_ns[0]) / 1e9
     rate = (
-        np.interp(t[moving] + 0.25, at, turned) - np.interp(t[moving] - 0.25, at, turned)
+        np.interp(t[moving] + 0.25, imu_s, turned) - np.interp(t[moving] - 0.25, imu_s, turned)
     ) / 0.5
     steady = np.abs(course) < 1.0
     assert np.corrcoef(rate[steady], course[steady])[0, 1] > 0.98

@@ -150,14 +150,14 @@ def test_real_recording(tmp_path: Path) -> None:
     places = {info.rsu_id: info.position for info in infos}
     spreads, bare = [], []
     for link, anchor in places.items():
-        own = [m for m in measured[::5] if m.rsu_id == link]
-        at = np.array([m.stamp_ns for m in own])
-        p = np.column_stack([np.interp(at, stamps, track[:, axis]) for axis in range(3)])
-        turn = np.interp(at, stamps, yaw)
+        of_link = [m for m in measured[::5] if m.rsu_id == link]
+        stamp_ns = np.array([m.stamp_ns for m in of_link])
+        p = np.column_stack([np.interp(stamp_ns, stamps, track[:, axis]) for axis in range(3)])
+        turn = np.interp(stamp_ns, stamps, yaw)
         x, y, z = TAGS_M[int(link[-1])]
         c, s = np.cos(turn), np.sin(turn)
-        arm = np.column_stack([c * x - s * y, s * x + c * y, np.full(len(at), z)])
-        ranges = np.array([m.range_m for m in own])
+        arm = np.column_stack([c * x - s * y, s * x + c * y, np.full(len(stamp_ns), z)])
+        ranges = np.array([m.range_m for m in of_link])
         error = ranges - np.linalg.norm(p + arm - anchor, axis=1)
         assert 0.0 < np.median(error) < 0.5
         spreads.append(error.std())

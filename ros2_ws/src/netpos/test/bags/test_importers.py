@@ -129,9 +129,9 @@ def test_a_person_stands_at_a_corner_until_departure(tmp_path: Path) -> None:
     import_ble_aoa(ble_folder(tmp_path / "ble", truth=corners), tmp_path / "bag")
     _, _, truth = values(tmp_path / "bag")
     assert [t.stamp_ns // 10**6 for t in truth] == [*range(1000, 1801, 100)]
-    place = np.array([t.position[:2] for t in truth])
-    np.testing.assert_allclose(place[:, 0], [0, 0.5, 1, 1, 1, 1, 1, 1, 1], atol=1e-12)
-    np.testing.assert_allclose(place[:, 1], [0, 0, 0, 0, 0, 0, 0, 0.5, 1], atol=1e-12)
+    positions = np.array([t.position[:2] for t in truth])
+    np.testing.assert_allclose(positions[:, 0], [0, 0.5, 1, 1, 1, 1, 1, 1, 1], atol=1e-12)
+    np.testing.assert_allclose(positions[:, 1], [0, 0, 0, 0, 0, 0, 0, 0.5, 1], atol=1e-12)
     speeds = [t.linear_velocity[0] for t in truth]
     assert speeds == pytest.approx([5, 5, 0, 0, 0, 0, 5, 5, 5])
 
@@ -248,7 +248,7 @@ def residuals(bag: Path) -> dict[str, Array]:
             azimuth = math.remainder(m.azimuth_rad - math.atan2(y, x), math.tau)
             elevation = m.elevation_rad - math.atan2(z, math.hypot(x, y))
             rows[m.rsu_id].append((azimuth, elevation, m.range_m - float(np.linalg.norm(ray))))
-    return {rsu_id: np.array(found) for rsu_id, found in rows.items()}
+    return {rsu_id: np.array(errors) for rsu_id, errors in rows.items()}
 
 
 @pytest.mark.parametrize(

@@ -41,21 +41,21 @@ def test_one_measurement_a_line(tmp_path: Path, sign: str, name: str) -> None:
     columns = Columns.parse(
         "time=t,rsu=anchor,range=dist,rssi=power", "time=ms,range=mm", "range=100"
     )
-    _, found, _, counts = written(tmp_path, text.replace(",", sign), columns, name)
-    assert [(m.stamp_ns, m.rsu_id, m.range_m, m.rssi_dbm) for m in found] == [
+    _, measured, _, counts = written(tmp_path, text.replace(",", sign), columns, name)
+    assert [(m.stamp_ns, m.rsu_id, m.range_m, m.rssi_dbm) for m in measured] == [
         (1_000_000_000, "a1", 2.5, -70.0),
         (1_001_500_000, "5", 3.0, 0.0),
     ]
-    assert all(m.fields == Field.RANGE for m in found)
-    assert [m.range_var for m in found] == pytest.approx([0.01, 0.01])
+    assert all(m.fields == Field.RANGE for m in measured)
+    assert [m.range_var for m in measured] == pytest.approx([0.01, 0.01])
     assert counts["RSSI not finite, taken as not measured"] == 1
 
 
 def test_a_column_for_each_rsu_and_no_header(tmp_path: Path) -> None:
     columns = Columns.parse("time=1,range:a1=2,range:a2=3", sd="range=0.1")
     text = "1,3,4\n2,,4.5\n3,3.5,nan\n"
-    _, found, _, counts = written(tmp_path, text, columns)
-    assert [(m.stamp_ns, m.rsu_id, m.range_m, m.expected) for m in found] == [
+    _, measured, _, counts = written(tmp_path, text, columns)
+    assert [(m.stamp_ns, m.rsu_id, m.range_m, m.expected) for m in measured] == [
         (10**9, "a1", 3.0, 2),
         (10**9, "a2", 4.0, 2),
         (2 * 10**9, "a2", 4.5, 1),
@@ -96,8 +96,8 @@ PLAIN = Columns.parse("time=1,rsu=2,range=3", sd="range=0.1")
 
 @pytest.mark.parametrize("text", ["1,a1,2\n2,a1,3\n3,a", "9,a\n1,a1,2\n2,a1,3\n"])
 def test_a_cut_first_or_last_line_is_skipped_and_counted(tmp_path: Path, text: str) -> None:
-    _, found, _, counts = written(tmp_path, text, PLAIN)
-    assert [m.range_m for m in found] == [2.0, 3.0]
+    _, measured, _, counts = written(tmp_path, text, PLAIN)
+    assert [m.range_m for m in measured] == [2.0, 3.0]
     assert counts["cut first or last lines"] == 1
     with BagReader(tmp_path / "bag") as bag:
         assert bag.metadata["skipped"] == "cut first or last lines 1"
@@ -121,14 +121,14 @@ def test_a_bad_line_is_named_or_skipped_and_counted(
     text = f"1,a1,2\n{line}\n3,a1,3\n"
     with pytest.raises(BagError, match=message):
         written(tmp_path, text, PLAIN)
-    _, found, _, counts = written(tmp_path, text, PLAIN, skip_bad_lines=True)
-    assert [m.range_m for m in found] == [2.0, 3.0]
+    _, measured, _, counts = written(tmp_path, text, PLAIN, skip_bad_lines=True)
+    assert [m.range_m for m in measured] == [2.0, 3.0]
     assert counts["lines that cannot be understood"] == 1
 
 
 def test_a_file_out_of_order_is_sorted_when_asked(tmp_path: Path) -> None:
-    _, found, _, _ = written(tmp_path, "1,a1,2\n4,a1,4\n3,a1,3\n", PLAIN, any_order=True)
-    assert [m.range_m for m in found] == [2.0, 3.0, 4.0]
+    _, measured, _, _ = written(tmp_path, "1,a1,2\n4,a1,4\n3,a1,3\n", PLAIN, any_order=True)
+    assert [m.range_m for m in measured] == [2.0, 3.0, 4.0]
 
 
 @pytest.mark.parametrize(
@@ -199,8 +199,8 @@ def walk(n: int = 60) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
 
 def ranges_of_walk() -> str:
     lines = []
-    for t, place in zip(*walk(), strict=True):
-        d = [np.linalg.norm(place - info.position) for info in RSUS]
+    for t, position in zip(*walk(), strict=True):
+        d = [np.linalg.norm(position - info.position) for info in RSUS]
         lines.append(",".join(f"{v:.6f}" for v in (t, *d)))
     return "\n".join(lines) + "\n"
 
@@ -213,17 +213,17 @@ def test_truth_with_axes_and_a_clock_of_its_own(tmp_path: Path, way: Any) -> Non
     angle = math.radians(25.0) if way == "rigid" else 0.0
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     times, places = walk()
-    own = (places[:, :2] - [3.0, -4.0]) @ turn  # map = turn @ own + (3, -4)
+    surveyed = (places[:, :2] - [3.0, -4.0]) @ turn  # map = turn @ own + (3, -4)
     truth = tmp_path / "truth.csv"
-    rows = "\n".join(f"{t - 77.3},{x},{y}" for t, (x, y) in zip(times, own, strict=True))
+    rows = "\n".join(f"{t - 77.3},{x},{y}" for t, (x, y) in zip(times, surveyed, strict=True))
     truth.write_text("t,x,y\n" + rows + "\n")
     columns = TruthColumns.parse("time=t,x=x,y=y")
     asked = Truth(source=truth, columns=columns, offset_s=None, align=way, height_m=1.0)
     _, _, poses, _ = written(tmp_path, ranges_of_walk(), WALK, truth=asked)
     stamps = np.array([pose.stamp_ns for pose in poses]) / 1e9
     expected = np.column_stack([np.interp(stamps, times, places[:, axis]) for axis in range(2)])
-    found = np.array([pose.position[:2] for pose in poses])
-    assert np.abs(found - expected).max() < 0.03
+    positions = np.array([pose.position[:2] for pose in poses])
+    assert np.abs(positions - expected).max() < 0.03
     with BagReader(tmp_path / "bag") as bag:
         sentence = bag.metadata["truth_alignment"]
     assert f"turned {math.degrees(angle):.0f}." in sentence or way == "rigid"
@@ -275,9 +275,9 @@ def ros1_bag(path: Path) -> Path:
         for i in range(3):
             stamp = types["builtin_interfaces/msg/Time"](sec=5, nanosec=i * 10**8)
             header = types["std_msgs/msg/Header"](seq=i, stamp=stamp, frame_id="")
-            place = types["geometry_msgs/msg/Point"](x=1.0 + i % 2, y=2.0, z=3.0)
+            point = types["geometry_msgs/msg/Point"](x=1.0 + i % 2, y=2.0, z=3.0)
             distances = np.array([4.0 + i, 9.0], dtype=np.float32)
-            message = types["uwb/msg/Range"](header=header, to=i % 2, place=place, d=distances)
+            message = types["uwb/msg/Range"](header=header, to=i % 2, place=point, d=distances)
             raw = store.serialize_ros1(message, "uwb/msg/Range")
             bag.write(connection, 6 * 10**9 + i, raw)
     return path
@@ -291,12 +291,12 @@ def test_a_ros_1_bag_with_a_type_of_its_own(tmp_path: Path) -> None:
     )
     counts = import_ros(source, tmp_path / "bag", columns, "/uwb", [])
     assert counts == {"/rsu/info": 2, "/rsu/measurements": 3}
-    infos, found, _ = values(tmp_path / "bag")
+    infos, measured, _ = values(tmp_path / "bag")
     assert {info.rsu_id: info.position.tolist() for info in infos} == {
         "0": [1.0, 2.0, 3.0],
         "1": [2.0, 2.0, 3.0],
     }
-    assert [(m.stamp_ns, m.rsu_id, m.range_m) for m in found] == [
+    assert [(m.stamp_ns, m.rsu_id, m.range_m) for m in measured] == [
         (5_000_000_000, "0", 4.0),
         (5_100_000_000, "1", 5.0),
         (5_200_000_000, "0", 6.0),
@@ -323,9 +323,11 @@ def test_a_real_ros_1_bag(tmp_path: Path) -> None:
     data = recordings("uwb_ranging")
     if data is None:
         pytest.skip("uwb_ranging is not there; set NETPOS_DATA to the folder of the recordings")
-    place = "rsu_x=responder_location.x,rsu_y=responder_location.y,rsu_z=responder_location.z"
+    position_columns = (
+        "rsu_x=responder_location.x,rsu_y=responder_location.y,rsu_z=responder_location.z"
+    )
     columns = Columns.parse(
-        f"time=header.stamp,rsu=responder_id,range=distance,{place}", sd="range=0.1"
+        f"time=header.stamp,rsu=responder_id,range=distance,{position_columns}", sd="range=0.1"
     )
     truth = Truth(
         source="/vicon_xb/viconPoseTopic",

@@ -127,11 +127,11 @@ def test_payload_that_does_not_fit_its_type(tmp_path: Path) -> None:
 def say(bag: BagWriter, key: str, value: str) -> None:
     """A node says how it runs."""
     store, name = get_typestore(Stores.ROS2_JAZZY), "diagnostic_msgs/msg/KeyValue"
-    said = store.types[name](key=key, value=value)
-    bag.write_raw(RUN_ESTIMATOR, name, bytes(store.serialize_cdr(said, name)), 1)
+    message = store.types[name](key=key, value=value)
+    bag.write_raw(RUN_ESTIMATOR, name, bytes(store.serialize_cdr(message, name)), 1)
 
 
-def test_facts_are_those_of_the_metadata_and_those_that_nodes_said(tmp_path: Path) -> None:
+def test_facts_are_those_of_the_metadata_and_of_the_topics_of_nodes(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "run", metadata={"seed": "3", "tracker": "a: 1"}) as bag:
         say(bag, "fusion", "b: 2")
         say(bag, "tracker", "a: 1")

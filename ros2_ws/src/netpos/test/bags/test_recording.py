@@ -50,9 +50,9 @@ def test_any_order_goes_in_and_beacons_are_numbered(tmp_path: Path) -> None:
         metadata={"source": "a test"},
     )
     assert counts == {"/rsu/info": 2, "/rsu/measurements": 3, "/vue_1/ground_truth": 2}
-    infos, found, poses = values(tmp_path / "bag")
+    infos, messages, poses = values(tmp_path / "bag")
     assert [info.stamp_ns for info in infos] == [5, 5]
-    assert [(m.stamp_ns, m.rsu_id, m.sequence, m.expected) for m in found] == [
+    assert [(m.stamp_ns, m.rsu_id, m.sequence, m.expected) for m in messages] == [
         (10, "a", 0, 1),
         (20, "a", 1, 2),
         (20, "b", 1, 2),
@@ -66,8 +66,8 @@ def test_any_order_goes_in_and_beacons_are_numbered(tmp_path: Path) -> None:
 def test_two_devices_at_one_stamp_are_two_beacons(tmp_path: Path) -> None:
     given = [measured(20, "a", "vue_2"), measured(20, "a", "vue_1")]
     netpos.write_bag(tmp_path / "bag", rsus=RSUS, measurements=given)
-    _, found, _ = values(tmp_path / "bag")
-    assert [(m.vue_id, m.sequence, m.expected) for m in found] == [
+    _, messages, _ = values(tmp_path / "bag")
+    assert [(m.vue_id, m.sequence, m.expected) for m in messages] == [
         ("vue_1", 0, 1),
         ("vue_2", 1, 1),
     ]
@@ -78,7 +78,7 @@ def test_two_devices_at_one_stamp_are_two_beacons(tmp_path: Path) -> None:
     [
         ([], "there is no measurement"),
         ([measured(10, "c")], "no position of RSU c; give an RsuInfo of each .there are a, b"),
-        ([measured(0, "a")], "stamp 0 ns is no stamp; add a constant"),
+        ([measured(0, "a")], "stamp 0 ns is not > 0; add a constant"),
         ([measured(10, "a")] * 2, "RSU a measures vue_1 twice at stamp 10 ns"),
     ],
 )

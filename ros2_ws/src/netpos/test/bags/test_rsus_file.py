@@ -71,13 +71,13 @@ def _bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_what_was_learned_is_saved_and_serves_the_next_day(bags: Path, tmp_path: Path) -> None:
-    found = save_rsus(bags / "learned", tmp_path / "rsus.yaml")
-    assert [info.rsu_id for info in found] == ["a0", "a1", "a2", "a3", "a4"]
-    spreads = np.array([info.range_bias_sd_m for info in found])
+    saved = save_rsus(bags / "learned", tmp_path / "rsus.yaml")
+    assert [info.rsu_id for info in saved] == ["a0", "a1", "a2", "a3", "a4"]
+    spreads = np.array([info.range_bias_sd_m for info in saved])
     assert 0.1 < np.sqrt(np.mean(spreads**2)) < 0.6
-    assert all(info.bias_correlation_time_s > 3.0 for info in found)
+    assert all(info.bias_correlation_time_s > 3.0 for info in saved)
     assert load_rsus(tmp_path / "rsus.yaml", bags / "tuesday", tmp_path / "told") == [
-        info.rsu_id for info in found
+        info.rsu_id for info in saved
     ]
     nees = {}
     for source in (bags / "tuesday", tmp_path / "told"):
@@ -90,8 +90,8 @@ def test_what_was_learned_is_saved_and_serves_the_next_day(bags: Path, tmp_path:
 
 
 def test_a_file_reads_as_it_was_saved(bags: Path, tmp_path: Path) -> None:
-    found = save_rsus(bags / "learned", tmp_path / "rsus.yaml")
-    for written, read in zip(found, read_rsus(tmp_path / "rsus.yaml"), strict=True):
+    saved = save_rsus(bags / "learned", tmp_path / "rsus.yaml")
+    for written, read in zip(saved, read_rsus(tmp_path / "rsus.yaml"), strict=True):
         assert read.rsu_id == written.rsu_id
         np.testing.assert_allclose(read.position, written.position, atol=1e-6)
         assert read.range_bias_sd_m == pytest.approx(written.range_bias_sd_m, abs=1e-6)
@@ -126,7 +126,7 @@ def test_every_field_of_an_rsu_is_kept(tmp_path: Path) -> None:
             assert getattr(back, name) == getattr(info, name), name
 
 
-def test_a_copy_keeps_all_but_what_a_tracker_said(bags: Path, tmp_path: Path) -> None:
+def test_a_copy_keeps_all_but_the_output_of_a_tracker(bags: Path, tmp_path: Path) -> None:
     (tmp_path / "one.yaml").write_text("rsus: {a1: [4.5, 12.0, 3.0]}\n")
     assert load_rsus(tmp_path / "one.yaml", bags / "learned", tmp_path / "copy") == ["a1"]
     make = codec()
@@ -162,6 +162,6 @@ def test_the_commands(bags: Path, tmp_path: Path) -> None:
 
     file, copy = tmp_path / "rsus.yaml", tmp_path / "copy"
     assert netpos("rsus", "save", bags / "learned", file) == (0, f"wrote {file}: 5 RSUs\n")
-    code, said = netpos("rsus", "load", file, bags / "tuesday", copy)
-    assert (code, said) == (0, f"wrote {copy}: a0, a1, a2, a3, a4 as in {file}\n")
+    code, output = netpos("rsus", "load", file, bags / "tuesday", copy)
+    assert (code, output) == (0, f"wrote {copy}: a0, a1, a2, a3, a4 as in {file}\n")
     assert netpos("rsus", "load", file, bags / "tuesday", copy)[0] == 2

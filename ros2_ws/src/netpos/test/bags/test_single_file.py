@@ -35,16 +35,16 @@ def test_what_rosbags_tells(tmp_path: Path) -> None:
     assert file is not None
     file.close()
     with Reader(folder) as reference:
-        told = {
+        expected = {
             c.topic: (c.msgtype, c.msgcount, c.ext.offered_qos_profiles, c.msgdef.data)
             for c in reference.connections
         }
         assert list(file.topics) == [c.topic for c in reference.connections]
-        assert file.topics == told
-        assert all(qos for _, _, qos, _ in told.values())
+        assert file.topics == expected
+        assert all(qos for _, _, qos, _ in expected.values())
         assert (file.start_ns, file.end_ns) == (reference.start_time, reference.end_time - 1)
         assert file.custom == reference.storage.metadata.custom
-        in_order = [(c.topic, at, bytes(cdr)) for c, at, cdr in reference.messages()]
+        in_order = [(c.topic, time_ns, bytes(cdr)) for c, time_ns, cdr in reference.messages()]
     with BagReader(folder) as bag:
         assert [(e.topic, e.log_time_ns, e.cdr) for e in bag.messages()] == in_order
         assert bag.metadata == {"seed": "3", "run": "a: b"}
@@ -53,18 +53,20 @@ def test_what_rosbags_tells(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        lambda found: found.update(version=10),
-        lambda found: found.update(storage_identifier="sqlite3"),
-        lambda found: found.update(compression_mode="file", compression_format="zstd"),
-        lambda found: found.update(message_count=5),
-        lambda found: found["duration"].update(nanoseconds=7),
-        lambda found: found["starting_time"].update(nanoseconds_since_epoch=2),
-        lambda found: found["topics_with_message_count"].pop(),
-        lambda found: found["topics_with_message_count"][0].update(message_count=4),
-        lambda found: found["topics_with_message_count"][0]["topic_metadata"].update(type="a/b"),
-        lambda found: found["relative_file_paths"].append("run_1.mcap"),
-        lambda found: found["relative_file_paths"].__setitem__(0, "other.mcap"),
-        lambda found: found.pop("duration"),
+        lambda description: description.update(version=10),
+        lambda description: description.update(storage_identifier="sqlite3"),
+        lambda description: description.update(compression_mode="file", compression_format="zstd"),
+        lambda description: description.update(message_count=5),
+        lambda description: description["duration"].update(nanoseconds=7),
+        lambda description: description["starting_time"].update(nanoseconds_since_epoch=2),
+        lambda description: description["topics_with_message_count"].pop(),
+        lambda description: description["topics_with_message_count"][0].update(message_count=4),
+        lambda description: description["topics_with_message_count"][0]["topic_metadata"].update(
+            type="a/b"
+        ),
+        lambda description: description["relative_file_paths"].append("run_1.mcap"),
+        lambda description: description["relative_file_paths"].__setitem__(0, "other.mcap"),
+        lambda description: description.pop("duration"),
     ],
 )
 def test_what_is_not_as_usual_is_left_to_rosbags(
@@ -74,7 +76,9 @@ def test_what_is_not_as_usual_is_left_to_rosbags(
 
 
 def test_a_promise_not_kept_is_damage(tmp_path: Path) -> None:
-    folder = changed(written(tmp_path / "run"), lambda found: found.update(message_count=5))
+    folder = changed(
+        written(tmp_path / "run"), lambda description: description.update(message_count=5)
+    )
     with pytest.raises(BagError, match="5 messages announced, its topics count 4"):
         BagReader(folder)
 

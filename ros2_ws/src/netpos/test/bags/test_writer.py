@@ -32,7 +32,7 @@ RUN = {"scenario": 'name: x\n# "quoted": äöü\n', "seed": "7"}
 def samples(n: int) -> list[tuple[str, Any, int]]:
     """n messages of three types, seeded."""
     rng = np.random.default_rng(1)
-    made: list[tuple[str, Any, int]] = []
+    messages: list[tuple[str, Any, int]] = []
     for i in range(n):
         ns = 1_700_000_000_000_000_000 + i * 10_000_000
         measurement = RsuMeasurement(
@@ -50,10 +50,10 @@ def samples(n: int) -> list[tuple[str, Any, int]]:
             quaternion=np.array([0.0, 0.0, 0.0, 1.0]),
             linear_velocity=rng.normal(size=3),
         )
-        made.append(("/rsu/measurements", codec().measurement_to_msg(measurement), ns))
-        made.append(("/vue_1/ground_truth", codec().odometry_to_msg(truth), ns))
+        messages.append(("/rsu/measurements", codec().measurement_to_msg(measurement), ns))
+        messages.append(("/vue_1/ground_truth", codec().odometry_to_msg(truth), ns))
     info = RsuInfo(rsu_id="rsu_0", position=np.array([1.0, 2.0, 3.0]))
-    return [("/rsu/info", codec().rsu_info_to_msg(info), made[0][2]), *made]
+    return [("/rsu/info", codec().rsu_info_to_msg(info), messages[0][2]), *messages]
 
 
 def cdr(message: Any) -> bytes:
@@ -190,12 +190,12 @@ def test_flush_puts_every_message_on_disk(tmp_path: Path) -> None:
     for topic, message, ns in messages:
         bag.write(topic, message, ns)
     bag.flush()
-    found = []
+    payloads = []
     with (tmp_path / "run" / "run_0.mcap").open("rb") as stream, suppress(EndOfFile):
         for record in StreamReader(stream).records:
             if isinstance(record, Message):
-                found.append(record.data)  # noqa: PERF401  # the end raises
-    assert found == [cdr(message) for _, message, _ in messages]
+                payloads.append(record.data)  # noqa: PERF401  # the end raises
+    assert payloads == [cdr(message) for _, message, _ in messages]
     bag.close()
 
 

@@ -30,12 +30,12 @@ def test_work_that_fails_leaves_what_was_there(tmp_path: Path, error: BaseExcept
     for before in (None, "old"):
         if before is not None:
             path.write_text(before)
-        with pytest.raises(type(error)) as told:
+        with pytest.raises(type(error)) as raised:
             fail_half_way(path, error)
         assert [f.read_text() for f in tmp_path.iterdir()] == ([] if before is None else [before])
         if isinstance(error, OSError):
-            assert told.value.filename == str(path)
-            assert told.value.strerror == "No space left on device"
+            assert raised.value.filename == str(path)
+            assert raised.value.strerror == "No space left on device"
 
 
 def test_a_full_device_is_named(tmp_path: Path) -> None:

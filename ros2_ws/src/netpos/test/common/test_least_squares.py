@@ -85,6 +85,6 @@ def test_where_nothing_falls_the_start_remains() -> None:
     assert len(seen) == 1 + round(math.log10(1e8 / 1e-3)) + 1
 
 
-def test_what_cannot_be_solved_is_said() -> None:
+def test_an_unsolvable_system_raises() -> None:
     with pytest.raises(np.linalg.LinAlgError):
         minimise(lambda x: (1.0, x, np.zeros((2, 2))), np.ones(2), np.linalg.solve)

@@ -56,7 +56,7 @@ def test_what_is_refused_does_not_hang(name: str) -> None:
         load_yaml(text)
 
 
-def test_the_line_is_told() -> None:
+def test_the_error_names_the_line() -> None:
     with pytest.raises(YamlError, match=r"^line 3: "):
         load_yaml("a: 1\nb: 2\nc: [1, }\n")
 
@@ -68,18 +68,18 @@ def test_commands_answer_with_one_sentence(name: str, tmp_path: Path) -> None:
     text, _ = TEXTS[name]
     scenario = tmp_path / "bad.yaml"
     scenario.write_text(f"seed: 1\n{text}\n", encoding="utf-8")
-    said = tmp_path / "said"
-    with BagWriter(said, metadata={"tracker": text}) as bag:
+    bag_dir = tmp_path / "said"
+    with BagWriter(bag_dir, metadata={"tracker": text}) as bag:
         bag.write("/rsu/measurements", codec().clock_to_msg(1), 1)
     inside = tmp_path / "inside"
-    shutil.copytree(said, inside)
+    shutil.copytree(bag_dir, inside)
     whole = (inside / "metadata.yaml").read_text(encoding="utf-8")
     (inside / "metadata.yaml").write_text(f"{text}\n{whole}", encoding="utf-8")
     for command in (
         ("run", scenario, "--offline", "--bag", tmp_path / "out"),
-        *(("evaluate", bag) for bag in (said, inside)),
-        *(("replay", bag, "--out", tmp_path / "out") for bag in (said, inside)),
-        *(("report", bag, "--out", tmp_path / "r.html") for bag in (said, inside)),
+        *(("evaluate", bag) for bag in (bag_dir, inside)),
+        *(("replay", bag, "--out", tmp_path / "out") for bag in (bag_dir, inside)),
+        *(("report", bag, "--out", tmp_path / "r.html") for bag in (bag_dir, inside)),
     ):
         result = CliRunner().invoke(app, list(map(str, command)))
         assert result.exit_code == 2, (command, result.output, result.exception)

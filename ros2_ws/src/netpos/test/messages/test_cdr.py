@@ -225,9 +225,9 @@ def test_the_other_byte_order_and_encodings_are_left_to_the_long_way() -> None:
 
 def test_text_that_is_no_utf8_or_has_no_end_is_left_to_the_long_way() -> None:
     whole = SAMPLES[MEASUREMENT]
-    at = whole.index(b"rsu_12\0")
+    start = whole.index(b"rsu_12\0")
     assert cdr_codec().measurement(whole.replace(b"rsu_12", b"rsu_1\xff")) is None
-    assert cdr_codec().measurement(whole[: at + 6] + b"!" + whole[at + 7 :]) is None
+    assert cdr_codec().measurement(whole[: start + 6] + b"!" + whole[start + 7 :]) is None
 
 
 @pytest.mark.parametrize(
@@ -327,6 +327,6 @@ def test_a_time_that_is_none_is_left_to_the_codec_of_messages(nanosec: int) -> N
 def test_the_source_of_a_measurement_is_read_alone(value: RsuMeasurement) -> None:
     message = codec().measurement_to_msg(value)
     cdr = bytes(typestore().serialize_cdr(message, MEASUREMENT))
-    found = cdr_codec().source(cdr)
-    assert found in (None, (value.rsu_id, value.vue_id, value.stamp_ns))
-    assert (found is None) == (cdr_codec().measurement(cdr) is None)
+    source = cdr_codec().source(cdr)
+    assert source in (None, (value.rsu_id, value.vue_id, value.stamp_ns))
+    assert (source is None) == (cdr_codec().measurement(cdr) is None)
