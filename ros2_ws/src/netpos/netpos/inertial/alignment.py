@@ -1,6 +1,6 @@
 """Coarse alignment: the first attitude, position and velocity of a strapdown system.
 
-The accelerometers tell roll and pitch (level), the way tells the heading: a vehicle drives where
+The accelerometers show roll and pitch (level), the way shows the heading: a vehicle drives where
 it points. Between the fixes gyro and accelerometer give the shape of the way, up to where it
 begins, its heading psi and the speed s there:
 
@@ -9,7 +9,7 @@ begins, its heading psi and the speed s there:
     D = integral of t (cos d, sin d)
 
 with d the heading turned since. Levelling takes the mean acceleration for tilt; ``a`` gives it
-back, to the way and to the tilt. Start from rest (s = 0, then B tells psi) and from motion are one
+back, to the way and to the tilt. Start from rest (s = 0, then B shows psi) and from motion are one
 problem. Fitted by Levenberg-Marquardt to horizontal fixes with their covariances.
 """
 
@@ -76,10 +76,12 @@ def way_of(time_s: Array, rates: Array, at_s: Array) -> Way:
     B = np.cumsum(ahead * (gained * dt)[:, None], axis=0)
     D = np.cumsum(ahead * (time_s * dt)[:, None], axis=0)
     series = np.column_stack([turned, gained, A, B, D])
-    found = np.column_stack([np.interp(at_s, time_s, column) for column in series.T])
-    turned_at, gained_at, A_at, B_at, D_at = np.split(found - found[0], [1, 2, 4, 6], axis=1)
-    back = Rotation.from_euler("z", -float(found[0, 0])).as_matrix()[:2, :2]
-    B_at = B_at - float(found[0, 1]) * A_at  # speed and time count from the begin as well
+    interpolated = np.column_stack([np.interp(at_s, time_s, column) for column in series.T])
+    turned_at, gained_at, A_at, B_at, D_at = np.split(
+        interpolated - interpolated[0], [1, 2, 4, 6], axis=1
+    )
+    back = Rotation.from_euler("z", -float(interpolated[0, 0])).as_matrix()[:2, :2]
+    B_at = B_at - float(interpolated[0, 1]) * A_at  # speed and time count from the begin as well
     D_at = D_at - float(at_s[0]) * A_at
     return Way(
         time_s=at_s - at_s[0],
@@ -115,9 +117,9 @@ def fit_course(way: Way, position: Array, cov: Array) -> Course | None:
     root = np.linalg.inv(np.linalg.cholesky(cov))
     best: tuple[float, Array, Array] | None = None
     for heading in np.arange(_HEADINGS) * (math.tau / _HEADINGS):
-        found = _fit(way, position, root, heading)
-        if found is not None and (best is None or found[0] < best[0]):
-            best = found
+        candidate = _fit(way, position, root, heading)
+        if candidate is not None and (best is None or candidate[0] < best[0]):
+            best = candidate
     if best is None:
         return None
     cost, x, normal = best

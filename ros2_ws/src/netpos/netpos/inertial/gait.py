@@ -55,7 +55,7 @@ _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 @dataclass(frozen=True, slots=True, kw_only=True, config=_STRICT)
 class GaitModel:
     """How a person walks. ``bounce_m``, ``sway_m`` and ``surge_m`` are peak to peak, the swings
-    amplitudes; ``stance_pause_s`` is a stand after every single step."""
+    amplitudes; ``stance_pause_s`` is a pause after every step."""
 
     step_length_m: float = Field(default=0.6375, gt=0)
     cadence_hz: float = Field(default=1.57, gt=0, le=5)
@@ -189,15 +189,15 @@ class Gait:
         yaw, yaw_rate = stand.yaw + stand.turn * eased, stand.turn * rate / span
         body_rate = _body_rate(lean, zero, yaw_rate, zero, zero)
         still = np.zeros((len(t), 4))
-        place = np.column_stack([zero + stand.x, zero + stand.y])
-        return np.hstack([place, still, np.column_stack([yaw, lean, zero]), body_rate])
+        position = np.column_stack([zero + stand.x, zero + stand.y])
+        return np.hstack([position, still, np.column_stack([yaw, lean, zero]), body_rate])
 
     def _walking(self, run: _Run, t: Array) -> Array:
         m = self.model
         u, du, e, de = _progress(t - run.start_s, run.n, 1.0 / m.cadence_hz)
         leg, way = self._legs[run.leg], run.way_m + run.length_m * u
         path = leg.way.at(np.clip(way, 0.0, leg.length_m))
-        heading, bend = leg.heading(way)
+        heading, curvature = leg.heading(way)
         ahead = np.column_stack([np.cos(heading), np.sin(heading)])
         left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
         a = 2 * np.pi * (u - 0.5 - LATE)
@@ -223,7 +223,7 @@ class Gait:
         pitch, d_pitch = swing(math.radians(m.pitch_swing_deg), np.cos(a), -np.sin(a) * da)
         roll, d_roll = swing(math.radians(m.roll_swing_deg), np.sin(b), np.cos(b) * db)
         way_rate = run.length_m * du
-        turn_rate = bend * way_rate
+        turn_rate = curvature * way_rate
         forward = (d_surge - turn_rate * sway)[:, None] * ahead
         sideways = (d_sway + turn_rate * surge)[:, None] * left
         pitch = pitch + math.radians(m.lean_deg)
@@ -279,7 +279,7 @@ def walk(
 
 
 def _timetable(model: GaitModel, legs: Sequence[_Leg], pauses: Sequence[float]) -> Gait:
-    """Runs and stands one after the other."""
+    """Runs and pauses one after the other."""
     runs: list[_Run] = []
     stands: list[_Stand] = []
     clock, steps = 0.0, 0

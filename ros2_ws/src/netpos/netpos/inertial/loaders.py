@@ -184,7 +184,7 @@ def load_pdr_phone(path: Path) -> WaypointRecord:
     The three sensors share their stamps (epoch ms); rows without all three are dropped.
     """
     wanted = {"TYPE_ACCELEROMETER": 0, "TYPE_GYROSCOPE": 1, "TYPE_MAGNETIC_FIELD": 2}
-    found: tuple[dict[int, list[float]], ...] = ({}, {}, {})
+    samples: tuple[dict[int, list[float]], ...] = ({}, {}, {})
     points: list[tuple[int, float, float]] = []
     with _require(path).open(encoding="utf-8", errors="replace") as lines:
         for number, line in enumerate(lines, start=1):
@@ -196,14 +196,14 @@ def load_pdr_phone(path: Path) -> WaypointRecord:
                     points.append((int(cells[0]), float(cells[2]), float(cells[3])))
                 elif cells[1] in wanted:
                     xyz = [float(c) for c in cells[2:5]]
-                    found[wanted[cells[1]]][int(cells[0])] = xyz
+                    samples[wanted[cells[1]]][int(cells[0])] = xyz
             except (ValueError, IndexError) as error:
                 raise _malformed(path, f"line {number}: {error}") from error
-    common = sorted(set(found[0]) & set(found[1]) & set(found[2]))
+    common = sorted(set(samples[0]) & set(samples[1]) & set(samples[2]))
     if not common or not points:
         raise _malformed(path, "no IMU rows or no waypoints")
     take: Callable[[int, float], Array] = lambda i, scale: phone_to_flu(  # noqa: E731
-        _samples([found[i][t] for t in common], path, scale)
+        _samples([samples[i][t] for t in common], path, scale)
     )
     imu = ImuRecord(np.array(common) * 1_000_000, take(1, 1.0), take(0, 1.0), take(2, 1e-6))
     stamps = np.array([p[0] for p in points], dtype=np.int64) * 1_000_000
@@ -211,7 +211,7 @@ def load_pdr_phone(path: Path) -> WaypointRecord:
 
 
 def load_imu_mag_attitude(path: Path) -> AttitudeRecord:
-    """``imu_mag_attitude/*.mat``: BROAD trial; the sensor axes are taken as body axes."""
+    """``imu_mag_attitude/*.mat``: BROAD trial; the sensor axes are used as body axes."""
     data = _load_mat(path)
     try:
         force = _samples(data["imu_acc"], path)

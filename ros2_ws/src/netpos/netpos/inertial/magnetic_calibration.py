@@ -52,10 +52,10 @@ def fit_iron(field: npt.ArrayLike) -> MagneticCalibration:
         raise ValueError(
             f"a calibration needs at least {MIN_SAMPLES} finite readings (n, 3), got {m.shape}"
         )
-    middle, spread = m.mean(axis=0), float(m.std())
-    if not spread > 0:
+    middle, sd = m.mean(axis=0), float(m.std())
+    if not sd > 0:
         raise ValueError("all readings are the same; turn the device through all orientations")
-    x, y, z = ((m - middle) / spread).T
+    x, y, z = ((m - middle) / sd).T
     design = np.column_stack(
         [x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z, 2 * x, 2 * y, 2 * z]
     )
@@ -70,8 +70,8 @@ def fit_iron(field: npt.ArrayLike) -> MagneticCalibration:
         )
     centre = -np.linalg.solve(quadric, p[6:])
     radius = math.sqrt(1.0 + float(centre @ quadric @ centre))
-    size = radius * spread / math.exp(float(np.mean(np.log(values))) / 2)  # geometric mean axis
-    matrix = (vectors * np.sqrt(values)) @ vectors.T * (size / (radius * spread))
-    offset = middle + spread * centre
+    size = radius * sd / math.exp(float(np.mean(np.log(values))) / 2)  # geometric mean axis
+    matrix = (vectors * np.sqrt(values)) @ vectors.T * (size / (radius * sd))
+    offset = middle + sd * centre
     norms = np.linalg.norm((m - offset) @ matrix.T, axis=1)
     return MagneticCalibration(offset, matrix, float(norms.std() / norms.mean()))

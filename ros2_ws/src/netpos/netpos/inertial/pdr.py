@@ -6,7 +6,7 @@ walk, handling, a single step) the velocity is unknown: zero with ``undecided_sp
 ``moving`` True.
 
 Time is the stamp of the samples; there is no clock. Bad data never raises: it is counted in
-``PedestrianDeadReckoning.counters`` under its reason, and what lasts is told once
+``PedestrianDeadReckoning.counters`` under its reason, and a lasting condition is reported once
 (``take_notices``).
 """
 
@@ -79,7 +79,7 @@ class PedestrianDeadReckoning:
         return self._conditions.active
 
     def take_notices(self) -> list[str]:
-        """Sentences about the input since the last call; each condition is told once."""
+        """Sentences about the input since the last call; each condition is reported once."""
         return self._conditions.take()
 
     @property
@@ -226,7 +226,7 @@ class PedestrianDeadReckoning:
     def _refuse(
         self, reason: str, why: str = "IMU samples without three finite values are left out"
     ) -> None:
-        """Count a sample that cannot be read; the first of a kind is told."""
+        """Count a sample that cannot be read, and report the first of a kind."""
         if not self._counters[reason]:
             self._conditions.tell(f"{reason}: {why}")
         self._counters[reason] += 1
@@ -315,7 +315,7 @@ class PedestrianDeadReckoning:
         horizontal = math.hypot(x, y)
         heading = math.atan2(y, x) + self.config.mount_heading_rad
         length = self.length_scale.mean * self._model_length(step)
-        spread = self.length_scale.sd / self.length_scale.mean
+        scale_sd_fraction = self.length_scale.sd / self.length_scale.mean
         self._count += 1
         return StepEvent(
             stamp_ns=stamp_ns,
@@ -325,7 +325,7 @@ class PedestrianDeadReckoning:
             length_m=length,
             heading_rad=wrap_angle(heading),
             heading_sd_rad=self._heading_sd(stamp_ns, horizontal),
-            length_sd_m=math.hypot(spread, self.config.step_sd_fraction) * length,
+            length_sd_m=math.hypot(scale_sd_fraction, self.config.step_sd_fraction) * length,
             cadence_hz=step.cadence_hz,
             heading_reference=self._attitude.reference,
         )

@@ -71,14 +71,14 @@ class PdrConfig:
         " or the IMU sample of the same time arrives first; 0: at once",
     )
     field_patience_s: float = positive(
-        3.0, "how long the heading may do without magnetic samples before it is said"
+        3.0, "time without magnetic samples after which this is reported"
     )
-    still_speed_sd_mps: float = positive(0.05, "of the zero velocity of a body that stands")
+    still_speed_sd_mps: float = positive(0.05, "of the zero velocity of a body at rest")
     turning_speed_sd_mps: float = positive(0.3, "of the zero velocity of a body that only turns")
     undecided_speed_sd_mps: float = positive(
-        1.0, "of the velocity of a body that neither stands nor walks"
+        1.0, "of the velocity of a body that is neither at rest nor walking"
     )
-    still_rate_radps: float = positive(0.2, "a body that stands turns slower")
+    still_rate_radps: float = positive(0.2, "a body at rest turns slower")
     speed_drift_mps2: float = not_negative(
         0.5,
         "growth of the velocity sd with the age of the last step: people stop within a step, and"

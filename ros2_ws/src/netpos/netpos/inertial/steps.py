@@ -11,7 +11,7 @@
 3. A zero-phase Gaussian smooths the impacts; a zero-phase difference of two, from 0.6 to 3 Hz,
    passes the bounce.
 4. A peak counts when its prominence exceeds a floor and a fraction of the running prominence. An
-   impact must also be sharp: its frequency, told by the ratio of the second to the first
+   impact must also be sharp: its frequency, from the ratio of the second to the first
    difference, 2 sin(pi f cell), is above ``min_impact_hz``; setting off and bending are slower.
 5. A device being turned in the hand is not walking: peaks with a fast tilt are refused.
 6. ``bout_steps`` peaks in a row start a bout; the first ones are then released together.
@@ -122,7 +122,7 @@ class Step:
     """One detected step.
 
     start_ns, end_ns : initial contacts that bound it; ``start_ns`` is the previous step's
-        ``end_ns``; at the start of a bout and after a stand, one typical period earlier
+        ``end_ns``; at the start of a bout and after a pause, one typical period earlier
     bounce_mps2 : range of the vertical acceleration over the step, with the attenuation of the
         band-pass at the step's cadence made good
     """

@@ -1,7 +1,7 @@
-"""What is wrong with an IMU stream: refused samples by reason, and conditions told once.
+"""What is wrong with an IMU stream: refused samples by reason, and conditions reported once.
 
-A *fault* refuses one sample. A *condition* lasts; it is told in one sentence when it begins and
-in one when it ends.
+A *fault* refuses one sample. A *condition* lasts; it is reported in one sentence when it begins
+and in one when it ends.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ Vector = tuple[float, float, float]
 # So many samples of exactly the same, largest reading: the end of a range narrower than declared.
 _PLATEAU_SAMPLES = 4
 _PLATEAU_MPS2 = 14.7  # 1.5 g; a sensor at rest may well repeat itself
-_EDGE = 1.001  # a reading further beyond the range is none
+_EDGE = 1.001  # a reading further beyond the range is refused
 _GRAVITY_MEMORY_S = 5.0
 
 
 class Conditions:
-    """Which conditions hold, and the sentences that are still to be told."""
+    """Which conditions hold, and the sentences that were not yet taken."""
 
     def __init__(self) -> None:
         self._active: list[str] = []
-        self._told: deque[str] = deque(maxlen=100)
+        self._notices: deque[str] = deque(maxlen=100)
 
     @property
     def active(self) -> tuple[str, ...]:
@@ -33,23 +33,23 @@ class Conditions:
         return tuple(self._active)
 
     def set(self, name: str, holds: bool, begins: str, ends: str) -> None:
-        """Note whether a condition holds; the first time either way is told."""
+        """Note whether a condition holds; report when it begins and when it ends."""
         if holds and name not in self._active:
             self._active.append(name)
-            self._told.append(begins)
+            self._notices.append(begins)
         elif not holds and name in self._active:
             self._active.remove(name)
-            self._told.append(ends)
+            self._notices.append(ends)
 
     def tell(self, sentence: str) -> None:
-        """Tell of something that does not last."""
-        self._told.append(sentence)
+        """Report an event that does not last."""
+        self._notices.append(sentence)
 
     def take(self) -> list[str]:
         """The sentences since the last call."""
-        told = list(self._told)
-        self._told.clear()
-        return told
+        notices = list(self._notices)
+        self._notices.clear()
+        return notices
 
 
 class StreamWatch:
@@ -72,7 +72,7 @@ class StreamWatch:
 
     def saturated(self, rate: Vector, force: Vector) -> tuple[str, bool] | None:
         """Reason when a sample is at the end of a sensor's range, and whether it lies beyond it
-        and cannot be a reading at all; told once."""
+        and cannot be a reading at all; reported once."""
         cfg = self._cfg
         turn, push = max(map(abs, rate)), max(map(abs, force))
         if turn >= cfg.gyro_range_radps:

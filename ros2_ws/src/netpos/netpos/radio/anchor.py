@@ -93,7 +93,7 @@ class TwoWayRanging:
 
     @property
     def range_sd_m(self) -> float:
-        """Standard deviation of the distance by the timestamps."""
+        """Standard deviation of the distance that follows from the timestamps."""
         poll, final = 0.25, 0.25  # the response counts 0.5: it is in both round trips
         if self.method == "asymmetric":
             replies_s = 2.0 * (self.anchor_reply_s + self.device_reply_s)
@@ -102,7 +102,7 @@ class TwoWayRanging:
         return SPEED_OF_LIGHT_MPS * self.timestamp_sd_s * gain
 
     def residual(self, device_drift: float, anchor_drift: float) -> tuple[float, float]:
-        """What the clock rates (s/s) leave in the distance: scale [1] and offset [m]."""
+        """Error that the clock rates (s/s) leave in the distance: scale [1] and offset [m]."""
         scale = (device_drift + anchor_drift) / 2.0
         if self.method == "asymmetric":
             return scale, 0.0

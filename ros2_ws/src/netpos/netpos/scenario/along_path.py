@@ -1,6 +1,6 @@
-"""Stations along a way that was really driven, and what they would have measured of it.
+"""Simulated stations along a real path, and their simulated measurements.
 
-For recordings with a true path and a real IMU but without stations: the stations stand on a square
+For recordings with a true path and a real IMU but without stations: the stations are on a square
 grid as in deng2022, ``heights`` above the nearest part of the way, and measure with its errors.
 """
 
@@ -61,7 +61,7 @@ def observe_along(
     fewest: int,
     nearest: int,
 ) -> Observations:
-    """What ``fewest`` to ``nearest`` stations measure of the antenna (n, 3) at stamps (n,)."""
+    """Measurements of the antenna (n, 3) at stamps (n,) by ``fewest`` to ``nearest`` stations."""
     perfect = np.zeros((len(stations), 0, 3))
     sites = sites_of(stations, rotations_of(stations), perfect, seed, vue_id)
     none = np.zeros((0, 4))

@@ -1,4 +1,4 @@
-"""From the words of a scenario to the arrays of the simulation."""
+"""Turn a scenario into the arrays of the simulation."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def buildings_of(scenario: Scenario) -> Array:
     return np.array(rows, dtype=np.float64).reshape(-1, 4)
 
 
-def buildings_of_text(text: str, place: Path) -> Array:
-    """(k, 4) rectangles of the scenario that a run tells of itself, found at ``place``.
+def buildings_of_text(text: str, path: Path) -> Array:
+    """(k, 4) rectangles of the scenario in a recording; ``path`` is for error messages.
 
     None (k = 0) where the text is no scenario that this version reads: a map without buildings is
     then the honest one.
     """
     try:
-        return buildings_of(scenario_of_text(text, place))
+        return buildings_of(scenario_of_text(text, path))
     except ScenarioError:
         return np.zeros((0, 4))
 
@@ -134,7 +134,7 @@ def clock_tones_of(scenario: Scenario, rsus: tuple[RsuInfo, ...]) -> Array:
     ids = [rsu.rsu_id for rsu in rsus]
     if clock.reference is not None and clock.reference not in ids:
         raise ValueError(
-            f"rsus.clock.reference {clock.reference!r} is none of the RSUs: {', '.join(ids)}"
+            f"rsus.clock.reference {clock.reference!r} is not one of the RSUs: {', '.join(ids)}"
         )
     return np.array([clock_tones(clock, scenario.seed, rsu_id) for rsu_id in ids])
 
@@ -147,8 +147,8 @@ def sites_of(
     vue_id: str,
     two_way: TwoWayRanging | None = None,
 ) -> Sites:
-    """The RSUs as one device meets them: places, rotations of ``rotations_of``, clocks of
-    ``clock_tones_of``, noise streams, what ``two_way`` ranging leaves of the clocks' drift."""
+    """The RSUs for one device: positions, rotations of ``rotations_of``, clocks of
+    ``clock_tones_of``, noise streams, range errors of ``two_way`` ranging by the clocks' drift."""
     residuals = np.array([_residual(two_way, seed, f"{r.rsu_id}/{vue_id}") for r in rsus])
     return Sites(
         position=np.array([rsu.position for rsu in rsus]),
@@ -174,13 +174,13 @@ def _residual(two_way: TwoWayRanging | None, seed: int, link: str) -> tuple[floa
 
 
 def two_way_of(scenario: Scenario) -> TwoWayRanging | None:
-    """How the scenario's ranges are measured, where it says so."""
+    """Two-way ranging of the scenario, None without it."""
     errors = scenario.measurement.errors
     return errors.two_way_ranging if isinstance(errors, FixedErrors) else None
 
 
 def sight_of(scenario: Scenario, device: Device) -> Sight:
-    """Who may hear the device."""
+    """Which RSUs may hear the device."""
     los = scenario.measurement.los
     return Sight(
         nearest=scenario.measurement.nearest,

@@ -1,4 +1,4 @@
-"""Find and read scenario files. Every complaint names the file, the line and the key."""
+"""Find and read scenario files. Every error message names the file, the line and the key."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from netpos.common.yaml_text import YamlError, compose_yaml
 from netpos.scenario.schema import Scenario
 
 _SHARED = Path("share/netpos_bringup/scenarios")
-_OWN = Path(__file__).parent / "scenarios"
+_SHIPPED = Path(__file__).parent / "scenarios"
 _YAML_1_2_FLOAT = re.compile(r"^[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$")
 
 
@@ -33,16 +33,16 @@ _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _YAML_1_2_FLOAT, list("
 
 def _folders() -> list[Path]:
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    return [Path(p) / _SHARED for p in prefixes if p] + [_OWN]
+    return [Path(p) / _SHARED for p in prefixes if p] + [_SHIPPED]
 
 
 def scenario_files() -> dict[str, Path]:
     """Installed scenarios by name; those of the library fill in what is not installed."""
-    found: dict[str, Path] = {}
+    files: dict[str, Path] = {}
     for folder in _folders():
         for path in sorted(folder.glob("*.yaml")):
-            found.setdefault(path.stem, path)
-    return found
+            files.setdefault(path.stem, path)
+    return files
 
 
 def scenario_names() -> tuple[str, ...]:
@@ -76,9 +76,9 @@ def scenario_text(scenario: Scenario) -> str:
     return str(yaml.safe_dump({**content, "seed": scenario.seed}, sort_keys=False))
 
 
-def scenario_of_text(text: str, place: Path) -> Scenario:
-    """The scenario of a text found at ``place``. Raises ``ScenarioError`` as ``load_scenario``."""
-    return _parse(place, text, {}, {})
+def scenario_of_text(text: str, path: Path) -> Scenario:
+    """The scenario of a text read from ``path``. Raises ``ScenarioError`` as ``load_scenario``."""
+    return _parse(path, text, {}, {})
 
 
 def _parse(
@@ -102,8 +102,8 @@ def _parse(
 def place_of(name_or_path: str, *keys: str) -> str:
     """File, line and key of a value of a readable scenario: "a.yaml: line 3: tracker.x"."""
     path = _find(name_or_path)
-    found, line = _locate(_compose(path, path.read_text(encoding="utf-8")), keys)
-    return f"{path}: line {line}: {found}"
+    text, line = _locate(_compose(path, path.read_text(encoding="utf-8")), keys)
+    return f"{path}: line {line}: {text}"
 
 
 def _find(name_or_path: str) -> Path:
@@ -160,7 +160,7 @@ def _change(content: Any, dotted: str, value: object) -> None:
 
 
 def _describe(path: Path, root: yaml.Node, error: ValidationError) -> str:
-    """One sentence per complaint."""
+    """One sentence per error."""
     lines = []
     complaints = error.errors(include_url=False)
     for item in complaints:
@@ -182,7 +182,7 @@ def _describe(path: Path, root: yaml.Node, error: ValidationError) -> str:
 
 
 def _locate(root: yaml.Node, loc: tuple[int | str, ...]) -> tuple[str, int]:
-    """Dotted key and line of a place; parts that only name a variant of the schema are skipped."""
+    """Dotted key and line of an error, without parts that only name a variant of the schema."""
     node, line, keys = root, root.start_mark.line + 1, []
     for position, part in enumerate(loc):
         if isinstance(node, yaml.MappingNode):

@@ -1,5 +1,4 @@
-"""What a scenario file may say of the measurements: who hears a beacon, what is measured, how
-well."""
+"""Measurements in a scenario file: which RSUs hear a beacon, what they measure, how well."""
 
 from __future__ import annotations
 
@@ -27,7 +26,7 @@ _ERRORS = {
 
 
 class LineOfSight(Section):
-    """Who may hear a beacon. Buildings of the world always block.
+    """Which RSUs may hear a beacon. Buildings of the world always block.
 
     ``max_distance_m`` is fokin2020's d_los (plane distance; absent: no limit). ``probability``
     draws the state by ITU-R M.2412 once per (seed, RSU, device) as a field over the plane with the
@@ -40,7 +39,7 @@ class LineOfSight(Section):
 
 class FixedErrors(Section):
     """Constant standard deviations of the measurements; ``two_way_ranging`` gives that of a range
-    in place of ``range_sd_m``."""
+    instead of ``range_sd_m``."""
 
     model: Literal["fixed"] = "fixed"
     azimuth_sd_deg: Positive | None = None
@@ -68,8 +67,8 @@ class CramerRaoErrors(Section):
 
 
 class Measurement(Section):
-    """What the RSUs measure of each beacon; the ``nearest`` RSUs with a line of sight report it,
-    or of these a number drawn evenly for each beacon, at least ``fewest`` (deng2022)."""
+    """Quantities that the RSUs measure of each beacon. The ``nearest`` RSUs in line of sight
+    report it, or a number of these drawn uniformly for each beacon, at least ``fewest``."""
 
     quantities: tuple[str, ...] = ("azimuth", "toa")
     nearest: int = Field(default=2, ge=1)

@@ -56,7 +56,7 @@ def fix_errors(
 
 
 def answering_of(scenario: Scenario, rsus: tuple[RsuInfo, ...]) -> tuple[Answering, ...]:
-    """Who answers, network by network."""
+    """The RSUs that answer, for each network."""
     errors = scenario.measurement.errors
     sd = errors.position_sd_m or 0.0 if isinstance(errors, FixedErrors) else 0.0
     if not scenario.networks:
@@ -74,7 +74,7 @@ def answering_of(scenario: Scenario, rsus: tuple[RsuInfo, ...]) -> tuple[Answeri
 
 
 def names_of(scenario: Scenario, network: Network) -> dict[str, str]:
-    """What a network calls each device, by its name in the scenario."""
+    """Name that a network gives each device, by its name in the scenario."""
     vues = scenario.vue_ids
     if not network.own_names:
         return {vue: vue for vue in vues}

@@ -1,4 +1,4 @@
-"""Write a scenario's run to a bag without ROS: what the live graph carries, except the tracker's
+"""Write a scenario's run to a bag without ROS: all topics of the live graph except the tracker's
 output."""
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def timeline(
 
 
 class _Walkers:
-    """Dead reckoning of everybody who walks, as the nodes do it."""
+    """Dead reckoning of every walking device, as in the nodes."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._cores = {

@@ -1,4 +1,4 @@
-"""What stands in a scenario: buildings and RSUs."""
+"""Buildings and RSUs of a scenario."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class RsuUnit(Section):
 
 
 class Grid(Section):
-    """RSUs on a square grid from its south-west corner, their heights drawn evenly per seed."""
+    """RSUs on a square grid from its south-west corner, their heights drawn uniformly per seed."""
 
     spacing_m: Positive
     columns: int = Field(ge=1)

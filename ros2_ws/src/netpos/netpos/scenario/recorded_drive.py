@@ -1,4 +1,4 @@
-"""A recorded drive made into a bag: real IMU, RTK as truth, simulated stations along its way."""
+"""Make a bag of a recorded drive: real IMU, RTK as truth, simulated stations along its path."""
 
 from __future__ import annotations
 
@@ -78,14 +78,14 @@ def import_car_drive(
     ValueError  numbers of stations out of range
     """
     drive = load_car_drive(path, mount)
-    made = station_drive(drive, fewest=fewest, nearest=nearest, seed=seed)
-    height_m = float(made.antenna[0, 2])
+    simulated = station_drive(drive, fewest=fewest, nearest=nearest, seed=seed)
+    height_m = float(simulated.antenna[0, 2])
     source = f"car-imu-rtk {Path(path).name}, simulated stations {fewest}-{nearest}, seed {seed}"
     return write_bag(
         bag,
-        rsus=made.stations,
+        rsus=simulated.stations,
         measurements=measurements_of(
-            made.seen, made.stations, made.stamps_ns, VUE, drive.lever_arm_m
+            simulated.seen, simulated.stations, simulated.stamps_ns, VUE, drive.lever_arm_m
         ),
         truth=truth_of(drive, VUE),
         imu=imu_samples(drive, VUE),

@@ -45,7 +45,7 @@ _LIST = "rsus_file"
 
 @dataclass(frozen=True, slots=True)
 class ReplaySummary:
-    """What a replay did: parameters of the tracker that are not the defaults, epochs written,
+    """Summary of a replay: parameters of the tracker that are not the defaults, epochs written,
     estimates in them, and measurements refused or rejected, by device and reason."""
 
     parameters: Mapping[str, Any]
@@ -154,7 +154,7 @@ def _through(
 def reading_of(
     topic: str, info: TopicInfo, config: TrackerConfig
 ) -> Callable[[BagEntry], Item | ImuSample] | None:
-    """What makes tracker input of the entries of a topic; None where the tracker takes none."""
+    """Function that turns entries of a topic into tracker input; None for other topics."""
     make, fast = codec(), cdr_codec()
     if topic == topics.RSU_MEASUREMENTS:
         return _short_cut(info, fast.measurement, make.measurement_from_msg)
@@ -178,7 +178,7 @@ def reading_of(
 def _short_cut(
     info: TopicInfo, fast: Callable[[bytes], Any], from_msg: Callable[[Any], Any]
 ) -> Callable[[BagEntry], Any]:
-    """Read the bytes where they are as usual and the bag's definition is ours."""
+    """Read the bytes directly if their encoding is the usual one and the definition is ours."""
     if not has_common_definition(info.type_name, info.definition):
         return lambda entry: from_msg(entry.message)
 

@@ -1,4 +1,4 @@
-"""What a scenario file may say. Unknown keys are refused; every physical key carries its unit."""
+"""Schema of a scenario file. Unknown keys are refused; every physical key carries its unit."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from netpos.scenario.section import (
     Interval,
     Name,
     NotNegative,
-    Place,
+    Point,
     Positive,
     Section,
     Start,
@@ -65,7 +65,7 @@ class WaypointRoute(Section):
     """Straight lines between way-points; ``pauses_s`` one per way-point."""
 
     kind: Literal["waypoints"]
-    points: tuple[Place, ...] = Field(min_length=2)
+    points: tuple[Point, ...] = Field(min_length=2)
     corner_radius_m: NotNegative = 0.0
     pauses_s: tuple[NotNegative, ...] = ()
 
@@ -78,7 +78,7 @@ class RectangleRoute(Section):
     """Once or more round a rectangle, counter-clockwise from its lower left corner."""
 
     kind: Literal["rectangle"]
-    corner: Place = (0.0, 0.0)
+    corner: Point = (0.0, 0.0)
     width_m: Positive
     height_m: Positive
     laps: int = Field(default=1, ge=1, le=LEGS_MAX // 4)
@@ -91,18 +91,18 @@ class RectangleRoute(Section):
 
 
 class Stretch(Section):
-    """A time of constant acceleration."""
+    """A stretch of constant acceleration."""
 
     duration_s: Positive
-    acceleration_mps2: Place = (0.0, 0.0)
+    acceleration_mps2: Point = (0.0, 0.0)
 
 
 class QuadraticRoute(Section):
     """Per axis a curve of the second order, or several in a row (dvornikov2017)."""
 
     kind: Literal["quadratic"]
-    start: Place
-    velocity_mps: Place
+    start: Point
+    velocity_mps: Point
     stretches: tuple[Stretch, ...] = Field(min_length=1)
 
     def motion(self) -> QuadraticMotion:
@@ -122,7 +122,7 @@ Route = Annotated[
 
 class Network(Section):
     """One of several networks: its RSUs answer the beacons of its own times alone, so the networks
-    measure at different instants. It calls the devices what it likes where ``own_names``."""
+    measure at different instants. With ``own_names`` it uses its own names of devices."""
 
     name: Name
     interval_s: Interval
@@ -142,12 +142,12 @@ class Network(Section):
 
 
 class Device(Section):
-    """One device, or ``count`` devices with the same settings and draws of their own.
+    """One device, or ``count`` devices with the same settings and different draws.
 
     It drives along its route at ``speed_mps``, or a person walks with it there (``gait``).
     ``pdr`` holds parameters of its dead reckoning (``PdrConfig``); with a gait it is worn at the
     waist unless ``placement`` says otherwise. ``antenna_height_m`` is the height of base_link
-    where the road is flat, the antenna stands at ``lever_arm_m`` in base_link; the road rises and
+    where the road is flat, the antenna is at ``lever_arm_m`` in base_link; the road rises and
     falls as a sine in time. ``wander_density_mps2_sqrthz`` adds the integral of white acceleration
     to the drive."""
 
@@ -176,7 +176,7 @@ class Device(Section):
 
     @property
     def walks(self) -> bool:
-        """Whether a person carries the device and its IMU tells the steps."""
+        """Whether a person carries the device and its IMU gives the steps."""
         return self.gait is not None and self.imu is not None
 
     @property
@@ -216,10 +216,10 @@ class Device(Section):
 
     @model_validator(mode="after")
     def _drivable(self) -> Self:
-        own_velocity = isinstance(self.route, QuadraticRoute)
-        if own_velocity and (self.speed_mps is not None or self.gait is not None):
+        has_velocity = isinstance(self.route, QuadraticRoute)
+        if has_velocity and (self.speed_mps is not None or self.gait is not None):
             raise ValueError("a quadratic route has its own velocity; remove speed_mps and gait")
-        if not own_velocity and (self.gait is None) == (self.speed_mps is None):
+        if not has_velocity and (self.gait is None) == (self.speed_mps is None):
             raise ValueError(
                 "a device needs either speed_mps (it drives) or gait (a person walks with it)"
             )

@@ -10,7 +10,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Interval = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]  # s
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Place = tuple[Finite, Finite]
+Point = tuple[Finite, Finite]
 Start = Annotated[float, Field(gt=0, le=2e9, allow_inf_nan=False)]  # ROS has 2^31 seconds
 FileName = Annotated[str, Field(pattern=r"^[^/]+$")]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]

@@ -18,13 +18,13 @@ from netpos.messages.values import RsuInfo
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.networks.config import FusionConfig
 
-# What a bag calls the parameters of the tracker of its measurements, as YAML.
+# Name of the fact with the parameters of the tracker, as YAML.
 TRACKER_FACT = "tracker"
-# The network's list of RSUs that its tracker was given, as YAML.
+# Name of the fact with the list of RSUs of the tracker, as YAML.
 RSUS_FACT = "rsus"
-# Its scenario, with the seed, where it was simulated, as YAML.
+# Name of the fact with the scenario and its seed, for simulated runs, as YAML.
 SCENARIO_FACT = "scenario"
-# The same of the networks whose tracks are fused and the parameters of that.
+# Name of the fact with the fused networks and the parameters of the fusion.
 FUSION_FACT = "fusion"
 
 
@@ -41,7 +41,7 @@ class TrackerSettings:
     networks: tuple[str, ...] = ()
     fusion: Mapping[str, Any] = field(default_factory=dict)
     names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """What each network calls the devices, where it has names of its own."""
+    """Names that each network gives the devices, where they differ."""
     rsus: str = ""
     """The network's list of RSUs as YAML; empty: none."""
 
@@ -59,13 +59,13 @@ DEFAULTS = TrackerSettings()
 
 
 def bag_settings(bag: BagReader) -> TrackerSettings:
-    """Settings a bag holds: what its trackers said they used, or who wrote it noted.
+    """Settings in a bag: those that its trackers published, or that its writer noted.
 
     Raises ``BagError`` where it holds none, or several that do not agree.
     """
     fusion = _mapping(bag, FUSION_FACT)
     if fusion is None and TRACKER_FACT not in bag.facts:
-        raise BagError(f"{bag.path} does not say with which parameters it is to be tracked")
+        raise BagError(f"{bag.path} does not say with which parameters to track it")
     networks = tuple(map(str, (fusion or {}).pop("networks", ())))
     parameters = _mapping(bag, TRACKER_FACT) or {}
     lists = bag.facts.get(RSUS_FACT, ())
@@ -76,10 +76,10 @@ def bag_settings(bag: BagReader) -> TrackerSettings:
 
 
 def tracker_fact(config: TrackerConfig, rsus: str = "") -> dict[str, str]:
-    """What a bag is told of the parameters of its tracker, every one of them, and of the list of
-    RSUs it was given; trackers of several networks say the same."""
-    told = {TRACKER_FACT: yaml.safe_dump(asdict(replace(config, network="")))}
-    return told | ({RSUS_FACT: rsus} if rsus else {})
+    """Facts of a bag: every parameter of its tracker, and its list of RSUs; trackers of several
+    networks have the same facts."""
+    facts = {TRACKER_FACT: yaml.safe_dump(asdict(replace(config, network="")))}
+    return facts | ({RSUS_FACT: rsus} if rsus else {})
 
 
 def list_of(file: Path | str) -> str:
@@ -97,17 +97,17 @@ def not_usual(config: TrackerConfig) -> dict[str, Any]:
 
 
 def fusion_fact(networks: tuple[str, ...], config: FusionConfig) -> dict[str, str]:
-    """What a bag is told of the networks and the fusion of their tracks."""
+    """Facts of a bag: the networks and the fusion of their tracks."""
     return {FUSION_FACT: yaml.safe_dump({"networks": list(networks), **asdict(config)})}
 
 
 def _mapping(bag: BagReader, name: str) -> dict[str, Any] | None:
-    """The one value of a fact, None where nothing is said."""
+    """The one value of a fact, None where the bag has none."""
     texts = bag.facts.get(name, ())
     try:
         values = [load_yaml(text) or {} for text in texts]
     except YamlError as error:
-        raise BagError(f"{bag.path}: what it says of its {name}: {error}") from error
+        raise BagError(f"{bag.path}: its {name} cannot be read: {error}") from error
     if not all(isinstance(value, dict) for value in values):
         raise BagError(f"{bag.path}: {name!r} is not a mapping of parameters")
     if len(values) > 1:

@@ -65,7 +65,7 @@ class Beacons:
 
 
 class Simulation:
-    """A scenario come to life; every method may be called again and gives the same values."""
+    """Simulation of a scenario. Every method gives the same values when called again."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
@@ -152,9 +152,11 @@ class Simulation:
             vue.sight,
             self._errors,
         )
-        found = [self._measurement(beacon, part, seen, j) for j in range(int(seen.heard_by[0]))]
-        told = [m for m in found if m.fields]
-        return [replace(m, expected=len(told)) for m in told]
+        measurements = [
+            self._measurement(beacon, part, seen, j) for j in range(int(seen.heard_by[0]))
+        ]
+        usable = [m for m in measurements if m.fields]
+        return [replace(m, expected=len(usable)) for m in usable]
 
     def warm_up(self) -> None:
         """Compile the measurement kernel, so that the first beacon does not wait for it."""
@@ -198,7 +200,7 @@ class Simulation:
         return self._vues[vue_id].truth(stamps_ns)
 
     def initial_pose(self, vue_id: str) -> InitialPose | None:
-        """The position handed to the tracker, where the scenario asks for one."""
+        """Initial position for the tracker, where the scenario asks for one."""
         return self._vues[vue_id].initial_pose
 
     def _measurement(

@@ -1,4 +1,4 @@
-"""How large a scenario is, told by its numbers before anything is built."""
+"""How large a scenario is, from its numbers, before anything is built."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
     from netpos.scenario.schema import Device, Scenario
 
 MESSAGES_MAX = 20_000_000
-"""Of a whole run: some GB of arrays and of bag; chosen, not measured."""
+"""Limit for a whole run, a few GB of arrays and of bag; chosen, not measured."""
 
 
 def route_duration_s(device: Device) -> float:
-    """How long a device takes for its route, without the turns at its corners; s."""
+    """Duration [s] of a device's route, without the turns at its corners."""
     route = device.route
     if route.kind == "quadratic":
         return math.fsum(stretch.duration_s for stretch in route.stretches)
@@ -45,7 +45,7 @@ def messages_of(device: Device, heard: int, limit_s: float) -> float:
 
 
 def check_motion(device: Device) -> None:
-    """ValueError where the motion alone would not fit: it is drawn for the whole route."""
+    """Raise ValueError if the motion alone (of the whole route) does not fit into memory."""
     steps = route_duration_s(device) / device.beacon_interval_s
     if device.wander_density_mps2_sqrthz is not None and steps > MESSAGES_MAX:
         raise ValueError(
@@ -56,7 +56,7 @@ def check_motion(device: Device) -> None:
 
 
 def check_size(scenario: Scenario) -> None:
-    """ValueError, with limit and keys to change, for a run that would not fit into memory."""
+    """Raise ValueError, with limit and keys to change, if a run does not fit into memory."""
     nearest = scenario.measurement.nearest
     heard = min(nearest, len(scenario.rsus.units) or nearest)
     limit_s = scenario.max_duration_s or math.inf

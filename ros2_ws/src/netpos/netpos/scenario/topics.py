@@ -60,7 +60,7 @@ def topic_of(value: Value) -> str:
 
 def device_topics(scenario: Scenario) -> dict[str, str]:
     """Message type by topic of everything the scenario's devices emit."""
-    found = {}
+    types = {}
     for vue_id, device in scenario.each_device:
         absent = {
             InitialPose: device.initial_pose_sd_m is None,
@@ -69,8 +69,8 @@ def device_topics(scenario: Scenario) -> dict[str, str]:
         }
         for kind, (name, type_name) in _OF_DEVICE.items():
             if not absent.get(kind, False):
-                found[topics.of_vue(vue_id, name)] = type_name
-    return found
+                types[topics.of_vue(vue_id, name)] = type_name
+    return types
 
 
 def to_message(codec: Codec, value: Value) -> Any:

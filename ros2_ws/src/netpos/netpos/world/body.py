@@ -1,4 +1,4 @@
-"""What carries a device: the state of a body in the plane and in space."""
+"""State of the body that carries a device, in the plane and in three dimensions."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class Kinematics:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BodyState:
-    """Motion of a body in space at n instants: position, velocity (n, 3) in map; ``rotation`` n
-    rotations body -> map; angular_velocity (n, 3) rad/s in body axes."""
+    """Motion of a body in three dimensions at n instants: position, velocity (n, 3) in map;
+    ``rotation`` n rotations body -> map; angular_velocity (n, 3) rad/s in body axes."""
 
     position: Array
     velocity: Array
@@ -40,7 +40,7 @@ class BodyState:
 
 
 class BodyMotion(Protocol):
-    """What carries a device: a vehicle's ``Motion`` or a person's gait."""
+    """Motion that carries a device: a vehicle's ``Motion`` or a person's gait."""
 
     duration_s: float
     smooth: bool
@@ -59,7 +59,7 @@ def check_times(time_s: npt.ArrayLike, duration_s: float) -> Array:
 
 
 def level(state: Kinematics) -> BodyState:
-    """A plane motion as that of a level body in space."""
+    """A plane motion as the motion of a level body in three dimensions."""
     zero = np.zeros((len(state.yaw), 2))
     return BodyState(
         position=np.hstack([state.position, zero[:, :1]]),
@@ -70,7 +70,7 @@ def level(state: Kinematics) -> BodyState:
 
 
 def on_hills(state: Kinematics, height: Array, climb: Array, rate: Array) -> BodyState:
-    """A plane motion as that of a body that points up and down as it climbs."""
+    """A plane motion as the motion of a body that pitches with its climb."""
     speed = np.hypot(*state.velocity.T)
     gained = (state.velocity * state.acceleration).sum(axis=1) / speed
     pitch = -np.arctan2(climb, speed)

@@ -1,4 +1,4 @@
-"""Where on earth ``map`` is: metres east, north and up of a datum, exact on the WGS 84 ellipsoid.
+"""Position of ``map`` on earth: metres east, north and up of a datum, exact on WGS 84.
 
 ``map`` is the tangent plane at the datum: a topocentric frame, no projection. 500 km away the
 ground is about 20 km below z = 0, and local east and north are turned against those of ``map``;
@@ -54,14 +54,14 @@ class Datum:
         return np.column_stack([latitude, longitude, height])
 
     def enu_axes(self, latitude_deg: float, longitude_deg: float) -> Array:
-        """Local east, north and up at a place, in ``map``: the columns of a rotation (3, 3)."""
+        """Local east, north and up at a point, in ``map``: the columns of a rotation (3, 3)."""
         here = _ecef_axes(self.latitude_deg, self.longitude_deg)
         axes: Array = here.T @ _ecef_axes(latitude_deg, longitude_deg)
         return axes
 
 
 def check_geodetic(latitude_deg: float, longitude_deg: float, height_m: float) -> None:
-    """Raises ``ValueError`` for what is no place near the earth's surface."""
+    """Raises ``ValueError`` for values that are not near the earth's surface."""
     for name, value, low, high in (
         ("latitude", latitude_deg, -90.0, 90.0),
         ("longitude", longitude_deg, -180.0, 180.0),

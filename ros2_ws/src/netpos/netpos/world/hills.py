@@ -1,4 +1,4 @@
-"""The height of a road."""
+"""Height of a road over time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hills:
-    """Height of a road: a sine in time, along which a body on it points; amplitude 0: flat."""
+    """Height of a road: a sine in time; a body on it pitches with the slope. Amplitude 0: flat."""
 
     amplitude_m: float = 0.0
     period_s: float = 180.0

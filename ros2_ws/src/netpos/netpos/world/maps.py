@@ -1,4 +1,4 @@
-"""Maps: buildings, streets and places of roadside units (RSUs)."""
+"""Maps: buildings, streets and positions of roadside units (RSUs)."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ class StreetGrid:
         return np.hstack([corner, corner + self.block_m])
 
     def lamp_posts(self, spacing_m: float, kerb_offset_m: float) -> Array:
-        """(n, 2) places along every street, ``spacing_m`` apart, on alternating sides [m].
+        """(n, 2) positions along every street, ``spacing_m`` apart, on alternating sides [m].
 
         The first place is on the map's edge, and so is the last where the spacing divides the
         side. ``kerb_offset_m`` is the distance from the centre line; > 0, so that no vehicle on
         the centre line ever drives through an antenna."""
         if not 0 < kerb_offset_m <= self.street_m / 2:
             raise ValueError(
-                f"kerb_offset_m must be in (0, {self.street_m / 2}] so that RSUs stand beside the "
+                f"kerb_offset_m must be in (0, {self.street_m / 2}] so that RSUs are beside the "
                 f"centre line and inside the street, got {kerb_offset_m}"
             )
         if not 0 < spacing_m < self.side_m:

@@ -98,7 +98,7 @@ class Motion:
         )
 
     def body_at(self, time_s: npt.ArrayLike) -> BodyState:
-        """The same as a body in space: level, or pointing along its hills."""
+        """The same as a body in three dimensions: level, or pitching with its hills."""
         state = self.at(time_s)
         if self.hills.amplitude_m == 0.0:
             return level(state)
@@ -155,7 +155,7 @@ def _walk(
     speed: float,
     acceleration: float | None,
 ) -> tuple[list[_Piece], float]:
-    """Pieces from break to break, where the motion begins, stands or ends, and their duration."""
+    """Pieces from break to break, where the motion begins, pauses or ends, and their duration."""
     pieces: list[_Piece] = []
     clock = 0.0
     for a, b in itertools.pairwise(breaks):
@@ -196,8 +196,8 @@ def _check(
     repeated = np.flatnonzero((np.diff(xy, axis=0) == 0).all(axis=1))
     if repeated.size:
         raise ValueError(
-            f"way-points {repeated[0]} and {repeated[0] + 1} are the same place; "
-            "to stand there use pauses_s"
+            f"way-points {repeated[0]} and {repeated[0] + 1} are the same point; "
+            "remove one, or set pauses_s to wait there"
         )
 
 
@@ -299,7 +299,7 @@ def _stand(
 
 
 def _along(segment: _Segment, way: float) -> tuple[float, float, float]:
-    """x, y, yaw after a way along a segment."""
+    """x, y, yaw after a distance along a segment."""
     half = segment.curvature * way / 2
     chord = way * float(np.sinc(half / np.pi))
     return (

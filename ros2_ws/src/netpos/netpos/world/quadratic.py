@@ -1,4 +1,4 @@
-"""Motion of constant acceleration, stretch by stretch."""
+"""Motion in stretches of constant acceleration."""
 
 from __future__ import annotations
 
@@ -71,5 +71,5 @@ class QuadraticMotion:
         )
 
     def body_at(self, time_s: npt.ArrayLike) -> BodyState:
-        """The same as a level body in space."""
+        """The same as a level body in three dimensions."""
         return level(self.at(time_s))

@@ -45,8 +45,8 @@ def random_route(grid: StreetGrid, rng: np.random.Generator, max_crossings: int 
 
 
 def rectangle(corner: npt.ArrayLike, width_m: float, height_m: float, *, laps: int = 1) -> Array:
-    """(4 laps + 1, 2) closed way round a rectangle, counter-clockwise from its lower left corner,
-    eastwards first."""
+    """(4 laps + 1, 2) way-points of a closed path round a rectangle, counter-clockwise from its
+    lower left corner, eastwards first."""
     if not (width_m > 0 and height_m > 0 and laps >= 1):
         raise ValueError(
             f"a rectangle needs width, height > 0 and laps >= 1, got {width_m}, {height_m}, {laps}"

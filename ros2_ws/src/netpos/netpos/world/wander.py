@@ -1,4 +1,4 @@
-"""A motion whose velocity wanders as white acceleration makes it: what trackers assume."""
+"""A motion with white acceleration added: the motion model that trackers assume."""
 
 from __future__ import annotations
 
@@ -54,18 +54,19 @@ class Wander:
         """
         t = check_times(time_s, self.duration_s)
         way = self._way.body_at(t)
-        at = t / self._step_s
-        whole = np.rint(at)
-        at = np.where(np.abs(at - whole) < 1e-6, whole, at)  # stamps are whole nanoseconds
-        k = np.floor(at).astype(int)
-        s = (at - k)[:, None]
+        steps = t / self._step_s
+        whole = np.rint(steps)
+        # stamps are whole nanoseconds, so a grid time may be off by rounding
+        steps = np.where(np.abs(steps - whole) < 1e-6, whole, steps)
+        k = np.floor(steps).astype(int)
+        s = (steps - k)[:, None]
         p0, p1 = self._position[k], self._position[k + 1]
         v0, v1 = self._step_s * self._velocity[k], self._step_s * self._velocity[k + 1]
-        bend = 2 * (p0 - p1) + v0 + v1
+        cubic = 2 * (p0 - p1) + v0 + v1
         rise = 3 * (p1 - p0) - 2 * v0 - v1
-        position = way.position[:, :2] + p0 + s * (v0 + s * (rise + s * bend))
-        velocity = way.velocity[:, :2] + (v0 + s * (2 * rise + 3 * s * bend)) / self._step_s
-        acceleration = (2 * rise + 6 * s * bend) / self._step_s**2
+        position = way.position[:, :2] + p0 + s * (v0 + s * (rise + s * cubic))
+        velocity = way.velocity[:, :2] + (v0 + s * (2 * rise + 3 * s * cubic)) / self._step_s
+        acceleration = (2 * rise + 6 * s * cubic) / self._step_s**2
         across = velocity[:, 0] * acceleration[:, 1] - velocity[:, 1] * acceleration[:, 0]
         speed2 = (velocity**2).sum(axis=1)
         return level(

@@ -36,14 +36,14 @@ def aligned(
 ) -> tuple[Course | None, Array]:
     """The course from one fix a second, and the true position, heading and speed at the end."""
     times, rates = imu_of(motion, end_s, tilt or Rotation.identity())
-    at = np.arange(begin_s, end_s + 1e-9, 1.0)
-    fixes = motion.at(at).position
+    fix_s = np.arange(begin_s, end_s + 1e-9, 1.0)
+    fixes = motion.at(fix_s).position
     fixes = fixes + sd_m * np.random.default_rng(seed).normal(size=fixes.shape)
-    cov = np.tile(max(sd_m, 0.01) ** 2 * np.eye(2), (len(at), 1, 1))
+    cov = np.tile(max(sd_m, 0.01) ** 2 * np.eye(2), (len(fix_s), 1, 1))
     end = motion.at(end_s)
     speed = math.hypot(*end.velocity[0])
     truth = np.array([*end.position[0], end.yaw[0], speed])
-    return fit_course(way_of(times, rates, at), fixes, cov), truth
+    return fit_course(way_of(times, rates, fix_s), fixes, cov), truth
 
 
 CURVE = follow([[0, 0], [80, 0], [80, 80], [0, 80]], 8.0, corner_radius_m=20.0)
@@ -101,8 +101,8 @@ def test_errors_are_as_large_as_claimed() -> None:
     for seed in range(60):
         course, truth = aligned(CURVE, 12.0, sd_m=2.0, seed=seed)
         assert course is not None
-        found = np.array([*course.position, course.heading, course.speed])
-        error = found - truth
+        estimate = np.array([*course.position, course.heading, course.speed])
+        error = estimate - truth
         error[2] = math.remainder(error[2], math.tau)
         errors.append(error / np.sqrt(np.diag(course.cov)))
     rms = np.sqrt(np.mean(np.square(errors), axis=0))

@@ -82,7 +82,7 @@ def test_strapdown_of_perfect_samples_returns_the_walk(gait: Gait) -> None:
     start_ns = 10**9
     imu = simulate_imu(PERFECT, gait, start_ns, 1, "vue_1")
     begin = gait.body_at(0.0)
-    attitude, velocity, place = begin.rotation[0], begin.velocity[0], begin.position[0]
+    attitude, velocity, position = begin.rotation[0], begin.velocity[0], begin.position[0]
     truth = gait.body_at((imu.stamp_ns - start_ns) * 1e-9)
     dt = 1 / PERFECT.rate_hz
     for i, (rate, force) in enumerate(zip(imu.angular_velocity, imu.specific_force, strict=True)):
@@ -90,12 +90,12 @@ def test_strapdown_of_perfect_samples_returns_the_walk(gait: Gait) -> None:
         attitude = attitude * half
         new = velocity + (attitude.apply(force) - np.array([0.0, 0.0, 9.80665])) * dt
         attitude = attitude * half
-        place, velocity = place + (velocity + new) * dt / 2, new
+        position, velocity = position + (velocity + new) * dt / 2, new
         if i % 100 == 0:
-            assert np.abs(place - truth.position[i]).max() < 2e-3
+            assert np.abs(position - truth.position[i]).max() < 2e-3
             assert np.abs(velocity - truth.velocity[i]).max() < 1e-9
             assert (attitude.inv() * truth.rotation[i]).magnitude() < 1e-9
-    assert np.abs(place - truth.position[-1]).max() < 2e-3
+    assert np.abs(position - truth.position[-1]).max() < 2e-3
 
 
 def test_amplitudes_are_those_of_the_model() -> None:
@@ -219,11 +219,11 @@ def _plain(model: ImuModel) -> dict[str, float]:
 
 
 def test_magnetometer_turns_with_the_body_and_meets_iron_and_disturbances() -> None:
-    place = MagneticDisturbance(center=(6.7, 2.0), radius_m=0.5, field_t=(30e-6, 0.0, 5e-6))
+    disturbance = MagneticDisturbance(center=(6.7, 2.0), radius_m=0.5, field_t=(30e-6, 0.0, 5e-6))
     clean, iron = (
         MagnetometerModel(noise_sd_t=0.0),
         MagnetometerModel(
-            noise_sd_t=0.0, hard_iron_sd_t=5e-6, soft_iron_sd=0.03, disturbances=(place,)
+            noise_sd_t=0.0, hard_iron_sd_t=5e-6, soft_iron_sd=0.03, disturbances=(disturbance,)
         ),
     )
     gait = GAITS[0]
@@ -233,7 +233,7 @@ def test_magnetometer_turns_with_the_body_and_meets_iron_and_disturbances() -> N
         state.rotation.apply(field), np.tile(clean.field_map, (len(field), 1)), atol=1e-15
     )
     _, worn = simulate_magnetometer(iron, gait, 0, 1, "v")
-    away = np.hypot(*(state.position[:, :2] - place.center).T)
+    away = np.hypot(*(state.position[:, :2] - disturbance.center).T)
     assert away.min() < 0.1
     far = away > 4.0
     design = np.hstack([field[far], np.ones((far.sum(), 1))])
@@ -245,5 +245,5 @@ def test_magnetometer_turns_with_the_body_and_meets_iron_and_disturbances() -> N
     extra = state.rotation[near].apply(
         np.linalg.solve(fit[:3].T, worn[near] - fit[3]) - field[near]
     )
-    expected = np.array(place.field_t) * math.exp(-(away[near] ** 2) / 0.5)
+    expected = np.array(disturbance.field_t) * math.exp(-(away[near] ** 2) / 0.5)
     np.testing.assert_allclose(extra, expected, atol=1e-8)

@@ -47,8 +47,8 @@ def test_scale_from_ranges_of_one_anchor_is_consistent() -> None:
         truth = rng.normal(1.0, 0.1)
         scale = LengthScale(1.0, 0.1)
         angle = np.linspace(0, 2 * np.pi, 33)
-        place = np.column_stack([3 * np.cos(angle), 6 + 3 * np.sin(angle)])
-        ranges = np.hypot(*place.T)
+        positions = np.column_stack([3 * np.cos(angle), 6 + 3 * np.sin(angle)])
+        ranges = np.hypot(*positions.T)
         for a, b in itertools.pairwise(ranges.tolist()):
             modelled = (a - b) / truth
             measured = a - b + rng.normal(scale=0.03 * math.sqrt(2))

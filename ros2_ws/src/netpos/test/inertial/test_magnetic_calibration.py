@@ -60,6 +60,8 @@ def test_noisy_readings_are_near_the_truth() -> None:
         ),
     ],
 )
-def test_what_cannot_be_told_is_refused(field: np.ndarray, message: str) -> None:
+def test_readings_that_do_not_determine_the_iron_are_refused(
+    field: np.ndarray, message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         fit_iron(field)

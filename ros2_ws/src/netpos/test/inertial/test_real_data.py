@@ -145,8 +145,8 @@ def with_heading_of_vqf(got: PdrRun, imu: loaders.ImuRecord) -> list[StepEvent]:
     assert imu.magnetic_field is not None
     filter_ = VQF(float(np.median(np.diff(imu.stamp_ns))) * 1e-9)
     samples = (imu.angular_velocity, imu.specific_force, imu.magnetic_field)
-    found = filter_.updateBatch(*map(np.ascontiguousarray, samples))["quat9D"]
-    turned = yaw_of(found) - yaw_of(got.attitude)
+    attitude = filter_.updateBatch(*map(np.ascontiguousarray, samples))["quat9D"]
+    turned = yaw_of(attitude) - yaw_of(got.attitude)
     return [
         replace(e, heading_rad=e.heading_rad + float(np.interp(e.end_ns, imu.stamp_ns, turned)))
         for e in got.events

@@ -63,13 +63,13 @@ def test_every_step_is_found_at_its_time(
     rate_hz: float, cadence_hz: float, amplitude: float
 ) -> None:
     stamps, force, peaks = gait(rate_hz, cadence_hz, 30, amplitude)
-    found = ends(detect(stamps, force)) - StepConfig().contact_lag_s
-    rebound = found > peaks[-1] + 0.5 / cadence_hz  # of the filter, after a slow walk
+    detected_s = ends(detect(stamps, force)) - StepConfig().contact_lag_s
+    rebound = detected_s > peaks[-1] + 0.5 / cadence_hz  # of the filter, after a slow walk
     assert np.count_nonzero(rebound) <= (1 if cadence_hz < 1.0 else 0)
-    found = found[~rebound]
-    assert found.size == peaks.size
-    np.testing.assert_allclose(found, peaks, atol=0.1)
-    assert abs(np.median(found - peaks)) < 0.04  # lead of the gravity high-pass at 0.9 Hz
+    detected_s = detected_s[~rebound]
+    assert detected_s.size == peaks.size
+    np.testing.assert_allclose(detected_s, peaks, atol=0.1)
+    assert abs(np.median(detected_s - peaks)) < 0.04  # lead of the gravity high-pass at 0.9 Hz
 
 
 def test_cadence_and_interval_chain() -> None:
@@ -103,9 +103,9 @@ def test_delay_within_a_bout_is_bounded() -> None:
     assert 0.0 < worst <= config.delay_s
 
 
-@pytest.mark.parametrize(("steps", "found"), [(2, 0), (3, 3)])
-def test_a_bout_opens_at_three_steps(steps: int, found: int) -> None:
-    assert len(detect(*gait(100.0, 1.8, steps, 3.0, noise=0.02)[:2])) == found
+@pytest.mark.parametrize(("steps", "detected"), [(2, 0), (3, 3)])
+def test_a_bout_opens_at_three_steps(steps: int, detected: int) -> None:
+    assert len(detect(*gait(100.0, 1.8, steps, 3.0, noise=0.02)[:2])) == detected
 
 
 @pytest.mark.parametrize(("amplitude", "expected"), [(0.05, 0), (0.6, 20)])
@@ -121,8 +121,8 @@ def test_turning_the_device_in_the_hand_is_not_walking(turn_radps: float, steps:
     vertical = G + np.where(shaking, 0.7 * np.sin(2 * np.pi * 1.5 * (t - 4.0)), 0.0)
     tilt = np.clip(t - 3.0, 0.0, None) * turn_radps
     force = np.column_stack([vertical * np.sin(tilt), 0 * t, vertical * np.cos(tilt)])
-    found = detect(np.rint(t * 1e9).astype(np.int64), force)
-    assert len(found) == pytest.approx(steps, abs=1 if steps else 0)
+    detected = detect(np.rint(t * 1e9).astype(np.int64), force)
+    assert len(detected) == pytest.approx(steps, abs=1 if steps else 0)
 
 
 def test_rest_has_no_steps_and_is_still() -> None:
@@ -205,13 +205,13 @@ def test_impacts_are_found_without_any_bounce() -> None:
     stamps = np.rint(t * 1e9).astype(np.int64)
     still = np.array([0.0, 0.0, G]) + rng.normal(scale=0.05, size=(t.size, 3))
     force = with_impacts(stamps, still, contacts)
-    found = ends(detect(stamps, force, StepConfig.waist()))
-    late = np.abs(found[:, None] - contacts).min(axis=0)
-    assert found.size == contacts.size
+    detected_s = ends(detect(stamps, force, StepConfig.waist()))
+    late = np.abs(detected_s[:, None] - contacts).min(axis=0)
+    assert detected_s.size == contacts.size
     assert late.max() < 0.07
     for r in Rotation.random(3, rng=rng):
         turned = ends(detect(stamps, r.apply(force), StepConfig.waist()))
-        np.testing.assert_allclose(turned, found, atol=1e-9)
+        np.testing.assert_allclose(turned, detected_s, atol=1e-9)
     assert len(detect(stamps, force)) < 10
 
 
@@ -317,9 +317,9 @@ def test_impacts_are_dated_without_a_lag() -> None:
     after = np.searchsorted(t, jumps)
     config = StepConfig.waist()
     steps = detect(*streamed(t, 2.0 * (np.searchsorted(jumps, t) % 2)), config)
-    found = ends(steps) - config.contact_lag_s
-    assert found.size == jumps.size
-    late = found - (t[after] - 0.005)
+    detected_s = ends(steps) - config.contact_lag_s
+    assert detected_s.size == jumps.size
+    late = detected_s - (t[after] - 0.005)
     assert np.abs(late).max() <= 0.5 * CELL_S
     assert abs(late.mean()) < 0.003
 

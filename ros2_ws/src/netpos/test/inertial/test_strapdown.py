@@ -123,8 +123,8 @@ def test_circle_at_constant_speed() -> None:
     increments = np.tile(dt * np.array([0, 0, rate, 0, speed * rate, G]), (n, 1))
     nav = run(start((speed, 0, 0)), increments, dt, still_earth(G))
     yaw, radius = rate * n * dt, speed / rate
-    place = [radius * math.sin(yaw), radius * (1 - math.cos(yaw)), 0.0]
-    np.testing.assert_allclose(nav[:3], place, atol=2e-4)
+    position = [radius * math.sin(yaw), radius * (1 - math.cos(yaw)), 0.0]
+    np.testing.assert_allclose(nav[:3], position, atol=2e-4)
     np.testing.assert_allclose(nav[3:6], [speed * math.cos(yaw), speed * math.sin(yaw), 0],
                                atol=1e-5)  # fmt: skip
     np.testing.assert_allclose(nav[6:10], Rotation.from_euler("z", yaw).as_quat(), atol=1e-12)
@@ -231,9 +231,9 @@ def test_intervals_of_any_length_fit_together() -> None:
     t = np.concatenate([[0.0], np.cumsum(np.tile([0.004, 0.016], 250))])
     fine = np.linspace(0.0, t[-1], 100 * 1000 + 1)
     total = cumulative_trapezoid(wild(fine), fine, axis=0, initial=0.0)
-    at = np.rint(t / fine[1]).astype(int)
+    index = np.rint(t / fine[1]).astype(int)
     nav, last, gained = start(), np.zeros(7), np.zeros(3)
-    for increment, dt in zip(np.diff(total[at], axis=0), np.diff(t), strict=True):
+    for increment, dt in zip(np.diff(total[index], axis=0), np.diff(t), strict=True):
         mechanise(nav, increment, float(dt), last, still_earth(G), gained)
     truth = reference(wild, start(), float(t[-1]), still_earth(G))
     C = np.empty((3, 3))

@@ -82,7 +82,7 @@ def test_without_a_magnetometer_the_heading_is_the_gyros_and_its_variance_grows(
     assert abs(math.atan2(*walking[-1].velocity[::-1])) < 0.1
 
 
-def test_a_magnetometer_that_falls_silent_and_comes_back_is_told_both_ways(
+def test_a_magnetometer_that_falls_silent_and_comes_back_is_reported_both_ways(
     samples: list[Sample],
 ) -> None:
     silent = [(t, w, f, None if 6 * NS < t < 12 * NS else m) for t, w, f, m in samples]
@@ -94,7 +94,7 @@ def test_a_magnetometer_that_falls_silent_and_comes_back_is_told_both_ways(
     assert core.conditions == ()
 
 
-def test_a_lasting_disturbance_is_told(samples: list[Sample]) -> None:
+def test_a_lasting_disturbance_is_reported(samples: list[Sample]) -> None:
     bent = [(t, w, f, m * (1.0 if t < 6 * NS else 2.0)) for t, w, f, m in samples]
     core, notices, _, _ = run(bent)
     assert "the magnetic field is disturbed" in notices[0]
@@ -113,7 +113,7 @@ def test_a_wrong_rate_makes_the_velocity_unknown(samples: list[Sample], every: i
         np.testing.assert_allclose(v.covariance, np.eye(2))
 
 
-def test_a_rate_that_recovers_is_told(samples: list[Sample]) -> None:
+def test_a_rate_that_recovers_is_reported(samples: list[Sample]) -> None:
     slow = [s for i, s in enumerate(samples) if i > 600 or i % 5 == 0]
     core, notices, _, steps = run(slow)
     assert [n[:19] for n in notices] == ["the IMU comes at 20", "the IMU comes at 10"]
@@ -121,7 +121,7 @@ def test_a_rate_that_recovers_is_told(samples: list[Sample]) -> None:
     assert steps > 12
 
 
-def test_gaps_are_told_once_and_counted(samples: list[Sample]) -> None:
+def test_gaps_are_reported_once_and_counted(samples: list[Sample]) -> None:
     holes = [s for s in samples if not (5 * NS < s[0] < 5.5 * NS or 9 * NS < s[0] < 9.4 * NS)]
     core, notices, velocities, steps = run(holes)
     assert core.counters["gap"] == 2
@@ -148,19 +148,19 @@ def test_swapped_axes_show_by_gravity_and_the_heading_is_not_believed(
         np.testing.assert_array_equal(v.velocity, 0.0)
 
 
-def test_a_device_worn_upside_down_is_told(samples: list[Sample]) -> None:
+def test_a_device_worn_upside_down_is_reported(samples: list[Sample]) -> None:
     core, notices, _, _ = run(mapped(samples, lambda v: v * [1.0, -1.0, -1.0]))
     assert core.conditions == ("axes",)
     assert "gravity points along -z of the device, 1" in notices[0]
 
 
-@pytest.mark.parametrize(("tilt_deg", "told"), [(57.0, False), (63.0, True)])
-def test_mount_tilt_at_its_boundary(tilt_deg: float, told: bool) -> None:
+@pytest.mark.parametrize(("tilt_deg", "noticed"), [(57.0, False), (63.0, True)])
+def test_mount_tilt_at_its_boundary(tilt_deg: float, noticed: bool) -> None:
     tilt = math.radians(tilt_deg)
     force = np.array([G * math.sin(tilt), 0.0, G * math.cos(tilt)])
     still = [(NS + i * NS // 100, np.zeros(3), force, None) for i in range(1000)]
     core, _, _, _ = run(still)
-    assert ("axes" in core.conditions) is told
+    assert ("axes" in core.conditions) is noticed
 
 
 def test_carried_devices_may_be_held_anyhow(samples: list[Sample]) -> None:
@@ -169,7 +169,7 @@ def test_carried_devices_may_be_held_anyhow(samples: list[Sample]) -> None:
     assert notices == []
 
 
-def test_a_saturated_accelerometer_is_told_once_and_steps_are_still_counted(
+def test_a_saturated_accelerometer_is_reported_once_and_steps_are_still_counted(
     samples: list[Sample],
 ) -> None:
     declared = [(t, w, np.clip(f, -11.0, 11.0), m) for t, w, f, m in samples]
@@ -198,7 +198,7 @@ def test_a_plateau_of_the_largest_reading_is_taken_for_saturation() -> None:
     assert core.counters.get("accelerometer_saturated", 0) == 0
 
 
-def test_a_saturated_gyro_is_told(samples: list[Sample]) -> None:
+def test_a_saturated_gyro_is_reported(samples: list[Sample]) -> None:
     """The heading is kept, less surely, until the field gives it again."""
     cut = [(t, np.clip(w, -0.15, 0.15), f, None) for t, w, f, _ in samples]
     core, notices, velocities, steps = run(cut, gyro_range_radps=0.15)
@@ -215,7 +215,7 @@ def test_a_saturated_gyro_is_told(samples: list[Sample]) -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_samples_that_are_not_finite_are_left_out_and_told_once(
+def test_samples_that_are_not_finite_are_left_out_and_reported_once(
     samples: list[Sample], bad: float
 ) -> None:
     broken = [
@@ -229,7 +229,7 @@ def test_samples_that_are_not_finite_are_left_out_and_told_once(
     assert steps == 19
 
 
-def test_force_in_g_is_told_until_it_is_plausible(samples: list[Sample]) -> None:
+def test_force_in_g_is_reported_until_it_is_plausible(samples: list[Sample]) -> None:
     wrong = [(t, w, f / (G if t < 3 * NS else 1.0), m) for t, w, f, m in samples]
     core, notices, _, steps = run(wrong)
     assert "the mean specific force is not 9.8 m/s^2: is it in g" in notices[0]
@@ -238,7 +238,7 @@ def test_force_in_g_is_told_until_it_is_plausible(samples: list[Sample]) -> None
     assert steps > 15
 
 
-def test_conditions_are_told_when_they_begin_and_end() -> None:
+def test_conditions_are_reported_when_they_begin_and_end() -> None:
     c = Conditions()
     for holds in (False, True, True, False, False, True):
         c.set("name", holds, "begins", "ends")

@@ -60,20 +60,20 @@ def exchange(
     return symmetric, product / (round_1 + round_2 + reply_1 + reply_2)
 
 
-@pytest.mark.parametrize(("method", "place"), [("symmetric", 0), ("asymmetric", 1)])
+@pytest.mark.parametrize(("method", "method_index"), [("symmetric", 0), ("asymmetric", 1)])
 def test_the_residual_of_the_drift_is_that_of_the_timestamps(
-    method: Literal["symmetric", "asymmetric"], place: int
+    method: Literal["symmetric", "asymmetric"], method_index: int
 ) -> None:
     ranging = TwoWayRanging(anchor_reply_s=1e-3, device_reply_s=1.5e-3, method=method)
     replies = Fraction(1, 1000), Fraction(3, 2000)
     anchor, device = Fraction(-4, 10**6), Fraction(7, 10**6)
     flight = Fraction(20, 10**9)
-    measured = exchange(flight, replies, (anchor, device))[place]
+    measured = exchange(flight, replies, (anchor, device))[method_index]
     scale, offset_m = ranging.residual(float(device), float(anchor))
     distance_m = float(flight) * speed_of_light
     expected_m = float(measured - flight) * speed_of_light
     assert distance_m * scale + offset_m == pytest.approx(expected_m, rel=1e-4)
-    assert abs(expected_m) > (1e-6 if place else 0.1)
+    assert abs(expected_m) > (1e-6 if method_index else 0.1)
 
 
 @pytest.mark.parametrize("method", ["symmetric", "asymmetric"])
@@ -136,8 +136,8 @@ def test_measured_range_and_phase_are_those_of_the_geometry(scenario_file: str) 
         assert stats.kstest(error, "norm").pvalue > 1e-4
     assert abs(np.corrcoef(range_error, phase_error)[0, 1]) < 0.15
     np.testing.assert_allclose(seen.variances[heard, 0, 4], math.radians(6.0) ** 2)
-    spread = TwoWayRanging().range_sd_m
-    np.testing.assert_allclose(seen.variances[heard, 0, 3], spread**2)
+    sd_m = TwoWayRanging().range_sd_m
+    np.testing.assert_allclose(seen.variances[heard, 0, 3], sd_m**2)
 
 
 def test_a_drift_of_the_clocks_shifts_every_range_alike(scenario_file: str) -> None:

@@ -23,8 +23,8 @@ def test_offset_and_drift_satisfy_equations_1_and_2() -> None:
     for n in range(1, len(STAMPS)):  # fokin2020:eq.1
         assert offset[n] == pytest.approx(offset[n - 1] + drift[n] * STEP_NS * 1e-9, abs=1e-15)
     eta = drift[1:] - model.beta * drift[:-1]  # fokin2020:eq.2
-    spread = (eta**2).sum() / model.drift_step_sd**2
-    assert stats.chi2(len(eta)).ppf(1e-3) < spread < stats.chi2(len(eta)).ppf(1 - 1e-3)
+    chi2 = (eta**2).sum() / model.drift_step_sd**2
+    assert stats.chi2(len(eta)).ppf(1e-3) < chi2 < stats.chi2(len(eta)).ppf(1 - 1e-3)
 
 
 def test_starts_follow_the_papers_distributions() -> None:
@@ -90,8 +90,8 @@ def test_rsu_clock_errors_have_the_wanted_autocorrelation() -> None:
     )
     assert abs(errors.mean(axis=0)).max() < 4 * 3e-9 / np.sqrt(3000)
     products = errors * errors[:, :1] / 9e-18
-    spread = 4 * products.std(axis=0) / np.sqrt(3000)
-    assert (abs(products.mean(axis=0) - np.exp(-lags / 50.0)) < spread).all()
+    four_sd = 4 * products.std(axis=0) / np.sqrt(3000)
+    assert (abs(products.mean(axis=0) - np.exp(-lags / 50.0)) < four_sd).all()
 
 
 def test_rsu_clock_errors_are_normal_and_independent() -> None:

@@ -135,14 +135,16 @@ def test_azimuth_and_elevation_have_each_its_own_bound(rows: int, columns: int) 
     )
     azimuth, elevation, away, n = 0.5, 0.3, 40.0, 4000
     flat = away * math.cos(elevation)
-    place = [
+    position = [
         flat * math.cos(azimuth),
         flat * math.sin(azimuth),
         away * math.sin(elevation),
     ]
     sight = Sight(1, math.inf, np.zeros((0, 4)), ALWAYS_VISIBLE, 50.0, 1.5)
     sites = _sites(np.zeros((1, 2)))
-    seen = observe(np.arange(1, n + 1), np.tile(place, (n, 1)), np.zeros(n), sites, sight, errors)
+    seen = observe(
+        np.arange(1, n + 1), np.tile(position, (n, 1)), np.zeros(n), sites, sight, errors
+    )
     snr = 1e10 * 10.0 ** (-(20.0 + 30.0 * math.log10(away)) / 10.0)
     bound = np.diag(direction_bound(array, snr, azimuth, elevation))
     better, worse = sorted(bound)

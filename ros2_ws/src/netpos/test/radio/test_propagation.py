@@ -68,8 +68,8 @@ def test_field_is_uniform_smooth_and_keyed() -> None:
     """Uniform over keys at any place in a cell; close places have close values; far ones are
     independent."""
     keys = [stream_key(4, f"rsu_{i}") for i in range(3000)]
-    for place in ((0.0, 0.0), (-13.0, 20.0), (124.9, -75.1)):
-        drawn = [smooth_uniform(*place, 50.0, k) for k in keys]
+    for point in ((0.0, 0.0), (-13.0, 20.0), (124.9, -75.1)):
+        drawn = [smooth_uniform(*point, 50.0, k) for k in keys]
         assert stats.kstest(drawn, "uniform").pvalue > 1e-3
     here = np.array([smooth_uniform(10.0, 10.0, 50.0, k) for k in keys])
     near = np.array([smooth_uniform(10.5, 10.0, 50.0, k) for k in keys])

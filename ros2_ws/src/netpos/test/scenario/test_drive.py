@@ -63,9 +63,9 @@ def test_a_grid_is_square_and_its_heights_follow_the_seed() -> None:
 
 
 def test_height_climb_and_pitch_belong_together() -> None:
-    made = simulation()
-    stamps = made.scenario.start_ns + np.arange(0, 30 * 10**9, 10**7, dtype=np.int64)
-    truth = made.truth(VUE, stamps)
+    simulated = simulation()
+    stamps = simulated.scenario.start_ns + np.arange(0, 30 * 10**9, 10**7, dtype=np.int64)
+    truth = simulated.truth(VUE, stamps)
     climb = np.gradient(truth.position[:, 2], 0.01)
     np.testing.assert_allclose(climb[1:-1], truth.velocity[1:-1, 2], atol=1e-6)
     body = truth.rotation.inv().apply(truth.velocity)
@@ -77,23 +77,23 @@ def test_height_climb_and_pitch_belong_together() -> None:
     np.testing.assert_allclose(turned[steady], middle[steady], atol=1e-6)
 
 
-def test_the_antenna_stands_at_its_lever_arm() -> None:
-    made = simulation()
-    odometry = {e.stamp_ns: e for e in made.events() if isinstance(e, Odometry)}
-    for beacon in (e for e in made.events() if isinstance(e, Beacon)):
+def test_the_antenna_is_at_its_lever_arm() -> None:
+    simulated = simulation()
+    odometry = {e.stamp_ns: e for e in simulated.events() if isinstance(e, Odometry)}
+    for beacon in (e for e in simulated.events() if isinstance(e, Beacon)):
         pose = odometry[beacon.stamp_ns]
         arm = Rotation.from_quat(pose.quaternion).apply([0.4, 0.2, 0.9])
         np.testing.assert_allclose(beacon.position, pose.position + arm, atol=1e-9)
-        assert made.measure(beacon)[0].lever_arm == (0.4, 0.2, 0.9)
+        assert simulated.measure(beacon)[0].lever_arm == (0.4, 0.2, 0.9)
         np.testing.assert_allclose(pose.linear_velocity[1:], 0.0, atol=1e-12)
 
 
 def test_a_perfect_imu_leads_along_the_true_way() -> None:
     """The mechanisation of what the IMU says is the motion in closed form, pitch and all."""
-    made = simulation(**PERFECT, max_duration_s=120.0)
-    samples = made.imu_arrays(VUE)
-    kept = samples.stamp_ns <= made.scenario.start_ns + 120 * 10**9
-    start = made.truth(VUE, np.array([made.scenario.start_ns]))
+    simulated = simulation(**PERFECT, max_duration_s=120.0)
+    samples = simulated.imu_arrays(VUE)
+    kept = samples.stamp_ns <= simulated.scenario.start_ns + 120 * 10**9
+    start = simulated.truth(VUE, np.array([simulated.scenario.start_ns]))
     nav = np.zeros(NAV)
     nav[:3], nav[3:6] = start.position[0], start.velocity[0]
     nav[6:10] = start.rotation[0].as_quat()
@@ -101,7 +101,7 @@ def test_a_perfect_imu_leads_along_the_true_way() -> None:
     rates = np.hstack([samples.angular_velocity, samples.specific_force])[kept]
     for rate in rates:
         mechanise(nav, 0.01 * rate, 0.01, last, still_earth(), gained)
-    end = made.truth(VUE, samples.stamp_ns[kept][-1:])
+    end = simulated.truth(VUE, samples.stamp_ns[kept][-1:])
     np.testing.assert_allclose(nav[:3], end.position[0], atol=0.02)
     np.testing.assert_allclose(nav[3:6], end.velocity[0], atol=2e-3)
 

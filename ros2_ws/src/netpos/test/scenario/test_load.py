@@ -63,7 +63,7 @@ def test_a_good_file(tmp_path: Path) -> None:
         ),
         ("model: fixed", "model: magic", "line 7: measurement.errors: .*magic"),
         ("kind: waypoints", "kind: metis_random", "line 9: devices.0.route.points: unknown key"),
-        ("[10.0, 5.0]", "[0.0, 5.0]", "line 9: devices.0: .*same place"),
+        ("[10.0, 5.0]", "[0.0, 5.0]", "line 9: devices.0: .*same point"),
         ("seed: 3", "seed: 3\nseed: 4", "line 2: seed was given already in line 1"),
         ("seed: 3", "seed: [3", "line .*not valid YAML"),
         ("seed: 3", "seed: -3", "line 1: seed: .*got -3"),

@@ -27,14 +27,14 @@ def measured(seed: int = 1, **changes: Any) -> list[tuple[Beacon, RsuMeasurement
 
 
 def test_each_network_has_times_names_and_variances_of_its_own() -> None:
-    found = measured()
+    arrivals = measured()
     stamps = {
-        name: np.array([(m.stamp_ns - NS) // 10**6 for _, m in found if m.rsu_id == name])
+        name: np.array([(m.stamp_ns - NS) // 10**6 for _, m in arrivals if m.rsu_id == name])
         for name in ("wifi_server", "wimax_server")
     }
     np.testing.assert_array_equal(stamps["wifi_server"], np.arange(0, 60_001, 500))
     np.testing.assert_array_equal(stamps["wimax_server"], np.arange(200, 60_001, 500))
-    for _, m in found:
+    for _, m in arrivals:
         wifi = m.rsu_id == "wifi_server"
         assert m.vue_id == ("wifi_1" if wifi else "vue_1")
         assert m.fields == Field.POSITION

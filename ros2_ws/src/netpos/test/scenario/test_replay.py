@@ -54,8 +54,8 @@ def read(path: Path, config: Any) -> list[Any]:
     """Tracker input of a bag, in its order."""
     with BagReader(path) as bag:
         readings = {name: reading_of(name, info, config) for name, info in bag.topics.items()}
-        found = [(readings[e.topic], e) for e in bag.messages()]
-        return [reading(entry) for reading, entry in found if reading is not None]
+        entries = [(readings[e.topic], e) for e in bag.messages()]
+        return [reading(entry) for reading, entry in entries if reading is not None]
 
 
 @pytest.fixture

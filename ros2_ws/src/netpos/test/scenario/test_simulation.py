@@ -138,7 +138,7 @@ def test_rsus_declare_the_errors_of_their_clocks() -> None:
     rsus = Simulation(load_scenario("fast_pass", changes={"rsus.clock": clock})).rsus
     declared = {r.rsu_id: (r.range_bias_sd_m, r.bias_correlation_time_s) for r in rsus}
     assert declared == {"rsu_1": (pytest.approx(4e-9 * C), 30.0), "rsu_2": (0.0, 0.0)}
-    with pytest.raises(ValueError, match="reference 'rsu_9' is none of the RSUs: rsu_1, rsu_2"):
+    with pytest.raises(ValueError, match="reference 'rsu_9' is not one of the RSUs: rsu_1, rsu_2"):
         Simulation(
             load_scenario("fast_pass", changes={"rsus.clock": {**clock, "reference": "rsu_9"}})
         )
@@ -241,7 +241,7 @@ def test_turned_planar_array_in_space(tmp_path: Path) -> None:
 
 def test_itu_probability_is_met_on_average_and_constant_in_a_place() -> None:
     heard, chance = [], []
-    place = np.array([30.0, 6.0, 0.0])
+    position = np.array([30.0, 6.0, 0.0])
     for seed in range(400):
         scenario = load_scenario(
             "intersection_turn", seed=seed, changes={"measurement.los.probability": "umi"}
@@ -252,7 +252,11 @@ def test_itu_probability_is_met_on_average_and_constant_in_a_place() -> None:
                 m.rsu_id
                 for m in simulation.measure(
                     Beacon(
-                        stamp_ns=t, vue_id="vue_1", sequence=0, position=place, clock_offset_s=0.0
+                        stamp_ns=t,
+                        vue_id="vue_1",
+                        sequence=0,
+                        position=position,
+                        clock_offset_s=0.0,
                     )
                 )
             }

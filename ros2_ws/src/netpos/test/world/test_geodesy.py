@@ -35,9 +35,9 @@ def axes(latitude_deg: float, longitude_deg: float) -> Array:
 
 def around(datum: Datum, reach_deg: float, seed: int) -> Array:
     rng = np.random.default_rng(seed)
-    spread = rng.uniform(-reach_deg, reach_deg, (200, 2))
+    offsets_deg = rng.uniform(-reach_deg, reach_deg, (200, 2))
     centre = [datum.latitude_deg, datum.longitude_deg]
-    return np.column_stack([centre + spread, rng.uniform(-100.0, 3000.0, 200)])
+    return np.column_stack([centre + offsets_deg, rng.uniform(-100.0, 3000.0, 200)])
 
 
 DATUMS = [Datum(55.75, 37.62, 150.0), Datum(-33.9, 151.2, 5.0), Datum(0.0, 0.0), Datum(79, -12.0)]

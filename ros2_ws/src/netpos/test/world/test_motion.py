@@ -86,7 +86,7 @@ def test_short_leg_never_reaches_cruising_speed() -> None:
     ("arguments", "message"),
     [
         ({"points": [[0, 0]], "speed_mps": 1}, "at least two"),
-        ({"points": [[0, 0], [0, 0]], "speed_mps": 1}, "same place"),
+        ({"points": [[0, 0], [0, 0]], "speed_mps": 1}, "same point"),
         ({"points": [[0, 0], [math.nan, 0]], "speed_mps": 1}, "finite way-points"),
         ({"points": [[0, 0], [1, 0]], "speed_mps": 0}, "speed_mps must be"),
         ({"points": [[0, 0], [1, 0]], "speed_mps": 1, "pauses_s": [1]}, "one value per way-point"),
