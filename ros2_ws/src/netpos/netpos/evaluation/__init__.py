@@ -1,4 +1,4 @@
-"""How good a run was: pairing with the truth, figures, consistency, verdicts and pictures.
+"""Quality of a run: pairing with the truth, figures, consistency, verdicts and pictures.
 
 ``evaluate_bag`` does all of it for a recording, ``survey_bag`` what can be said of one without
 ground truth, ``assess_bag`` the one or the other. Positions are judged in the horizontal plane of

@@ -1,4 +1,4 @@
-"""When a device had no usable position: availability, lost tracks, time without an estimate,
+"""Times without a usable position: availability, lost tracks, time without an estimate,
 refused measurements.
 """
 
@@ -73,11 +73,11 @@ def lost_tracks(statuses: Iterable[TrackStatus]) -> int:
     lost, known, counted = 0, False, 0
     for stamp in sorted(by_stamp):
         status = by_stamp[stamp]
-        told = sum(status.rejected.get(reason, 0) for reason in LOSSES)
+        counted_losses = sum(status.rejected.get(reason, 0) for reason in LOSSES)
         was_known = known
         known = status.state == TrackState.TRACKING or (known and status.state in STAYS)
-        lost += max(told - counted, int(was_known and not known))
-        counted = told
+        lost += max(counted_losses - counted, int(was_known and not known))
+        counted = counted_losses
     return lost
 
 

@@ -1,4 +1,4 @@
-"""Which of several estimates of the same run is better, with an interval: paired differences.
+"""Compare estimates of the same run by paired differences with an interval.
 
 Errors of one run are correlated over seconds, so that epochs are no sample: whole blocks of time
 are drawn (circular block bootstrap, Politis and Romano 1992), the same for both sides.
@@ -31,7 +31,7 @@ class Difference:
 
     rmse_m : of the first and the second; difference_m : second minus first, with the interval
     that holds it with 95 % probability; only_first, only_second : epochs of one alone; block_s :
-    how long errors are taken to be correlated
+    for how long errors are assumed to be correlated
     """
 
     vue: str
@@ -51,7 +51,7 @@ class Difference:
         return not self.interval_m[0] <= 0.0 <= self.interval_m[1]
 
     def sentence(self) -> str:
-        """For people."""
+        """The result in words."""
         low, high = sorted(abs(end) for end in self.interval_m)
         if not self.told_apart:
             low, high = self.interval_m
@@ -79,30 +79,30 @@ def compare_bags(bags: Sequence[Path], *, skip: int = SKIP_EPOCHS) -> list[Diffe
         have no device or no epoch in common
     """
     if len(bags) < 2:
-        raise ValueError("compare takes two bags or more")
+        raise ValueError(f"compare needs two bags or more, got {len(bags)}")
     names = [bag.name for bag in bags]
     if len(set(names)) < len(names):
         raise ValueError(f"{', '.join(names)}: two bags have the same name; rename one")
     first, *others = [evaluate_bag(bag, skip=skip) for bag in bags]
-    found = [
+    differences = [
         _difference(first, other, vue)
         for other in others
         for vue in first.vues
         if vue in other.vues
     ]
-    if not found:
+    if not differences:
         raise ValueError(f"{names[0]} has no device in common with the others")
-    return found
+    return differences
 
 
 def _difference(first: Evaluation, second: Evaluation, vue: str) -> Difference:
     errors = []
     for evaluation in (first, second):
         counted = evaluation.vues[vue].scored.counted
-        stamps, at = np.unique(counted.estimate.stamp_ns, return_index=True)
-        errors.append((stamps, counted.horizontal_error[at]))
+        stamps, first_index = np.unique(counted.estimate.stamp_ns, return_index=True)
+        errors.append((stamps, counted.horizontal_error[first_index]))
     (a_ns, a), (b_ns, b) = errors
-    common, at_a, at_b = np.intersect1d(a_ns, b_ns, return_indices=True)
+    common, index_a, index_b = np.intersect1d(a_ns, b_ns, return_indices=True)
     if len(common) < _BLOCKS_MIN:
         raise ValueError(
             f"{vue}: {first.path.name} and {second.path.name} have {len(common)} epochs in common;"
@@ -112,7 +112,7 @@ def _difference(first: Evaluation, second: Evaluation, vue: str) -> Difference:
         (first.path.name, second.path.name),
         vue,
         common,
-        (a[at_a], b[at_b]),
+        (a[index_a], b[index_b]),
         (len(a) - len(common), len(b) - len(common)),
     )
 

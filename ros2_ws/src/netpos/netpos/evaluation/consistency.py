@@ -1,4 +1,4 @@
-"""Does the filter know how good it is: NEES, NIS and their bounds.
+"""Consistency of a filter: NEES, NIS and their bounds.
 
 References: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and
 Navigation*, sec. 5.4.

@@ -1,4 +1,4 @@
-"""What a bag holds of the devices in it, read in one pass and kept in little room."""
+"""Contents of a bag by device, read in one pass and kept in little memory."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Delivery:
 
 
 class _DeliveryCounter:
-    """Takes measurements as they come, of each four numbers."""
+    """Collects four numbers of each measurement."""
 
     def __init__(self) -> None:
         self._rows = array("q")
@@ -67,8 +67,8 @@ class _DeliveryCounter:
 
     def add(self, measurement: RsuMeasurement) -> None:
         rsu = self._rsus.setdefault(measurement.rsu_id, len(self._rsus))
-        at = (measurement.stamp_ns, measurement.sequence)
-        self._rows.extend((*at, rsu, measurement.expected))
+        beacon = (measurement.stamp_ns, measurement.sequence)
+        self._rows.extend((*beacon, rsu, measurement.expected))
 
     def result(self, beacons: int | None) -> Delivery:
         rows = np.array(self._rows, dtype=np.int64).reshape(-1, 4)
@@ -95,7 +95,7 @@ def _key(vue: str, network: str) -> str:
 
 @dataclass(slots=True)
 class _Statuses:
-    """Those of a device; what a status has in common with the one before is held once."""
+    """Statuses of a device; values equal to those of the status before are stored once."""
 
     kept: list[TrackStatus] = field(default_factory=list)
 
@@ -151,7 +151,7 @@ class Recording:
     )
 
     def forget(self, vue: str) -> None:
-        """Make room."""
+        """Free the memory."""
         for kept in (self.measured, self.truth, self.estimate, self.delivery, self.clock_truth):
             kept.pop(vue, None)
 
@@ -177,7 +177,7 @@ def _into(convert: Callable[[Any], Any], add: Callable[[Any], None]) -> Callable
 
 
 def _output_sinks(recording: Recording, vue: str, network: str) -> dict[str, _Sink]:
-    """What becomes of what a tracker says of a device."""
+    """Collects the outputs of a tracker for one device."""
     convert, by = codec(), _key(vue, network)
     of_vue: dict[str, _Sink] = {
         topics.ODOMETRY: (
@@ -197,7 +197,7 @@ def _output_sinks(recording: Recording, vue: str, network: str) -> dict[str, _Si
 
 
 def _common_sinks(recording: Recording) -> dict[str, _Sink]:
-    """What becomes of the topics of the RSUs."""
+    """Collects the topics of the RSUs."""
     convert = codec()
 
     def add_rsu(info: RsuInfo) -> None:
@@ -227,7 +227,7 @@ def _common_sinks(recording: Recording) -> dict[str, _Sink]:
 def _sinks(
     recording: Recording, vues: list[str], networks: list[tuple[str, str]]
 ) -> dict[str, _Sink]:
-    """What becomes of each topic: its type, and what takes its messages."""
+    """Type of each topic, and the function that collects its messages."""
     convert, sinks = codec(), _common_sinks(recording)
     for vue in vues:
         of_vue: dict[str, _Sink] = {
@@ -263,9 +263,9 @@ def _read(
     sinks = _sinks(recording, vues, networks)
     wanted = sinks.keys() & bag.topics.keys()
     for topic in sorted(wanted):
-        expected, found = sinks[topic][0], bag.topics[topic].type_name
-        if found != expected:
-            raise ValueError(f"{bag.path}: {topic} must hold {expected}, it holds {found}")
+        expected, actual = sinks[topic][0], bag.topics[topic].type_name
+        if actual != expected:
+            raise ValueError(f"{bag.path}: {topic} must hold {expected}, it holds {actual}")
     for done, entry in enumerate(bag.messages(wanted)):
         try:
             sinks[entry.topic][1](entry)
@@ -289,25 +289,25 @@ def config_of(bag: BagReader) -> TrackerConfig | None:
 
 
 def notes_of(bag: BagReader) -> tuple[str, ...]:
-    """What a bag says is missing in it, and what was done to its data on import."""
+    """Notes of a bag: messages that are missing, and changes of its data on import."""
     facts = bag.facts
     skipped = [f"skipped on import: {text}" for text in facts.get(SKIPPED, ())]
     return (*lost_of(bag), *facts.get(TRUTH_ALIGNMENT, ()), *skipped)
 
 
 def lost_of(bag: BagReader) -> list[str]:
-    """What recorders say they missed, as a sentence; none where nothing was lost."""
+    """Messages that recorders missed, as a sentence; empty where nothing was lost."""
     lost = lost_in(bag.facts)
-    told = ", ".join(f"{n} of {topic}" for topic, n in sorted(lost.items()))
-    return [f"LOST while recording: {told}"] if told else []
+    losses = ", ".join(f"{n} of {topic}" for topic, n in sorted(lost.items()))
+    return [f"LOST while recording: {losses}"] if losses else []
 
 
 def lost_in(facts: Mapping[str, tuple[str, ...]]) -> dict[str, int]:
     """Messages that recorders missed, by topic."""
-    found: Counter[str] = Counter()
+    losses: Counter[str] = Counter()
     for text in facts.get(LOST_METADATA, ()):
-        found.update(load_yaml(text) or {})
-    return dict(found)
+        losses.update(load_yaml(text) or {})
+    return dict(losses)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""How large the mean square of correlated errors may be, from the shape of their series alone.
+"""Bounds of the mean square of correlated errors, from the shape of their series alone.
 
 A consistent filter's normalised error is Gaussian with zero mean and variance 1; its
 autocorrelation is unknown. We model it as a mixture of up to three exponentials,
@@ -74,7 +74,7 @@ class _Family(NamedTuple):
     first (B,) index of each band's first coefficient; size, counted (B,) coefficients in it and
     those that count; inverse (H, B) one over the mean variance in each band under each of H
     autocorrelations; log_prior (H,) with the determinant of the likelihood; smoothest (B,) least
-    power of a band over that of the first: a smoother series tells no more.
+    power of a band over that of the first: a smoother series has no more information.
     """
 
     first: Ints
@@ -164,10 +164,10 @@ def mean_square_given_shape(series: Array, rng: np.random.Generator) -> Array:
     family = _family(n)
     squares = dct(series / np.sqrt(power), norm="ortho") ** 2
     bands = np.add.reduceat(squares, family.first) / family.size
-    misfit = family.inverse @ (family.counted * np.maximum(bands, bands[0] * family.smoothest))
+    shape_cost = family.inverse @ (family.counted * np.maximum(bands, bands[0] * family.smoothest))
     total = float(family.counted.sum())
-    log_posterior = family.log_prior - 0.5 * total * np.log(misfit)
+    log_posterior = family.log_prior - 0.5 * total * np.log(shape_cost)
     cumulated = np.cumsum(np.exp(log_posterior - log_posterior.max()))
     quantiles = (np.arange(DRAWS) + 0.5) / DRAWS * cumulated[-1]
     chosen = rng.permutation(np.searchsorted(cumulated, quantiles))
-    return np.asarray(rng.chisquare(total, DRAWS) / misfit[chosen])
+    return np.asarray(rng.chisquare(total, DRAWS) / shape_cost[chosen])

@@ -44,7 +44,7 @@ class Evaluation:
     network and device, under the devices' true names only. ``topics``: type and number of
     messages; ``notes``: what the importer did to the data, to be read before the figures;
     ``buildings``: (k, 4) rectangles x_min, y_min, x_max, y_max [m], none where the bag
-    does not hold its scenario; ``facts``: what the bag says of how it was made."""
+    does not hold its scenario; ``facts``: how the bag was made."""
 
     path: Path
     skip: int
@@ -58,8 +58,8 @@ class Evaluation:
 
     def columns(self) -> dict[str, Figures]:
         """Figures by the name of their column in a table: devices, then devices by network."""
-        own = {name: vue.scored.figures for name, vue in self.vues.items()}
-        return own | {
+        fused = {name: vue.scored.figures for name, vue in self.vues.items()}
+        return fused | {
             f"{vue} by {network}": scored.figures
             for network, vues in self.networks.items()
             for vue, scored in vues.items()
@@ -91,17 +91,17 @@ class Evaluation:
 def _chosen(bag: BagReader, path: Path, vue: str | None) -> list[str]:
     """Devices to score; an error names what the bag lacks."""
     filled = {topics.split(topic) for topic, info in bag.topics.items() if info.count}
-    found = {name for name, topic in filled if topic == topics.GROUND_TRUTH}
-    if not found:
+    with_truth = {name for name, topic in filled if topic == topics.GROUND_TRUTH}
+    if not with_truth:
         raise ValueError(
             f"{path} is a bag without ground truth (no messages on /<vue>/ground_truth); "
             "record that topic to evaluate the run"
         )
-    if vue is not None and vue not in found:
+    if vue is not None and vue not in with_truth:
         raise ValueError(
-            f"{path} has no ground truth of {vue!r}; choose one of {', '.join(sorted(found))}"
+            f"{path} has no ground truth of {vue!r}; choose one of {', '.join(sorted(with_truth))}"
         )
-    names = sorted(found) if vue is None else [vue]
+    names = sorted(with_truth) if vue is None else [vue]
     if not any((name, topics.ODOMETRY) in filled for name in names):
         raise ValueError(
             f"{path} has no estimates (no messages on /<vue>/odometry); "
@@ -133,15 +133,17 @@ def _with_bound(
 def _surveyed(bag: BagReader, path: Path, vue: str | None) -> list[str]:
     """Devices that a tracker reported of; an error names what the bag lacks."""
     filled = {topics.split(topic) for topic, info in bag.topics.items() if info.count}
-    found = {name for name, topic in filled if name and topic in topics.TRACKER_OUTPUTS}
-    if not found:
+    tracked = {name for name, topic in filled if name and topic in topics.TRACKER_OUTPUTS}
+    if not tracked:
         raise ValueError(
             f"{path} has no estimates (no messages on /<vue>/odometry or track_status); "
             f"make some with: netpos replay {path} --out NEW_BAG"
         )
-    if vue is not None and vue not in found:
-        raise ValueError(f"{path} has no device {vue!r}; choose one of {', '.join(sorted(found))}")
-    return sorted(found) if vue is None else [vue]
+    if vue is not None and vue not in tracked:
+        raise ValueError(
+            f"{path} has no device {vue!r}; choose one of {', '.join(sorted(tracked))}"
+        )
+    return sorted(tracked) if vue is None else [vue]
 
 
 def assess_bag(
@@ -208,15 +210,15 @@ TruthOf = Callable[[list[RsuInfo], list[RsuMeasurement], str], tuple[list[Odomet
 def _alone(bag: BagReader, path: Path, vue: str | None) -> list[str]:
     """The one device with estimates, for a truth from elsewhere."""
     filled = {topics.split(topic) for topic, info in bag.topics.items() if info.count}
-    found = sorted(name for name, topic in filled if name and topic == topics.ODOMETRY)
-    if vue is not None and vue in found:
+    tracked = sorted(name for name, topic in filled if name and topic == topics.ODOMETRY)
+    if vue is not None and vue in tracked:
         return [vue]
-    if vue is not None or len(found) != 1:
+    if vue is not None or len(tracked) != 1:
         raise ValueError(
-            f"{path} has estimates of {', '.join(found) or 'no device'}; say with --vue of which "
-            "one the truth is"
+            f"{path} has estimates of {', '.join(tracked) or 'no device'}; choose with --vue the "
+            "device of the ground truth"
         )
-    return found
+    return tracked
 
 
 def evaluate_bag(

@@ -1,4 +1,4 @@
-"""Committed baselines: figures of guarded runs with intervals, and what has left them.
+"""Committed baselines: figures of guarded runs with intervals, and figures outside of them.
 
 The seeds and recordings are fixed, so an interval covers harmless changes of the program only
 (rounding, the order of sums), not the spread between runs. Its half width is three times the root
@@ -33,15 +33,15 @@ Pooled = dict[str, float | None]
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A figure of the baseline and the ends between which a harmless change leaves it."""
+    """A figure of the baseline, and the interval that harmless changes do not leave."""
 
     value: float
     low: float
     high: float
 
-    def holds(self, found: float) -> bool:
+    def holds(self, value: float) -> bool:
         """Whether a figure lies within, ends included."""
-        return self.low <= found <= self.high
+        return self.low <= value <= self.high
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,13 +146,13 @@ def baseline_of(full: Pooled, replicates: Sequence[Pooled], runs: int) -> Baseli
     return Baseline(runs=runs, figures=figures)
 
 
-def losses(name: str, baseline: Baseline, found: Pooled) -> list[str]:
+def losses(name: str, baseline: Baseline, figures: Pooled) -> list[str]:
     """One sentence for each figure of a case that has left its interval."""
     return [
-        f"{name}: {figure} is {_text(found.get(figure))}, its baseline is {_known(interval)}; if"
+        f"{name}: {figure} is {_text(figures.get(figure))}, its baseline is {_known(interval)}; if"
         " this is meant, run `make baselines` and read the diff"
         for figure, interval in sorted(baseline.figures.items())
-        if not _kept(interval, found.get(figure))
+        if not _kept(interval, figures.get(figure))
     ]
 
 
@@ -164,10 +164,10 @@ def read_baselines(folder: Path) -> dict[str, Baseline]:
     }
 
 
-def _kept(interval: Interval | None, found: float | None) -> bool:
-    if interval is None or found is None:
-        return interval is None and found is None
-    return interval.holds(found)
+def _kept(interval: Interval | None, value: float | None) -> bool:
+    if interval is None or value is None:
+        return interval is None and value is None
+    return interval.holds(value)
 
 
 def _known(interval: Interval | None) -> str:
@@ -176,8 +176,8 @@ def _known(interval: Interval | None) -> str:
     return f"{interval.value:g} ({interval.low:g} to {interval.high:g})"
 
 
-def _text(found: float | None) -> str:
-    return "missing" if found is None else f"{found:.{_DIGITS}g}"
+def _text(value: float | None) -> str:
+    return "missing" if value is None else f"{value:.{_DIGITS}g}"
 
 
 def _line(interval: Interval | None) -> str:

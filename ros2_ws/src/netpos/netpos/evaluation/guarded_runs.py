@@ -45,12 +45,12 @@ from netpos.tracking.sequencer import Item
 SEEDS = range(9001, 9061)
 FEWEST_RUNS = 8
 ENOUGH_S = 1500.0  # of all runs of a scenario
-_CLOCK_HZ = 1.0  # nobody listens to /clock here
+_CLOCK_HZ = 1.0  # these runs do not use /clock
 
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """What one run feeds its tracker, in order, and the truth to score it against, by device."""
+    """Input of the tracker in one run, in order, and the ground truth, by device."""
 
     settings: TrackerSettings
     rsus: tuple[RsuInfo, ...]
@@ -91,7 +91,7 @@ def cases() -> dict[str, Case]:
 
 
 def outputs_of(material: Material, changes: Mapping[str, Any] | None = None) -> list[TrackOutput]:
-    """What the tracker says of a material, in order; ``changes`` replaces parameters of the
+    """Outputs of the tracker for a material, in order; ``changes`` replaces parameters of the
     tracker."""
     parameters = {**material.settings.parameters, **(changes or {})}
     tracker = tracker_of(TrackerConfig.from_mapping(parameters), material.settings)
@@ -200,7 +200,7 @@ def _recorded(folder: Path, importer: Importer) -> Iterator[Material]:
 
 
 def _material_of(bag: Path) -> Material:
-    """What an imported bag holds."""
+    """The material of an imported bag."""
     make, truth = codec(), defaultdict(list)
     items: list[Item | ImuSample] = []
     with BagReader(bag) as source:

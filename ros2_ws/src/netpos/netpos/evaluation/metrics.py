@@ -38,7 +38,7 @@ NO_CLOCK = ClockOffsets.of(())
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Initial:
-    """How the run began, in seconds after the first ground truth.
+    """Start of the run, in seconds after the first ground truth.
 
     first fix: first estimate; ready: first estimate in state TRACKING; 1 m: first estimate that
     opens a stretch of at least 1 s, without a pause above 1 s, in which every horizontal error is
@@ -72,7 +72,7 @@ class Figures:
     without track status. unscored_s: seconds of the ground truth's span without a scored estimate
     (``availability.unscored_s``): before the first one, after a loss, in gaps. share_above_5m:
     share of the estimates scored with an error above 5 m. protection_exceeded: share of the
-    estimates with a horizontal error above the protection level told with them;
+    estimates with a horizontal error above the protection level of their status;
     protection_level_m: its median. bound_ratio: rmse_m over the posterior Cramer-Rao bound.
     """
 
@@ -138,7 +138,7 @@ class Figures:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
-    """What a recording holds of one device."""
+    """Data of one device in a recording."""
 
     truth: Trajectory
     estimate: Trajectory
@@ -160,7 +160,7 @@ class Scored:
 
 
 def rms(values: Array) -> float | None:
-    """Root mean square, None of nothing."""
+    """Root mean square; None without values."""
     return float(np.sqrt(np.mean(values**2))) if values.size else None
 
 
@@ -194,8 +194,8 @@ def time_to_converge(
 def clock_error_series(run: Run, max_gap_s: float = MAX_TRUTH_GAP_S) -> tuple[Stamps, Array]:
     """Stamps (k,) and clock offset errors (k,) [ns], estimate minus the interpolated truth."""
     true = run.clock_truth.at(run.clock.stamp_ns, max_gap_s)
-    told = np.isin(run.clock.stamp_ns, true.stamp_ns)
-    return true.stamp_ns, (run.clock.offset_s[told] - true.offset_s) * NS
+    has_truth = np.isin(run.clock.stamp_ns, true.stamp_ns)
+    return true.stamp_ns, (run.clock.offset_s[has_truth] - true.offset_s) * NS
 
 
 def _initial(run: Run, pairs: Pairs, ready_ns: Stamps) -> Initial:
@@ -294,8 +294,12 @@ def _losses(statuses: Sequence[TrackStatus]) -> dict[str, Any]:
 
 
 def _integrity(pairs: Pairs, statuses: Sequence[TrackStatus]) -> dict[str, Any]:
-    told = {s.stamp_ns: s.protection_level_m for s in statuses if s.protection_level_m >= 0.0}
-    levels = np.array([told.get(stamp, np.nan) for stamp in pairs.estimate.stamp_ns.tolist()])
+    level_by_stamp = {
+        s.stamp_ns: s.protection_level_m for s in statuses if s.protection_level_m >= 0.0
+    }
+    levels = np.array(
+        [level_by_stamp.get(stamp, np.nan) for stamp in pairs.estimate.stamp_ns.tolist()]
+    )
     known = np.isfinite(levels)
     if not known.any():
         return {}

@@ -128,9 +128,9 @@ class ClockOffsets:
 
     def at(self, stamp_ns: Stamps, max_gap_s: float = MAX_TRUTH_GAP_S) -> ClockOffsets:
         """At those of the stamps that ``bracket`` finds a place for."""
-        found = bracket(stamp_ns, self.stamp_ns, max_gap_s)
+        bracketed = bracket(stamp_ns, self.stamp_ns, max_gap_s)
         return ClockOffsets(
-            stamp_ns=stamp_ns[found.inside], offset_s=found.interpolate(self.offset_s)
+            stamp_ns=stamp_ns[bracketed.inside], offset_s=bracketed.interpolate(self.offset_s)
         )
 
     @classmethod
@@ -273,12 +273,12 @@ def pair(
     """Pair every estimate with the interpolated truth; see ``bracket`` for those that have no
     partner.
     """
-    found = bracket(estimate.stamp_ns, truth.stamp_ns, max_truth_gap_s)
+    bracketed = bracket(estimate.stamp_ns, truth.stamp_ns, max_truth_gap_s)
     return Pairs(
-        estimate=estimate if found.inside.all() else estimate.take(found.inside),
-        truth=_between(truth, found, estimate.stamp_ns),
-        outside=found.outside,
-        in_gap=found.in_gap,
+        estimate=estimate if bracketed.inside.all() else estimate.take(bracketed.inside),
+        truth=_between(truth, bracketed, estimate.stamp_ns),
+        outside=bracketed.outside,
+        in_gap=bracketed.in_gap,
     )
 
 
@@ -289,11 +289,11 @@ def at_stamps(
     return _between(track, bracket(stamp_ns, track.stamp_ns, max_gap_s), stamp_ns)
 
 
-def _between(track: Trajectory, found: Bracket, stamp_ns: Stamps) -> Trajectory:
+def _between(track: Trajectory, bracketed: Bracket, stamp_ns: Stamps) -> Trajectory:
     return Trajectory(
-        stamp_ns=stamp_ns[found.inside],
-        position=found.interpolate(track.position),
-        velocity=found.interpolate(track.velocity),
-        heading=found.interpolate_angle(track.heading),
-        position_cov=found.interpolate(track.position_cov),
+        stamp_ns=stamp_ns[bracketed.inside],
+        position=bracketed.interpolate(track.position),
+        velocity=bracketed.interpolate(track.velocity),
+        heading=bracketed.interpolate_angle(track.heading),
+        position_cov=bracketed.interpolate(track.position_cov),
     )

@@ -74,17 +74,17 @@ def run_core(
     return PdrRun(core, tuple(events), attitude)
 
 
-def score_contacts(found_ns: npt.ArrayLike, bouts: Sequence[WalkingBout]) -> ContactScore:
+def score_contacts(detected_ns: npt.ArrayLike, bouts: Sequence[WalkingBout]) -> ContactScore:
     """Match each contact to its nearest free detection, in order of time.
 
     Only detections between the first and the last contact of a bout count, the tolerance added.
     """
-    found = np.sort(np.asarray(found_ns, dtype=np.int64))
+    detected = np.sort(np.asarray(detected_ns, dtype=np.int64))
     totals = np.zeros(4, dtype=int)
     for bout in bouts:
         contacts = bout.initial_contact_ns
         first, last = contacts[0] - CONTACT_TOLERANCE_NS, contacts[-1] + CONTACT_TOLERANCE_NS
-        free = found[(found > first) & (found < last)].tolist()
+        free = detected[(detected > first) & (detected < last)].tolist()
         hits = 0
         for contact in contacts.tolist():
             near = [f for f in free if abs(f - contact) <= CONTACT_TOLERANCE_NS]

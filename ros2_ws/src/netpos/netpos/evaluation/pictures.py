@@ -31,7 +31,7 @@ PNG_COLOURS = 64
 ELLIPSE_PROBABILITY = 0.95
 ELLIPSES_PER_TRACK = 45
 LABELLED_RSUS = 14
-# Okabe and Ito's colours, told apart with any colour vision
+# Okabe and Ito's colours: distinct for any colour vision
 TRACK_COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#009E73", "#56B4E9", "#E69F00")
 RSU_COLOUR = "#117733"
 BUILDING_COLOUR = "#E4E0D8"
@@ -403,8 +403,8 @@ def draw_errors(evaluation: Evaluation) -> Figure:
 
 
 def draw_bounds(evaluation: Evaluation) -> Figure:
-    """Horizontal error against time beside what the tracker says of it, a panel per device: the
-    longer half axis of the 95 % ellipse, and the protection level where one was told.
+    """Horizontal error over time beside the tracker's own bounds, a panel per device: the
+    longer half axis of the 95 % ellipse, and the protection level where it was reported.
 
     The scale is logarithmic; estimates that are not scored are left out.
     """
@@ -421,8 +421,10 @@ def draw_bounds(evaluation: Evaluation) -> Figure:
 def _draw_bound_panel(axes: Axes, vue: VueEvaluation, colour: str) -> None:
     counted = vue.scored.counted
     t = (counted.estimate.stamp_ns - int(vue.run.truth.stamp_ns[0])) / NS
-    told = {s.stamp_ns: s.protection_level_m for s in vue.run.statuses}
-    level = np.array([told.get(stamp, -1.0) for stamp in counted.estimate.stamp_ns.tolist()])
+    level_by_stamp = {s.stamp_ns: s.protection_level_m for s in vue.run.statuses}
+    level = np.array(
+        [level_by_stamp.get(stamp, -1.0) for stamp in counted.estimate.stamp_ns.tolist()]
+    )
     if (level > 0.0).any():
         level = np.where(level > 0.0, level, np.nan)
         axes.plot(t, level, color=TRACK_COLOURS[1], lw=1.2, label="protection level")

@@ -29,23 +29,23 @@ def recorded_bound_m(
 ) -> float | None:
     """Smallest RMSE [m] at the stamps ``scored_ns`` that the measurements of a device allow.
 
-    None where the recording does not tell: motion models that interact or follow an IMU or a
-    heading, RSUs with biases or coloured noise, fewer than two epochs within the truth.
+    None where the recording does not determine it: motion models that interact or follow an IMU
+    or a heading, RSUs with biases or coloured noise, fewer than two epochs within the truth.
     """
     known = {name: Rsu.of(info) for name, info in rsus.items()}
     simple = config.motion_model == "constant_velocity" and len(truth) > 1
     if not simple or not all(rsu.plain for rsu in known.values()):
         return None
-    found: dict[int, list[Array]] = defaultdict(list)
+    rows_by_stamp: dict[int, list[Array]] = defaultdict(list)
     biases = BiasStates()  # of plain RSUs only what differences share
     first_ns, last_ns = int(truth.stamp_ns[0]), int(truth.stamp_ns[-1])
     heard = (m for m in measurements if m.rsu_id in known and first_ns <= m.stamp_ns <= last_ns)
     for stamp, together in itertools.groupby(heard, key=lambda m: m.stamp_ns):
-        found[stamp].append(epoch_rows_of(list(together), known, biases, -1).rows)
-    if len(found) < 2:
+        rows_by_stamp[stamp].append(epoch_rows_of(list(together), known, biases, -1).rows)
+    if len(rows_by_stamp) < 2:
         return None
-    stamps = np.array(sorted(found), dtype=np.int64)
-    blocks = [np.vstack(found[stamp]) for stamp in stamps.tolist()]
+    stamps = np.array(sorted(rows_by_stamp), dtype=np.int64)
+    blocks = [np.vstack(rows_by_stamp[stamp]) for stamp in stamps.tolist()]
     prior = np.zeros((N_CORE + len(biases.sd),) * 2)
     prior[:N_CORE, :N_CORE] = _prior(config, pose)
     bounds = run_bound(
@@ -64,7 +64,7 @@ def recorded_bound_m(
 
 
 def _prior(config: TrackerConfig, pose: InitialPose | None) -> Array:
-    """Covariance (6, 6) of what the tracker is told before the first measurement."""
+    """Covariance (6, 6) of the prior before the first measurement."""
     if pose is not None:
         return pose_state(config, pose.position[:2], pose.cov[:2, :2])[1]
     reach, c = config.coverage_radius_m, SPEED_OF_LIGHT_MPS

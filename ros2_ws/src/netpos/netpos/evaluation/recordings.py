@@ -148,9 +148,9 @@ def baseline_figures(
 
 def figures_of(figures: Figures) -> Json:
     """The figures of a row; None where one cannot be computed."""
-    found = figures.to_json()
+    content = figures.to_json()
     return {
-        **{key: found.get(key) for key in (*ACCURACY, *WHOLE)},
-        "nis_expected": found["nis_dof_mean"],
-        "time_to_first_fix_s": found["initial"]["time_to_first_fix_s"],
+        **{key: content.get(key) for key in (*ACCURACY, *WHOLE)},
+        "nis_expected": content["nis_dof_mean"],
+        "time_to_first_fix_s": content["initial"]["time_to_first_fix_s"],
     }

@@ -28,8 +28,8 @@ class Replays:
 
     def target(self, bag: Path) -> Path:
         """Where a bag's track goes."""
-        place = bag.resolve()
-        return self.out / (place.stem if place.suffix == ".mcap" else place.name)
+        path = bag.resolve()
+        return self.out / (path.stem if path.suffix == ".mcap" else path.name)
 
 
 def replay_bags(
@@ -67,12 +67,12 @@ def _is_done(bag: Path, plan: Replays) -> bool:
     target = plan.target(bag)
     if not target.exists():
         return False
-    with BagReader(bag) as source, BagReader(target) as found:
+    with BagReader(bag) as source, BagReader(target) as replayed:
         settings = changed(plan.settings or bag_settings(source), plan.overrides)
         config = TrackerConfig.from_mapping(settings.parameters)
         wanted = tracker_fact(config, settings.rsus)
-        smoothed = any(topics.split(t)[1] == topics.ODOMETRY_SMOOTHED for t in found.topics)
-        if wanted.items() <= found.metadata.items() and smoothed == plan.smooth:
+        smoothed = any(topics.split(t)[1] == topics.ODOMETRY_SMOOTHED for t in replayed.topics)
+        if wanted.items() <= replayed.metadata.items() and smoothed == plan.smooth:
             return True
     raise FileExistsError(
         f"{target} exists and was tracked with other parameters; choose another --out"

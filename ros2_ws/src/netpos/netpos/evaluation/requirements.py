@@ -26,7 +26,7 @@ V2X_SETS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """One requirement: ``ok`` is None where the run cannot tell."""
+    """One requirement: ``ok`` is None where the run has no figure."""
 
     name: str
     required: str

@@ -77,7 +77,7 @@ def series_of(
     clocks = dict(zip(clock.stamp_ns.tolist(), clock.offset_s.tolist(), strict=True))
     axes = {name: rsu_axes(info) for name, info in rsus.items()}
     places = {name: rsu_place(info, axes[name]) for name, info in rsus.items()}
-    found: dict[tuple[str, str], list[tuple[int, float, float]]] = defaultdict(list)
+    values_by_key: dict[tuple[str, str], list[tuple[int, float, float]]] = defaultdict(list)
     h = np.empty(N_CORE)
     for m in measurements:
         pose = poses.get(m.stamp_ns)
@@ -96,8 +96,10 @@ def series_of(
             residual = float(row[VALUE] - predict_row(row, state, height_m, h))
             if sensor.wraps is not Wraps.NEVER:
                 residual = float(wrap(residual))
-            found[name, sensor.name].append((m.stamp_ns, residual, math.sqrt(row[VARIANCE])))
-    return [_series(key, values) for key, values in sorted(found.items())]
+            values_by_key[name, sensor.name].append(
+                (m.stamp_ns, residual, math.sqrt(row[VARIANCE]))
+            )
+    return [_series(key, values) for key, values in sorted(values_by_key.items())]
 
 
 def _state(
@@ -167,8 +169,8 @@ def correlation_s(stamp_ns: Array, residual: Array) -> float | None:
 
 def newest(errors: Iterable[RsuErrors]) -> dict[tuple[str, str], RsuErrors]:
     """The newest that was learned, by RSU and quantity."""
-    found: dict[tuple[str, str], RsuErrors] = {}
-    for said in errors:
-        for quantity in said.quantities:
-            found[said.rsu_id, quantity] = said
-    return found
+    newest_by_key: dict[tuple[str, str], RsuErrors] = {}
+    for report in errors:
+        for quantity in report.quantities:
+            newest_by_key[report.rsu_id, quantity] = report
+    return newest_by_key

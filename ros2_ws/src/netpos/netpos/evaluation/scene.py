@@ -1,4 +1,4 @@
-"""What stands around the track: the buildings of the scenario a bag was made from."""
+"""Surroundings of a track: the buildings of the scenario from which a bag was made."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a recording says of itself where there is no ground truth to score it by."""
+"""Survey of a recording without ground truth, from its own residuals and states."""
 
 from __future__ import annotations
 
@@ -124,15 +124,15 @@ def survey_vue(record: VueRecord, rsus: Mapping[str, RsuInfo], learns: bool) -> 
 def _figures(record: VueRecord, rows: tuple[Residuals, ...]) -> VueSurvey:
     stamps = [m.stamp_ns for m in record.measurements] + [s.stamp_ns for s in record.statuses]
     span_s = (max(stamps) - min(stamps)) * 1e-9 if stamps else 0.0
-    at, places = record.track.stamp_ns, record.track.position[:, :2]
-    gaps = np.diff(at) * 1e-9
+    stamps_ns, places = record.track.stamp_ns, record.track.position[:, :2]
+    gaps = np.diff(stamps_ns) * 1e-9
     evaluated = [s for s in record.statuses if s.nis_dof > 0]
     sds = [s.position_sd_m for s in record.statuses if s.state is TrackState.TRACKING]
     levels = [s.protection_level_m for s in record.statuses if s.protection_level_m >= 0.0]
     last = record.statuses[-1] if record.statuses else None
     return VueSurvey(
         span_s=span_s,
-        estimates=len(at),
+        estimates=len(stamps_ns),
         measurements=len(record.measurements),
         states=_states(record.statuses, span_s),
         gaps=int((gaps > _GAP_S).sum()),
@@ -152,7 +152,7 @@ def _figures(record: VueRecord, rows: tuple[Residuals, ...]) -> VueSurvey:
 
 
 def _states(statuses: Sequence[TrackStatus], span_s: float) -> dict[str, float]:
-    """Share of the span by state: each status stands until the next, a second at most; the rest
+    """Share of the span by state: each status holds until the next, for a second at most; the rest
     is unheard."""
     if span_s <= 0.0:
         return {}
@@ -206,9 +206,9 @@ def _suggestions(
                 "a wrong height of the device or the RSUs"
             )
         for row in rows:
-            own = row.bias - common
-            if abs(own) > _BIASED * row.stated:
-                off = _off(own, row.unit)
+            excess = row.bias - common
+            if abs(excess) > _BIASED * row.stated:
+                off = _off(excess, row.unit)
                 yield f"{quantity} of {row.rsu_id} {off}, against the others{remedy}"
     if figures.nis is not None:
         ratio = figures.nis.mean / figures.nis_dof

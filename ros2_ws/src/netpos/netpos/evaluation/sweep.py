@@ -121,10 +121,10 @@ def means(table: pd.DataFrame, keys: Sequence[str], figure: str) -> list[Mean]:
     if figure not in table:
         known = ", ".join(sorted(set(table.columns) - {*keys, "seed", "vue"}))
         raise ValueError(f"no figure {figure!r}; known: {known}")
-    found = []
+    cells = []
     for values, rows in table.groupby(list(keys), sort=False, dropna=False):
         of_it = pd.to_numeric(rows[figure]).dropna().to_numpy(dtype=np.float64)
-        found.append(
+        cells.append(
             Mean(
                 setting=dict(zip(keys, values, strict=True)),
                 runs=len(of_it),
@@ -134,30 +134,30 @@ def means(table: pd.DataFrame, keys: Sequence[str], figure: str) -> list[Mean]:
                 lost_tracks=int(pd.to_numeric(rows["lost_tracks"]).sum()),
             )
         )
-    return found
+    return cells
 
 
 def _interval(values: Array) -> tuple[float, float] | None:
     if values.size < 2:
         return None
-    found = bootstrap(
+    result = bootstrap(
         (values,), np.mean, n_resamples=_DRAWS, confidence_level=CONFIDENCE,
         method="percentile", rng=np.random.default_rng(0),
     )  # fmt: skip
-    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+    return float(result.confidence_interval.low), float(result.confidence_interval.high)
 
 
-def draw_sweep(found: Sequence[Mean], figure: str) -> Figure:
+def draw_sweep(rows: Sequence[Mean], figure: str) -> Figure:
     """The figure against the first key, a line for each combination of the other keys, with
     intervals; settings without a figure are left out."""
-    first = next(iter(found[0].setting))
-    values = list(dict.fromkeys(mean.setting[first] for mean in found))
+    first = next(iter(rows[0].setting))
+    values = list(dict.fromkeys(mean.setting[first] for mean in rows))
     numbers = all(isinstance(value, int | float) for value in values)
     places: dict[object, Any] = dict(
         zip(values, values if numbers else range(len(values)), strict=True)
     )
     lines: dict[str, list[Mean]] = defaultdict(list)
-    for mean in found:
+    for mean in rows:
         others = [f"{key} {value}" for key, value in mean.setting.items() if key != first]
         if mean.mean is not None:
             lines[", ".join(others)].append(mean)

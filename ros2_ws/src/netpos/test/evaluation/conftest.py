@@ -100,13 +100,13 @@ def _truth_rows(drive: Drive) -> list[Row]:
 
 def _measurement_rows(drive: Drive) -> list[Row]:
     """Two RSUs each estimate; one measurement is lost."""
-    found = [
+    measurements = [
         RsuMeasurement(stamp_ns=pose.stamp_ns, rsu_id=rsu, vue_id="vue_1", sequence=k, expected=2)
         for k, pose in enumerate(drive.estimates)
         for rsu in ("rsu_0", "rsu_1")
         if (k, rsu) != (7, "rsu_1")
     ]
-    return [(m.stamp_ns, "/rsu/measurements", codec().measurement_to_msg(m)) for m in found]
+    return [(m.stamp_ns, "/rsu/measurements", codec().measurement_to_msg(m)) for m in measurements]
 
 
 def _estimate_rows(drive: Drive) -> list[Row]:

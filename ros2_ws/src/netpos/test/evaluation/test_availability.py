@@ -111,7 +111,7 @@ def test_a_loss_is_a_step_back_to_waiting(letters: str, lost: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "lost"),
+    ("statuses", "lost"),
     [
         (("T", {}, "W", {"track_lost": 1}), 1),  # one loss, seen twice
         (("T", {}, "T", {"diverged": 1}), 1),  # found again within the epoch
@@ -120,8 +120,8 @@ def test_a_loss_is_a_step_back_to_waiting(letters: str, lost: int) -> None:
         (("T", {"gate": 1}, "T", {"gate": 9}), 0),
     ],
 )
-def test_a_loss_that_was_counted_is_one(told: tuple[str, dict[str, int]], lost: int) -> None:
-    first, before, second, after = told
+def test_a_loss_that_was_counted_is_one(statuses: tuple[str, dict[str, int]], lost: int) -> None:
+    first, before, second, after = statuses
     states = [status(0.1, second, rejected=after), status(0.0, first, rejected=before)]
     assert lost_tracks(states) == lost
 
@@ -172,8 +172,8 @@ def test_a_slow_tracker_misses_only_what_is_missing(interval_s: float, missed_s:
     """Estimates at one interval over 20 s with one gap of 1 s."""
     before = np.arange(0.0, 10.0 + 1e-9, interval_s)
     after = np.arange(11.0, 20.0 + 1e-9, interval_s)
-    found = stamps(*before, *after)
-    assert unscored_s(stamps(0.0, 20.0), found, found) == pytest.approx(missed_s)
+    estimates = stamps(*before, *after)
+    assert unscored_s(stamps(0.0, 20.0), estimates, estimates) == pytest.approx(missed_s)
 
 
 def test_a_track_that_never_comes_back_misses_the_rest() -> None:

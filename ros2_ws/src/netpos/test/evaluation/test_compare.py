@@ -19,11 +19,11 @@ DT_S = 0.1
 def errors(rng: np.random.Generator, n: int, sd: float, tau_s: float) -> Array:
     """(n,) m: lengths of two-dimensional Gauss-Markov errors."""
     decay = math.exp(-DT_S / tau_s)
-    found = np.empty((n, 2))
-    found[0] = rng.normal(0.0, sd, 2)
+    offsets = np.empty((n, 2))
+    offsets[0] = rng.normal(0.0, sd, 2)
     for k in range(1, n):
-        found[k] = decay * found[k - 1] + sd * math.sqrt(1.0 - decay**2) * rng.normal(size=2)
-    return np.asarray(np.linalg.norm(found, axis=1))
+        offsets[k] = decay * offsets[k - 1] + sd * math.sqrt(1.0 - decay**2) * rng.normal(size=2)
+    return np.asarray(np.linalg.norm(offsets, axis=1))
 
 
 def stamps(n: int) -> Array:
@@ -34,36 +34,36 @@ def stamps(n: int) -> Array:
 def test_the_interval_holds_the_true_difference_as_often_as_it_says(tau_s: float) -> None:
     """RMSE 1.41 and 1.27 m, errors that last 2 s."""
     true = math.sqrt(2.0) * (0.9 - 1.0)
-    held = told = 0
+    held = significant = 0
     for seed in range(60):
         rng = np.random.default_rng(seed)
         pair = errors(rng, 3000, 1.0, tau_s), errors(rng, 3000, 0.9, tau_s)
-        found = paired(("a", "b"), "v", stamps(3000), pair)
-        low, high = found.interval_m
-        assert low <= found.difference_m <= high
+        difference = paired(("a", "b"), "v", stamps(3000), pair)
+        low, high = difference.interval_m
+        assert low <= difference.difference_m <= high
         held += low <= true <= high
-        told += found.told_apart
+        significant += difference.told_apart
     assert held >= 52  # 57 expected
     if tau_s < 1.0:
-        assert told == 60
+        assert significant == 60
 
 
-def test_the_same_on_both_sides_is_not_told_apart() -> None:
+def test_the_same_on_both_sides_is_no_difference() -> None:
     same = errors(np.random.default_rng(1), 500, 1.0, 1.0)
-    found = paired(("a", "b"), "v", stamps(500), (same, same))
-    assert found.difference_m == 0.0
-    assert found.interval_m == (0.0, 0.0)
-    assert not found.told_apart
-    assert "are not told apart" in found.sentence()
+    difference = paired(("a", "b"), "v", stamps(500), (same, same))
+    assert difference.difference_m == 0.0
+    assert difference.interval_m == (0.0, 0.0)
+    assert not difference.told_apart
+    assert "are not told apart" in difference.sentence()
 
 
 def test_what_both_share_does_not_hide_a_difference() -> None:
     """Errors of 1 m that both have, and 5 % more on one side."""
     shared = errors(np.random.default_rng(2), 1000, 1.0, 3.0)
-    found = paired(("a", "b"), "v", stamps(1000), (shared, 1.05 * shared))
-    assert found.told_apart
-    assert found.sentence().startswith("v: b is worse than a by 0.0")
-    assert found.interval_m[0] > 0.02
+    difference = paired(("a", "b"), "v", stamps(1000), (shared, 1.05 * shared))
+    assert difference.told_apart
+    assert difference.sentence().startswith("v: b is worse than a by 0.0")
+    assert difference.interval_m[0] > 0.02
 
 
 def test_blocks_are_as_long_as_errors_last() -> None:
@@ -78,12 +78,12 @@ def test_blocks_are_as_long_as_errors_last() -> None:
 
 def test_bags(tmp_path: Path, drive: Any, record: Callable[..., Path]) -> None:
     first, second = (record(tmp_path / name, drive) for name in ("one", "two"))
-    (found,) = compare_bags([first, second])
-    assert (found.vue, found.first, found.second) == ("vue_1", "one", "two")
-    assert found.difference_m == 0.0
-    assert found.epochs == 180
-    assert (found.only_first, found.only_second) == (0, 0)
-    assert found.to_json()["told_apart"] is False
+    (difference,) = compare_bags([first, second])
+    assert (difference.vue, difference.first, difference.second) == ("vue_1", "one", "two")
+    assert difference.difference_m == 0.0
+    assert difference.epochs == 180
+    assert (difference.only_first, difference.only_second) == (0, 0)
+    assert difference.to_json()["told_apart"] is False
 
 
 def test_bags_that_cannot_be_compared(tmp_path: Path, drive: Any, record: Any) -> None:

@@ -55,14 +55,14 @@ class Filter:
         e = np.linalg.cholesky(self._cov) @ rng.normal(size=(3, 2))
         process = np.einsum("ij,njm->nim", self._q, rng.normal(size=(n, 3, 2)))
         noise = self._sd * rng.normal(size=(n, 2))
-        found, nis = np.empty((n, 2)), np.empty(n)
+        series, nis = np.empty((n, 2)), np.empty(n)
         for k in range(n):
             e = self._F @ e - process[k]
             innovation = noise[k] - (self._H @ e)[0]
             nis[k] = innovation @ innovation / self._S
             e = e + np.outer(self._gain, innovation)
-            found[k] = e[0]
-        return found / np.sqrt(self._cov[0, 0]), nis
+            series[k] = e[0]
+        return series / np.sqrt(self._cov[0, 0]), nis
 
 
 def verdict(errors: Array) -> MeanTest:

@@ -105,11 +105,11 @@ def test_networks_are_scored_apart(
     content = evaluate_bag(bag).to_json()
     assert set(content["networks"]) == {"wifi", "wimax"}
     assert set(content["networks"]["wimax"]) == {"vue_1"}
-    own, wifi = content["vues"]["vue_1"], content["networks"]["wifi"]["vue_1"]
-    assert list(wifi) == list(own)
-    assert wifi["rmse_m"] == own["rmse_m"]
+    fused, wifi = content["vues"]["vue_1"], content["networks"]["wifi"]["vue_1"]
+    assert list(wifi) == list(fused)
+    assert wifi["rmse_m"] == fused["rmse_m"]
     assert wifi["clock_offset_sd_ns"] is None
-    assert content["networks"]["wimax"]["vue_1"]["rmse_m"] > 1.5 * own["rmse_m"]
+    assert content["networks"]["wimax"]["vue_1"]["rmse_m"] > 1.5 * fused["rmse_m"]
     assert list(evaluate_bag(bag).columns()) == ["vue_1", "vue_1 by wifi", "vue_1 by wimax"]
     assert evaluate_bag(drive_bag).to_json()["networks"] == {}
 

@@ -32,7 +32,7 @@ def written(
     """Devices that drive east at 5 m/s, estimates ``error_m`` to the north, 10 a second."""
     convert = codec()
     places = [np.array([0.0, 20.0, 3.0]), np.array([100.0, -20.0, 3.0])]
-    rsus = [RsuInfo(rsu_id=f"rsu_{i}", position=place) for i, place in enumerate(places)]
+    rsus = [RsuInfo(rsu_id=f"rsu_{i}", position=position) for i, position in enumerate(places)]
     with BagWriter(bag, metadata={"tracker": "{}"}) as out:
         for info in rsus:
             out.write("/rsu/info", convert.rsu_info_to_msg(info), 0)
@@ -48,7 +48,7 @@ def written(
                     linear_velocity=np.array([5.0, 0.0, 0.0]),
                 )
                 pose_cov = np.diag([0.25, 0.25, 1.0, 0.04, 0.04, 0.01])
-                found = replace(
+                estimate = replace(
                     true, position=true.position + np.array([0.0, error_m, 0.0]), pose_cov=pose_cov
                 )
                 clock = ClockState(stamp_ns=stamp, vue_id=vue, offset_s=1e-6, drift=0.0)
@@ -61,7 +61,7 @@ def written(
                     out.write(
                         f"/{vue}/ground_truth_clock", convert.clock_state_to_msg(clock), stamp
                     )
-                out.write(f"/{vue}/odometry", convert.odometry_to_msg(found), stamp)
+                out.write(f"/{vue}/odometry", convert.odometry_to_msg(estimate), stamp)
                 out.write(f"/{vue}/clock_state", convert.clock_state_to_msg(clock), stamp)
                 out.write(f"/{vue}/track_status", convert.track_status_to_msg(status), stamp)
                 for info in rsus:
@@ -88,12 +88,14 @@ def test_memory_a_message(tmp_path: Path) -> None:
     assert (peaks[1] - peaks[0]) / messages < 340.0
 
 
-def test_what_has_no_ground_truth_is_said_and_no_part_of_the_availability(tmp_path: Path) -> None:
-    found = evaluate_bag(written(tmp_path / "bag", 1, 300, truth_epochs=101))
-    figures = found.vues["vue_1"].scored.figures
+def test_time_without_ground_truth_is_noted_and_no_part_of_the_availability(
+    tmp_path: Path,
+) -> None:
+    evaluation = evaluate_bag(written(tmp_path / "bag", 1, 300, truth_epochs=101))
+    figures = evaluation.vues["vue_1"].scored.figures
     assert figures.truth_share == pytest.approx(101 / 300)
     assert figures.outside_truth == 199
-    assert found.notes == (
+    assert evaluation.notes == (
         "vue_1: 199 of 300 estimates (66.3 %) are not scored: 199 before or after the ground "
         "truth, 0 in gaps",
     )

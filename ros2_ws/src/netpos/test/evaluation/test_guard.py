@@ -45,16 +45,16 @@ def test_figures_of_many_runs_count_estimates_and_measurements() -> None:
     one = tracked(10, 1, 2, 50, rmse_m=1.0, nees_mean=1.0, nis_mean=3.0, nis_dof_mean=4.0)
     two = tracked(30, 0, 4, 150, rmse_m=3.0, nees_mean=2.0, nis_mean=5.0, nis_dof_mean=2.0)
     never = tracked(0, 1, 0, 0)
-    found = pooled([one, two, never])
-    assert found["rmse_m"] == pytest.approx(math.sqrt((10 * 1.0 + 30 * 9.0) / 40))
-    assert found["nees_mean"] == pytest.approx((10 * 1.0 + 30 * 2.0) / 40)
-    assert found["nis_over_dof"] == pytest.approx((10 * 3.0 + 30 * 5.0) / (10 * 4.0 + 30 * 2.0))
-    assert found["lost_tracks"] == 2
-    assert found["rejected_share"] == pytest.approx(6 / 200)
-    assert found["clock_offset_sd_ns"] is None
+    figures = pooled([one, two, never])
+    assert figures["rmse_m"] == pytest.approx(math.sqrt((10 * 1.0 + 30 * 9.0) / 40))
+    assert figures["nees_mean"] == pytest.approx((10 * 1.0 + 30 * 2.0) / 40)
+    assert figures["nis_over_dof"] == pytest.approx((10 * 3.0 + 30 * 5.0) / (10 * 4.0 + 30 * 2.0))
+    assert figures["lost_tracks"] == 2
+    assert figures["rejected_share"] == pytest.approx(6 / 200)
+    assert figures["clock_offset_sd_ns"] is None
     assert pooled([never])["rmse_m"] is None
     assert pooled([never])["rejected_share"] is None
-    assert found.keys() == LEAST.keys()
+    assert figures.keys() == LEAST.keys()
 
 
 def test_intervals_by_hand() -> None:
@@ -79,12 +79,12 @@ def test_intervals_by_hand() -> None:
 
 
 @pytest.mark.parametrize(
-    ("found", "kept"),
+    ("value", "kept"),
     [(0.95, True), (0.9499, False), (1.05, True), (1.0501, False), (None, False)],
 )
-def test_a_figure_leaves_at_the_ends_of_its_interval(found: float | None, kept: bool) -> None:
+def test_a_figure_leaves_at_the_ends_of_its_interval(value: float | None, kept: bool) -> None:
     baseline = Baseline(runs=1, figures={"rmse_m": Interval(1.0, 0.95, 1.05)})
-    assert (losses("street", baseline, {"rmse_m": found}) == []) is kept
+    assert (losses("street", baseline, {"rmse_m": value}) == []) is kept
 
 
 def test_a_loss_names_case_figure_value_interval_and_remedy() -> None:

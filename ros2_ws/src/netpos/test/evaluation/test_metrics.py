@@ -201,8 +201,8 @@ def converging(errors: list[float], dt_s: float = 0.25) -> Pairs:
     ],
 )
 def test_convergence_needs_a_whole_second(errors: list[float], expected_s: float | None) -> None:
-    found = time_to_converge(converging(errors))
-    assert found == (None if expected_s is None else round(expected_s * S))
+    converged_ns = time_to_converge(converging(errors))
+    assert converged_ns == (None if expected_s is None else round(expected_s * S))
 
 
 def test_a_pause_is_no_convergence() -> None:
@@ -303,11 +303,11 @@ def test_errors_above_the_protection_level_are_counted() -> None:
     truth = straight(10)
     estimate = [moved(o, 0.3, 0.0) for o in truth]
     levels = [0.2, -1.0, *([0.5] * 7)]
-    told = [
+    statuses = [
         status(0.1 * k, TrackState.TRACKING, protection_level_m=level)
         for k, level in enumerate(levels)
     ]
-    figures = score(run_of(truth, estimate, statuses=told), skip=0).figures
+    figures = score(run_of(truth, estimate, statuses=statuses), skip=0).figures
     assert figures.protection_exceeded == pytest.approx(1 / 8)
     assert figures.protection_level_m == 0.5
     figures = score(run_of(truth, estimate), skip=0).figures

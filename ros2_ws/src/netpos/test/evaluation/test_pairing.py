@@ -84,8 +84,8 @@ def test_no_truth_and_no_estimates_give_no_pairs() -> None:
 
 def test_stamps_of_this_century_keep_their_nanoseconds() -> None:
     base = 1_700_000_000 * S
-    found = bracket(np.array([base + 1]), np.array([base, base + 4]))
-    assert found.weight.tolist() == [0.25]
+    bracketed = bracket(np.array([base + 1]), np.array([base, base + 4]))
+    assert bracketed.weight.tolist() == [0.25]
 
 
 @pytest.mark.parametrize("gap", [0.0, -1.0, float("nan")])

@@ -26,7 +26,7 @@ def bout(*contacts_ms: int, untimed: tuple[tuple[int, int, int], ...] = ()) -> W
 
 
 @pytest.mark.parametrize(
-    ("found_ms", "expected"),
+    ("detected_ms", "expected"),
     [
         ([1000, 1600, 2200], ContactScore(3, 3, 0, 0)),
         ([1150, 1450, 2350], ContactScore(3, 2, 0, 0)),  # at the tolerance; the last is outside
@@ -36,15 +36,15 @@ def bout(*contacts_ms: int, untimed: tuple[tuple[int, int, int], ...] = ()) -> W
         ([], ContactScore(3, 0, 0, 0)),
     ],
 )
-def test_contacts_by_hand(found_ms: list[int], expected: ContactScore) -> None:
-    score = score_contacts(np.array(found_ms, dtype=np.int64) * MS, [bout(1000, 1600, 2200)])
+def test_contacts_by_hand(detected_ms: list[int], expected: ContactScore) -> None:
+    score = score_contacts(np.array(detected_ms, dtype=np.int64) * MS, [bout(1000, 1600, 2200)])
     assert score == expected
 
 
 def test_contacts_without_a_time_excuse_one_detection_each() -> None:
     reference = bout(1000, 3000, untimed=((1000, 3000, 2),))
-    found = np.array([1000, 1500, 2000, 2500, 3000]) * MS
-    assert score_contacts(found, [reference]) == ContactScore(2, 2, 1, 2)
+    detected = np.array([1000, 1500, 2000, 2500, 3000]) * MS
+    assert score_contacts(detected, [reference]) == ContactScore(2, 2, 1, 2)
 
 
 def event(end_s: float, length_m: float, heading_rad: float) -> StepEvent:

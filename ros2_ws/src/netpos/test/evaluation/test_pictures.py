@@ -38,8 +38,8 @@ def test_bounds_are_drawn_beside_the_error(drive_bag: Path) -> None:
     within 2.4477 (Rayleigh)."""
     evaluation = evaluate_bag(drive_bag)
     vue = evaluation.vues["vue_1"]
-    told = [replace(s, protection_level_m=3.0) for s in vue.run.statuses[100:]]
-    run = replace(vue.run, statuses=(*vue.run.statuses[:100], *told))
+    with_level = [replace(s, protection_level_m=3.0) for s in vue.run.statuses[100:]]
+    run = replace(vue.run, statuses=(*vue.run.statuses[:100], *with_level))
     levelled = replace(evaluation, vues={"vue_1": replace(vue, run=run)})
     (axes,) = draw_bounds(levelled).axes
     lines = {line.get_label(): np.asarray(line.get_ydata()) for line in axes.lines}

@@ -101,8 +101,8 @@ def test_the_script_writes_one_row_per_recording(data: Path, tmp_path: Path) -> 
     script = [sys.executable, str(ROOT / "scripts" / "real_data.py")]
     options = ["--data", str(data), "--json", str(file), "--out", str(out)]
     run = subprocess.run([*script, *options], capture_output=True, text=True, check=True)
-    found = json.loads(file.read_text())
-    (row,) = found["rows"]
+    content = json.loads(file.read_text())
+    (row,) = content["rows"]
     assert row["name"] == "uwb_LOS"
     assert row["reference"] == 0.5
     figures = {"snapshot", "plain_ekf", "ours", "declared", "learned", "defaults"}
@@ -115,8 +115,8 @@ def test_the_script_writes_one_row_per_recording(data: Path, tmp_path: Path) -> 
     # a window of 1 s on a circle at 1 m/s: its middle is 0.45 m behind
     assert row["snapshot"]["rmse_m"] == pytest.approx(0.45, abs=0.1)
     assert row["ours"]["n"] == row["plain_ekf"]["n"]
-    assert "ble_uc3_run1" in found["absent"]
-    assert "uwb_tdoa (planar)" in found["absent"]
+    assert "ble_uc3_run1" in content["absent"]
+    assert "uwb_tdoa (planar)" in content["absent"]
     assert "| uwb_LOS | 0.500 |" in run.stdout
     assert (out / "uwb_LOS" / "metadata.yaml").exists()
     again = subprocess.run([*script, *options], capture_output=True, text=True, check=False)

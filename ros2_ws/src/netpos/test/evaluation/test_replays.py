@@ -17,11 +17,11 @@ from typer.testing import CliRunner, Result
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("bags")
-    made = []
+    paths = []
     for seed in (1, 2, 3):
-        made.append(folder / f"run_{seed}")
-        simulate_to_bag(load_scenario("fast_pass", seed, {"max_duration_s": 2.0}), made[-1])
-    return made
+        paths.append(folder / f"run_{seed}")
+        simulate_to_bag(load_scenario("fast_pass", seed, {"max_duration_s": 2.0}), paths[-1])
+    return paths
 
 
 def replay(*arguments: object) -> Result:

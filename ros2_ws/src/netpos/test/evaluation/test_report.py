@@ -42,26 +42,26 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return page
 
 
-def test_losses_settings_seed_and_version_are_told(page_file: Path) -> None:
+def test_losses_settings_seed_and_version_are_shown(page_file: Path) -> None:
     text = page_file.read_text(encoding="utf-8")
     assert text.index("LOST while recording: 7 of /rsu/measurements") > 0
     runs = text[text.index("<caption>Runs") :]
     row = runs[runs.index("<td") : runs.index("</tr>", runs.index("<td"))]
-    for said in ("a_pass", "fast_pass", ">3<", "0.1.0", "initial_speed_sd_mps 42.0"):
-        assert said in row
+    for expected in ("a_pass", "fast_pass", ">3<", "0.1.0", "initial_speed_sd_mps 42.0"):
+        assert expected in row
     assert text.count("measured minus true") >= 2
     assert "measured minus where the track is" in text
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    found = [path for name in BROWSERS if (path := shutil.which(name))]
-    if not found:
+    paths = [path for name in BROWSERS if (path := shutil.which(name))]
+    if not paths:
         pytest.skip(f"no browser here: none of {', '.join(BROWSERS)}")
     from playwright.sync_api import sync_playwright  # noqa: PLC0415
 
     with sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=found[0], args=["--no-sandbox"])
+        browser = driver.chromium.launch(executable_path=paths[0], args=["--no-sandbox"])
         yield browser
         browser.close()
 
@@ -72,7 +72,10 @@ def page(browser: Any, page_file: Path, request: pytest.FixtureRequest) -> Itera
     complaints: list[str] = []
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("requestfailed", lambda asked: complaints.append(asked.url))
-    page.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
+    page.on(
+        "console",
+        lambda message: complaints.append(message.text) if message.type == "error" else None,
+    )
     page.goto(page_file.as_uri())
     page.wait_for_selector(".map .main-svg")
     yield page
@@ -91,12 +94,12 @@ def test_it_fits_its_screen(page: Any) -> None:
 
 def test_the_slider_moves_by_keyboard(page: Any) -> None:
     section = page.locator("section").first
-    said = section.locator("output")
-    before = said.inner_text()
+    shown = section.locator("output")
+    before = shown.inner_text()
     section.locator("input.time").focus()
     page.keyboard.press("End")
-    assert said.inner_text() != before
-    assert "vue_1 TRACKING" in said.inner_text()
+    assert shown.inner_text() != before
+    assert "vue_1 TRACKING" in shown.inner_text()
     marks = "document.querySelector('.map .js-plotly-plot').data.find(d => d.meta === 'now {}').x"
     (east, _) = page.evaluate(marks.format("estimate"))
     (true_east, _) = page.evaluate(marks.format("truth"))

@@ -31,11 +31,11 @@ RATE_HZ, SECONDS = 5.0, 60.0
 
 def gauss_markov(n: int, tau_s: float, dt_s: float, seed: int) -> Array:
     rng, decay = np.random.default_rng(seed), math.exp(-dt_s / tau_s)
-    found = np.empty(n)
-    found[0] = rng.normal()
+    series = np.empty(n)
+    series[0] = rng.normal()
     for k in range(1, n):
-        found[k] = decay * found[k - 1] + math.sqrt(1 - decay**2) * rng.normal()
-    return found
+        series[k] = decay * series[k - 1] + math.sqrt(1 - decay**2) * rng.normal()
+    return series
 
 
 def recorded(
@@ -56,8 +56,8 @@ def recorded(
         t = k / RATE_HZ
         if silence[0] <= t < silence[1]:
             continue
-        place = np.array([8.0 * math.cos(t / 8), 5.0 * math.sin(t / 8), 0.0])
-        d = np.linalg.norm(place - SITES, axis=1) + rng.normal(0.0, noise_sd, 5)
+        position = np.array([8.0 * math.cos(t / 8), 5.0 * math.sin(t / 8), 0.0])
+        d = np.linalg.norm(position - SITES, axis=1) + rng.normal(0.0, noise_sd, 5)
         d[0] += bias
         for i, distance in enumerate(d.tolist()):
             values: dict[str, Any] = {
@@ -136,7 +136,7 @@ def test_an_rsu_that_measures_too_long_is_named(tmp_path: Path) -> None:
     assert any(s.startswith("NIS ") and "too small" in s for s in vue.figures.suggestions)
 
 
-def test_what_is_learned_stands_beside(tmp_path: Path) -> None:
+def test_what_is_learned_is_shown_beside(tmp_path: Path) -> None:
     vue = of(recorded(tmp_path, bias=0.4, learn_errors=True))
     first = vue.figures.residuals[0]
     assert first.learned.startswith("ranges 0.")
@@ -144,12 +144,12 @@ def test_what_is_learned_stands_beside(tmp_path: Path) -> None:
     assert not any("set learn_errors" in s for s in vue.figures.suggestions)
 
 
-def test_variances_that_are_too_large_are_said(tmp_path: Path) -> None:
+def test_variances_that_are_too_large_are_reported(tmp_path: Path) -> None:
     vue = of(recorded(tmp_path, noise_sd=0.03))
     assert any("stated too large" in s for s in vue.figures.suggestions)
 
 
-def test_what_all_rsus_measure_too_long_is_told_from_what_one_does(tmp_path: Path) -> None:
+def test_a_common_excess_is_distinguished_from_that_of_one_rsu(tmp_path: Path) -> None:
     """The device is 2 m lower than its tracker thinks, and one RSU is off by itself."""
     bag = recorded(tmp_path, bias=0.5, device_height_m=2.0, isolate_rsus=False)
     suggestions = of(bag).figures.suggestions
@@ -180,9 +180,9 @@ def test_time_differences_are_named_by_their_pair(tmp_path: Path) -> None:
 def test_the_correlation_time_is_that_of_the_errors(tau_s: float) -> None:
     dt_s, n = 0.2, 20_000
     stamps = np.arange(n) * round(dt_s * S)
-    found = [correlation_s(stamps, gauss_markov(n, tau_s, dt_s, seed)) for seed in range(5)]
-    assert all(f is not None for f in found)
-    assert np.mean(found) == pytest.approx(tau_s + dt_s / 2, rel=0.15)  # type: ignore[arg-type]
+    times_s = [correlation_s(stamps, gauss_markov(n, tau_s, dt_s, seed)) for seed in range(5)]
+    assert all(f is not None for f in times_s)
+    assert np.mean(times_s) == pytest.approx(tau_s + dt_s / 2, rel=0.15)  # type: ignore[arg-type]
     white = np.random.default_rng(1).normal(size=n)
     assert correlation_s(stamps, white) is None
     assert correlation_s(stamps[:5], white[:5]) is None
@@ -222,8 +222,8 @@ def netpos(*arguments: object) -> tuple[int, str]:
 
 def figures_with(bag: Path, *options: object) -> tuple[dict[str, Any], list[str]]:
     file = bag.parent / "figures.json"
-    code, said = netpos("evaluate", bag, "--json", file, *options)
-    assert code == 0, said
+    code, output = netpos("evaluate", bag, "--json", file, *options)
+    assert code == 0, output
     content = json.loads(file.read_text())
     return content["vues"]["vue_1"], content["notes"]
 
@@ -236,7 +236,9 @@ def test_a_truth_from_a_text_file(tmp_path: Path) -> None:
     assert notes == ["truth from truth.tum"]
 
 
-def test_a_truth_with_its_own_clock_and_axes_is_aligned_and_said_so(tmp_path: Path) -> None:
+def test_a_truth_with_its_own_clock_and_axes_is_aligned_and_the_page_says_so(
+    tmp_path: Path,
+) -> None:
     bag = recorded(tmp_path)
     file = tum(tmp_path / "truth.tum", later_s=1000.0, turned_rad=0.7)
     options = ("--truth-time-offset", "auto", "--truth-align", "rigid")
@@ -250,8 +252,8 @@ def test_a_truth_with_its_own_clock_and_axes_is_aligned_and_said_so(tmp_path: Pa
 
 def test_a_truth_from_a_topic_of_another_bag(tmp_path: Path) -> None:
     bag = recorded(tmp_path)
-    own, _ = figures_with(bag, "--truth", bag, "--truth-topic", "/vue_1/odometry")
-    assert own["rmse_m"] < 0.02  # against itself, thinned
+    figures, _ = figures_with(bag, "--truth", bag, "--truth-topic", "/vue_1/odometry")
+    assert figures["rmse_m"] < 0.02  # against itself, thinned
 
 
 def on_earth(east: float, north: float, up: float) -> tuple[float, float, float]:
@@ -275,14 +277,14 @@ def on_earth(east: float, north: float, up: float) -> tuple[float, float, float]
         ]
     )
     wanted = ecef(lat, lon, h) + axes.T @ np.array([east, north, up])
-    at = np.array([lat, lon, h])
+    point = np.array([lat, lon, h])
     for _ in range(6):
         steps = np.array([1e-6, 1e-6, 1.0])
         slope = np.column_stack(
-            [(ecef(*(at + d)) - ecef(*(at - d))) / (2 * d.sum()) for d in np.diag(steps)]
+            [(ecef(*(point + d)) - ecef(*(point - d))) / (2 * d.sum()) for d in np.diag(steps)]
         )
-        at = at + np.linalg.solve(slope, wanted - ecef(*at))
-    return math.degrees(at[0]), math.degrees(at[1]), float(at[2])
+        point = point + np.linalg.solve(slope, wanted - ecef(*point))
+    return math.degrees(point[0]), math.degrees(point[1]), float(point[2])
 
 
 ORIGIN = (60.0, 30.25, 17.0)
@@ -327,11 +329,14 @@ def test_a_truth_of_latitudes_from_a_satellite_receiver(tmp_path: Path) -> None:
 
 def test_a_truth_that_cannot_be_used_is_one_sentence(tmp_path: Path) -> None:
     bag = recorded(tmp_path)
-    code, said = netpos("evaluate", bag, "--truth-align", "rigid")
-    assert (code, said) == (2, "netpos: there is no truth to map or align; name it with --truth\n")
-    code, said = netpos("evaluate", bag, "--truth", tmp_path / "none.tum")
+    code, output = netpos("evaluate", bag, "--truth-align", "rigid")
+    assert (code, output) == (
+        2,
+        "netpos: there is no truth to map or align; name it with --truth\n",
+    )
+    code, output = netpos("evaluate", bag, "--truth", tmp_path / "none.tum")
     assert code == 2
-    assert "none.tum" in said
-    code, said = netpos("evaluate", bag, "--truth", tum(tmp_path / "t.tum"), "--vue", "vue_7")
+    assert "none.tum" in output
+    code, output = netpos("evaluate", bag, "--truth", tum(tmp_path / "t.tum"), "--vue", "vue_7")
     assert code == 2
-    assert "has estimates of vue_1; say with --vue" in said
+    assert "has estimates of vue_1; choose with --vue" in output

@@ -50,10 +50,10 @@ def test_a_row_is_what_the_commands_give_one_by_one(table: pd.DataFrame, tmp_pat
 def test_means_have_intervals_and_count_what_has_no_figure(table: pd.DataFrame) -> None:
     holes = table.copy()
     holes.loc[0, "rmse_m"] = None
-    found = means(holes, KEYS, "rmse_m")
-    assert [mean.runs for mean in found] == [2, 3, 3, 3]
-    assert [mean.without for mean in found] == [1, 0, 0, 0]
-    for mean in found:
+    cells = means(holes, KEYS, "rmse_m")
+    assert [mean.runs for mean in cells] == [2, 3, 3, 3]
+    assert [mean.without for mean in cells] == [1, 0, 0, 0]
+    for mean in cells:
         rows = holes[np.logical_and.reduce([holes[k] == v for k, v in mean.setting.items()])]
         assert mean.mean == pytest.approx(rows["rmse_m"].mean())
         assert mean.interval is not None
@@ -97,7 +97,7 @@ def test_the_command_writes_a_table_and_a_picture(tmp_path: Path, suffix: str) -
         (("--vary", "tracker.hold_s=0", "--plot", "p.jpg"), "p.jpg"),
     ],
 )
-def test_mistakes_are_told_before_anything_is_run(
+def test_mistakes_are_reported_before_anything_is_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], words: str
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -15,11 +15,11 @@ from netpos.evaluation.work import Kept, Work, WorkerDiedError
 
 def draw(scale: float, seeds: range) -> list[float]:
     """Sums whose last bits depend on the order, and on threads if there were any."""
-    found = []
+    values = []
     for seed in seeds:
         a = np.random.default_rng(seed).normal(size=(60, 60))
-        found.append(scale * float(np.linalg.inv(a @ a.T).sum()))
-    return found
+        values.append(scale * float(np.linalg.inv(a @ a.T).sum()))
+    return values
 
 
 def note(folder: Path, part: tuple[int, ...]) -> int:
@@ -58,10 +58,10 @@ def test_processes_give_the_same_bits(serial: list[list[float]]) -> None:
 
 
 def test_progress_counts_what_is_in_the_parts() -> None:
-    told: list[tuple[str, int, int]] = []
-    with Work(20, 0, 1, lambda *said: told.append(said)) as work:
+    reports: list[tuple[str, int, int]] = []
+    with Work(20, 0, 1, lambda *report: reports.append(report)) as work:
         work.over_seeds("drawn", draw, 1.0)
-    assert told == [("drawn", 8, 20), ("drawn", 16, 20), ("drawn", 20, 20)]
+    assert reports == [("drawn", 8, 20), ("drawn", 16, 20), ("drawn", 20, 20)]
 
 
 def test_a_dead_process_is_an_error_of_its_own(tmp_path: Path) -> None:
@@ -96,11 +96,11 @@ class TestKept:
 
     def test_another_argument_is_another_job(self, tmp_path: Path) -> None:
         kept = Kept(tmp_path / "kept")
-        found = []
+        results = []
         for scale in (1.0, 2.0):
             with Work(2, 0, 1, kept=kept) as work:
-                found.append(work.over_seeds("drawn", draw, scale)[0][0])
-        assert found[1] == 2 * found[0]
+                results.append(work.over_seeds("drawn", draw, scale)[0][0])
+        assert results[1] == 2 * results[0]
 
     def test_a_file_is_no_folder(self, tmp_path: Path) -> None:
         (tmp_path / "a").touch()
@@ -120,10 +120,10 @@ class TestCluster:
     def test_it_gives_the_same_bits_as_one_process(
         self, address: str, serial: list[list[float]]
     ) -> None:
-        told: list[Any] = []
-        with Work(20, 5, cluster=address, progress=lambda *said: told.append(said)) as work:
+        reports: list[Any] = []
+        with Work(20, 5, cluster=address, progress=lambda *report: reports.append(report)) as work:
             assert work.over_seeds("drawn", draw, math.pi) == serial
-        assert told[-1] == ("drawn", 20, 20)
+        assert reports[-1] == ("drawn", 20, 20)
 
     def test_a_killed_worker_loses_nothing(self, address: str, tmp_path: Path) -> None:
         with Work(1, 0, cluster=address) as work:

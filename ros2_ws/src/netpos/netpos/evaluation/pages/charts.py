@@ -1,4 +1,4 @@
-"""Bar charts of recorded figures: what is compared, side by side."""
+"""Bar charts of recorded figures, side by side."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from netpos.evaluation.pages.recorded import Recorded, number
 from netpos.evaluation.pages.tables import TableError
 from netpos.evaluation.pictures import save
 
-# Okabe and Ito's colours, told apart with any colour vision; ours is the strongest
+# Okabe and Ito's colours: distinct for any colour vision; ours is the strongest
 COLOURS = ("#999999", "#E69F00", "#0072B2", "#56B4E9")
 
 

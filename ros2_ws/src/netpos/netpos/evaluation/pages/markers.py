@@ -1,4 +1,4 @@
-"""Where tables go in a page: between ``<!-- table: RECORDED NAME -->`` and
+"""Positions of tables in a page: between ``<!-- table: RECORDED NAME -->`` and
 ``<!-- end of table -->``."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the commands measured, as one list of entries whatever command wrote it.
+"""Recorded figures as one list of entries, for all commands.
 
 An entry has the name of an experiment and of a figure: a paper's row ``Fig. 5, T = 0.1 s: RMSE``
 is the figure ``RMSE`` of the experiment ``Fig. 5, T = 0.1 s``; a recording's ``ours: {rmse_m: 1}``
@@ -80,10 +80,10 @@ def number(value: Value) -> str:
 def split_name(name: str) -> tuple[str, str]:
     """Experiment and figure of a paper's row: around the last colon outside brackets."""
     places = [m.start() for m in re.finditer(": ", name)]
-    for place in reversed(places):
-        figure = name[place + 2 :]
+    for position in reversed(places):
+        figure = name[position + 2 :]
         if figure.count("(") == figure.count(")"):
-            return name[:place], figure
+            return name[:position], figure
     return name, ""
 
 
@@ -235,7 +235,7 @@ def _verdicts(figures: Mapping[str, Value]) -> Iterator[tuple[str, tuple[bool, s
     references = [
         (label, real(key, f"{key}.rmse_m", f"{key}.rmse")) for label, key in _REFERENCES.items()
     ]
-    limits = [(found[1], label) for label, found in references if found is not None]
+    limits = [(reference[1], label) for label, reference in references if reference is not None]
     if rmse is not None and limits:
         limit, label = min(limits)
         yield rmse[0], (rmse[1] <= limit, f"≤ {number(limit)} ({label})")
@@ -246,10 +246,10 @@ def _verdicts(figures: Mapping[str, Value]) -> Iterator[tuple[str, tuple[bool, s
         inside = low[1] <= nees[1] <= high[1]
         yield nees[0], (inside, f"{number(low[1])} to {number(high[1])}")
     for name, limit, at_most in _LIMITS:
-        found = real(f"ours.{name}")
-        if found is not None:
-            kept = found[1] <= limit if at_most else found[1] >= limit
-            yield found[0], (kept, f"{'≤' if at_most else '≥'} {limit:g}")
+        figure = real(f"ours.{name}")
+        if figure is not None:
+            kept = figure[1] <= limit if at_most else figure[1] >= limit
+            yield figure[0], (kept, f"{'≤' if at_most else '≥'} {limit:g}")
 
 
 _REFERENCES = {

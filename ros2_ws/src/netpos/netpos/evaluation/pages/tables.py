@@ -84,8 +84,8 @@ def render(table: Table, recorded: Recorded) -> str:
     for column in table.columns:
         groups = [_matching(column.figure, entries) for entries in chosen.values()]
         edges = [_matching(column.bounds, e) if column.bounds else [] for e in chosen.values()]
-        for pattern, found in ((column.figure, groups), (column.bounds, edges)):
-            if pattern and not any(found):
+        for pattern, matches in ((column.figure, groups), (column.bounds, edges)):
+            if pattern and not any(matches):
                 raise TableError(f"no figure of {table.rows!r} matches {pattern!r}")
         for source in column.show:
             texts = [

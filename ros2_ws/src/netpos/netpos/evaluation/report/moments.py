@@ -11,7 +11,7 @@ from netpos.evaluation.pairing import Trajectory, at_stamps
 from netpos.messages.values import TrackStatus
 
 MOMENTS = 600
-_AGE_S = 1.0  # an estimate older than this is none
+_AGE_S = 1.0  # an older estimate is not shown
 
 
 def moments_of(
@@ -37,29 +37,29 @@ def moments_of(
 def _estimates(
     track: Trajectory, statuses: Sequence[TrackStatus], stamps: np.ndarray
 ) -> dict[str, Any]:
-    told = {status.stamp_ns: status for status in statuses}
-    found: dict[str, list[Any]] = {"x": [], "y": [], "level": [], "state": []}
+    status_by_stamp = {status.stamp_ns: status for status in statuses}
+    columns: dict[str, list[Any]] = {"x": [], "y": [], "level": [], "state": []}
     for stamp, index in zip(
         stamps.tolist(), np.searchsorted(track.stamp_ns, stamps, side="right") - 1, strict=True
     ):
-        at = int(track.stamp_ns[index]) if index >= 0 else -1
-        here = index >= 0 and (stamp - at) * 1e-9 <= _AGE_S
-        status = told.get(at) if here else None
+        estimate_ns = int(track.stamp_ns[index]) if index >= 0 else -1
+        here = index >= 0 and (stamp - estimate_ns) * 1e-9 <= _AGE_S
+        status = status_by_stamp.get(estimate_ns) if here else None
         level = status.protection_level_m if status is not None else -1.0
         x, y = track.position[index, :2].tolist() if here else (None, None)
-        found["x"].append(x)
-        found["y"].append(y)
-        found["level"].append(level if level >= 0.0 else None)
-        found["state"].append(status.state.name if status is not None else "")
-    return found
+        columns["x"].append(x)
+        columns["y"].append(y)
+        columns["level"].append(level if level >= 0.0 else None)
+        columns["state"].append(status.state.name if status is not None else "")
+    return columns
 
 
 def _truths(truth: Trajectory | None, stamps: np.ndarray) -> dict[str, Any]:
-    found: dict[str, Any] = {"true_x": [None] * stamps.size, "true_y": [None] * stamps.size}
+    columns: dict[str, Any] = {"true_x": [None] * stamps.size, "true_y": [None] * stamps.size}
     if truth is None:
-        return found
+        return columns
     there = at_stamps(truth, stamps)
     places = np.searchsorted(stamps, there.stamp_ns)
-    for place, position in zip(places.tolist(), there.position.tolist(), strict=True):
-        found["true_x"][place], found["true_y"][place] = position[:2]
-    return found
+    for row, position in zip(places.tolist(), there.position.tolist(), strict=True):
+        columns["true_x"][row], columns["true_y"][row] = position[:2]
+    return columns

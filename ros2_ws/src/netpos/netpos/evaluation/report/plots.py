@@ -136,8 +136,10 @@ def integrity(evaluation: Evaluation) -> tuple[go.Figure, list[str]]:
     figure, sentences, ends = go.Figure(), [], [1e-2, 1e0]
     for index, (name, vue) in enumerate(evaluation.vues.items()):
         counted = vue.scored.counted
-        told = {s.stamp_ns: s.protection_level_m for s in vue.run.statuses}
-        level = np.array([told.get(stamp, -1.0) for stamp in counted.estimate.stamp_ns.tolist()])
+        level_by_stamp = {s.stamp_ns: s.protection_level_m for s in vue.run.statuses}
+        level = np.array(
+            [level_by_stamp.get(stamp, -1.0) for stamp in counted.estimate.stamp_ns.tolist()]
+        )
         known = level >= 0.0
         if not known.any():
             continue

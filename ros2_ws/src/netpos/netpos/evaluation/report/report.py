@@ -33,8 +33,8 @@ def bags_in(source: Path) -> list[Path]:
         raise ValueError(f"{source} does not exist; check the path")
     if source.is_file() or (source / "metadata.yaml").exists() or any(source.glob("*.mcap")):
         return [source]
-    found = (*source.glob("*/metadata.yaml"), *source.glob("*/*.mcap"))
-    bags = sorted({path.parent for path in found})
+    markers = (*source.glob("*/metadata.yaml"), *source.glob("*/*.mcap"))
+    bags = sorted({path.parent for path in markers})
     if not bags:
         raise ValueError(f"{source} is neither a bag nor a folder of bags")
     return bags
@@ -57,25 +57,25 @@ def write_report(
     """
     if out.suffix.lower() not in {".html", ".htm"}:
         raise ValueError(f"{out}: the report is an HTML file; choose a name that ends in .html")
-    found: list[Evaluation | Survey] = []
+    results: list[Evaluation | Survey] = []
     sections: list[dict[str, object]] = []
     left_out: list[str] = []
     for bag in bags:
         try:
             one = assess_bag(bag, skip=skip, residuals=True, progress=progress)
             sections.append(_scored(one) if isinstance(one, Evaluation) else _surveyed(one))
-            found.append(one)
+            results.append(one)
         except ValueError as error:
             left_out.append(str(error))
     if not sections:
         raise ValueError("; ".join(left_out))
-    common = [tables.overview(found)] if len(found) > 1 else []
+    common = [tables.overview(results)] if len(results) > 1 else []
     page = jinja2.Template((_HERE / "page.html").read_text(encoding="utf-8")).render(
         plotly=get_plotlyjs(),
         script=(_HERE / "page.js").read_text(encoding="utf-8"),
         version=__version__,
         skip=skip,
-        common=[*common, tables.runs(found)],
+        common=[*common, tables.runs(results)],
         sections=sections,
         left_out=left_out,
     )
@@ -84,7 +84,7 @@ def write_report(
 
 
 def _scored(evaluation: Evaluation) -> dict[str, object]:
-    """What the page says of a recording with ground truth."""
+    """Sections of a recording with ground truth."""
     vues = evaluation.vues
     tracks = {
         name: (vue.run.estimate, vue.run.statuses, vue.run.truth) for name, vue in vues.items()
@@ -120,7 +120,7 @@ def _integrity(evaluation: Evaluation) -> list[dict[str, str]]:
 
 
 def _surveyed(survey: Survey) -> dict[str, object]:
-    """What the page says of a recording without ground truth."""
+    """Sections of a recording without ground truth."""
     notes, drawn = list(survey.notes), []
     for name, vue in survey.vues.items():
         notes += [f"{name}: {text}" for text in vue.figures.suggestions]

@@ -36,10 +36,10 @@ def _table(
     return {"caption": caption, "head": head, "rows": rows, "text": text}
 
 
-def overview(found: Iterable[Evaluation | Survey]) -> Table:
+def overview(results: Iterable[Evaluation | Survey]) -> Table:
     """A row for each recording and device, misses first."""
     rows = []
-    for one in found:
+    for one in results:
         lost = str(sum(lost_in(one.facts).values()) or 0)
         if isinstance(one, Evaluation):
             rows += [
@@ -85,7 +85,7 @@ def _surveyed(figures: VueSurvey) -> list[str]:
     return [*unknown, _cell(refused, ".2%"), *unknown, NOTHING, tracking, "no truth"]
 
 
-def runs(found: Iterable[Evaluation | Survey]) -> Table:
+def runs(results: Iterable[Evaluation | Survey]) -> Table:
     """How each recording was made and tracked."""
     head = (
         "recording",
@@ -94,7 +94,7 @@ def runs(found: Iterable[Evaluation | Survey]) -> Table:
         "netpos",
         "tracker parameters that are not the default",
     )
-    return _table("Runs", head, [_run(one.path.name, one.facts) for one in found], text=(4,))
+    return _table("Runs", head, [_run(one.path.name, one.facts) for one in results], text=(4,))
 
 
 def _run(name: str, facts: Mapping[str, tuple[str, ...]]) -> list[str]:
@@ -102,8 +102,8 @@ def _run(name: str, facts: Mapping[str, tuple[str, ...]]) -> list[str]:
     parameters = "not said"
     if TRACKER_FACT in facts:
         config = TrackerConfig.from_mapping(_first(facts, TRACKER_FACT))
-        said = [f"{key} {value}" for key, value in not_usual(config).items()]
-        parameters = ", ".join(said) or "none"
+        changed = [f"{key} {value}" for key, value in not_usual(config).items()]
+        parameters = ", ".join(changed) or "none"
         if len(facts[TRACKER_FACT]) > 1:
             parameters = "contradicts itself"
     return [
@@ -138,7 +138,7 @@ def of_evaluation(
 
 
 def of_survey(survey: Survey) -> list[Table]:
-    """What a recording without ground truth tells of itself."""
+    """Tables of a recording without ground truth."""
     rows = {name: vue.figures.residuals for name, vue in survey.vues.items()}
     return [
         _table("Figures", ["figure", "unit", *survey.vues], survey_rows(survey)),
@@ -148,7 +148,7 @@ def of_survey(survey: Survey) -> list[Table]:
 
 def _residuals(rows: Mapping[str, Sequence[Residuals]], what: str) -> list[Table]:
     return [
-        _table(f"{name}: {what}", RESIDUAL_HEAD, residual_rows(found), text=(9,))
-        for name, found in rows.items()
-        if found
+        _table(f"{name}: {what}", RESIDUAL_HEAD, residual_rows(series), text=(9,))
+        for name, series in rows.items()
+        if series
     ]

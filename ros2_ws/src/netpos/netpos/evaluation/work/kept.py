@@ -46,15 +46,15 @@ class Kept:
 
 
 def _digest(job: Callable[..., Any], arguments: tuple[Any, ...]) -> str:
-    said = pickle.dumps((job.__module__, job.__qualname__, arguments))
-    return hashlib.sha256(_source() + said).hexdigest()[:32]
+    description = pickle.dumps((job.__module__, job.__qualname__, arguments))
+    return hashlib.sha256(_source() + description).hexdigest()[:32]
 
 
 @cache
 def _source() -> bytes:
     """The library as it is: its version and its text."""
-    found = hashlib.sha256(netpos.__version__.encode())
+    digest = hashlib.sha256(netpos.__version__.encode())
     root = Path(netpos.__file__).parent
     for path in sorted(root.rglob("*.py")):
-        found.update(str(path.relative_to(root)).encode() + path.read_bytes())
-    return found.digest()
+        digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
+    return digest.digest()

@@ -10,8 +10,8 @@ from typing import Self, TypeVar
 
 from threadpoolctl import threadpool_limits
 
+from netpos.evaluation.work.executors import Cluster, Executor, Here, Processes
 from netpos.evaluation.work.kept import Kept
-from netpos.evaluation.work.places import Cluster, Here, Place, Processes
 
 # Seeds per job. A constant, so that sums over a job do not depend on the number of workers.
 SEEDS_PER_JOB = 8
@@ -60,14 +60,14 @@ class Work:
         self._cluster = cluster
         self._progress = progress
         self._kept = kept
-        self._place: Place = Here()
+        self._executor: Executor = Here()
 
     def __enter__(self) -> Self:
         self._threads = threadpool_limits(1)  # which forked processes inherit
         if self._cluster is not None:
-            self._place = Cluster(self._cluster)
+            self._executor = Cluster(self._cluster)
         elif self._workers > 1 or self._apart:
-            self._place = Processes(self._workers)
+            self._executor = Processes(self._workers)
         return self
 
     def __exit__(
@@ -76,8 +76,8 @@ class Work:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._place.close(abandon=kind is not None)
-        self._place = Here()
+        self._executor.close(abandon=kind is not None)
+        self._executor = Here()
         self._threads.restore_original_limits()
 
     def with_runs(self, runs: int) -> Work:
@@ -119,7 +119,7 @@ class Work:
         self, job: Callable[[Argument, Part], Result], argument: Argument, part: Part
     ) -> Callable[[], Result]:
         def submit() -> Callable[[], Result]:
-            return self._place.submit(job, argument, part)
+            return self._executor.submit(job, argument, part)
 
         if self._kept is None:
             return submit()

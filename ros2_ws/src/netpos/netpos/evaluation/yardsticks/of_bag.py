@@ -94,6 +94,6 @@ def _rows(m: RsuMeasurement, info: RsuInfo, range_sd_m: float | None) -> Iterato
         sd = range_sd_m or math.hypot(math.sqrt(m.range_var), biases)
         yield Kind.RANGE, m.range_m, sd
     if m.fields & Field.TDOA and m.tdoa_var > 0:
-        own = math.sqrt(2.0) * info.range_bias_sd_m
-        sd = range_sd_m or math.hypot(SPEED_OF_LIGHT_MPS * math.sqrt(m.tdoa_var), own)
+        clock_sd_m = math.sqrt(2.0) * info.range_bias_sd_m
+        sd = range_sd_m or math.hypot(SPEED_OF_LIGHT_MPS * math.sqrt(m.tdoa_var), clock_sd_m)
         yield Kind.TDOA, -SPEED_OF_LIGHT_MPS * m.tdoa_s, sd

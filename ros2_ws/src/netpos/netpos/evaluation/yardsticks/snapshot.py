@@ -78,9 +78,9 @@ def snapshot(seen: Observations, space: Space, start: Array | None = None) -> Fi
         starts = by_cost[:_STARTS]
     else:
         starts = [start]
-    found = [_solve(seen, space, state) for state in starts]
-    state = min(found, key=lambda solution: _cost(seen, space, solution))
-    if _ambiguous(seen, space, state, found):
+    solutions = [_solve(seen, space, state) for state in starts]
+    state = min(solutions, key=lambda solution: _cost(seen, space, solution))
+    if _ambiguous(seen, space, state, solutions):
         return None
     for _ in range(_REPEATS):
         near = np.abs(_scaled(seen, space, state)[0]) <= GATE_SD
@@ -104,10 +104,10 @@ def _cost(seen: Observations, space: Space, state: Array) -> float:
     return float((_scaled(seen, space, state)[0] ** 2).sum())
 
 
-def _ambiguous(seen: Observations, space: Space, best: Array, found: list[Array]) -> bool:
+def _ambiguous(seen: Observations, space: Space, best: Array, solutions: list[Array]) -> bool:
     """Whether another solution, more than 1 m away, fits nearly as well as the best."""
     limit = _cost(seen, space, best) + _AS_GOOD
-    apart = [s for s in found if np.linalg.norm((s - best)[: space.dimensions]) > _APART_M]
+    apart = [s for s in solutions if np.linalg.norm((s - best)[: space.dimensions]) > _APART_M]
     return any(_cost(seen, space, solution) < limit for solution in apart)
 
 
@@ -151,7 +151,7 @@ def _grid(seen: Observations, space: Space) -> list[Array]:
     if not seen.turns:
         return list(places)
     headings = np.arange(_HEADINGS) * 2.0 * np.pi / _HEADINGS
-    return [np.append(place, heading) for place in places for heading in headings]
+    return [np.append(position, heading) for position in places for heading in headings]
 
 
 def snapshots(

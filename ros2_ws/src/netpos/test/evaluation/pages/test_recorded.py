@@ -25,8 +25,8 @@ def read(tmp_path: Path, name: str, data: object, full_runs: int = 20) -> Record
 
 
 def entry(recorded: Recorded, name: str) -> Entry:
-    (found,) = (e for e in recorded.entries if e.name == name)
-    return found
+    (match,) = (e for e in recorded.entries if e.name == name)
+    return match
 
 
 @pytest.mark.parametrize(
@@ -112,9 +112,9 @@ def test_a_recording_is_judged_at_the_boundaries(
     references: dict[str, Any],
     missed: list[tuple[str, str]],
 ) -> None:
-    found = read(tmp_path, "real_data", recording(ours, **references)).missed
-    assert len(found) == len(missed)
-    for entry_, (target, why) in zip(found, missed, strict=True):
+    targets = read(tmp_path, "real_data", recording(ours, **references)).missed
+    assert len(targets) == len(missed)
+    for entry_, (target, why) in zip(targets, missed, strict=True):
         assert entry_.target.startswith(target)
         assert why in entry_.target
 

@@ -38,7 +38,7 @@ def every_kind() -> Observations:
 
 def test_expected_values_by_hand() -> None:
     """3 m east and 4 m north of an RSU that looks north, 12 m below it."""
-    rsu, place = np.array([1.0, 2.0, 15.0]), np.array([4.0, 6.0, 3.0])
+    rsu, position = np.array([1.0, 2.0, 15.0]), np.array([4.0, 6.0, 3.0])
     north = math.pi / 2
     for kind, expected in (
         (Kind.RANGE, 13.0),
@@ -46,7 +46,7 @@ def test_expected_values_by_hand() -> None:
         (Kind.AZIMUTH_CONE, -math.asin(3 / 13)),
         (Kind.ELEVATION, -math.asin(12 / 13)),
     ):
-        error, _ = residuals(angles(kind, rsu, north, 0.0), place)
+        error, _ = residuals(angles(kind, rsu, north, 0.0), position)
         assert error[0] == pytest.approx(-expected, abs=1e-12), kind
 
 
@@ -58,22 +58,22 @@ def test_an_azimuth_behind_the_rsu_wraps() -> None:
 
 def test_a_tdoa_is_the_difference_of_two_ranges() -> None:
     rng = np.random.default_rng(3)
-    first, second, place = SQUARE[[0, 1, 2]], SQUARE[[3, 2, 0]], rng.uniform(0, 20, 3)
+    first, second, position = SQUARE[[0, 1, 2]], SQUARE[[3, 2, 0]], rng.uniform(0, 20, 3)
     zero = np.zeros(3)
-    far, far_slope = residuals(ranges([S] * 3, second, zero, 0.1), place)
-    near, near_slope = residuals(ranges([S] * 3, first, zero, 0.1), place)
-    error, slope = residuals(ranges([S] * 3, first, zero, 0.1, second), place)
+    far, far_slope = residuals(ranges([S] * 3, second, zero, 0.1), position)
+    near, near_slope = residuals(ranges([S] * 3, first, zero, 0.1), position)
+    error, slope = residuals(ranges([S] * 3, first, zero, 0.1, second), position)
     np.testing.assert_allclose(error, far - near, atol=1e-12)
     np.testing.assert_allclose(slope, far_slope - near_slope, atol=1e-12)
 
 
 def test_derivatives_are_those_of_central_differences() -> None:
-    seen, place, heading, h = every_kind(), np.array([7.0, 4.0, 1.5]), 0.7, 1e-6
-    _, slope = residuals(seen, place, heading)
+    seen, position, heading, h = every_kind(), np.array([7.0, 4.0, 1.5]), 0.7, 1e-6
+    _, slope = residuals(seen, position, heading)
     for k in range(4):
         step = np.eye(4)[k] * h
-        up, _ = residuals(seen, place + step[:3], heading + step[3])
-        down, _ = residuals(seen, place - step[:3], heading - step[3])
+        up, _ = residuals(seen, position + step[:3], heading + step[3])
+        down, _ = residuals(seen, position - step[:3], heading - step[3])
         np.testing.assert_allclose(slope[:, k], (down - up) / (2 * h), atol=1e-7)
 
 

@@ -66,9 +66,9 @@ def test_the_plain_filter_s_nis_is_that_of_its_measurements() -> None:
 @pytest.mark.parametrize(("off_sd", "rejected"), [(3.9, 0), (4.1, 1)])
 def test_the_gate_of_the_plain_filter_at_its_boundary(off_sd: float, rejected: int) -> None:
     """A range is off by this many sd of its innovation."""
-    place = np.array([10.0, 10.0, 1.0])
-    seen = at_rest(place, 0.2, 30, np.random.default_rng(8))
-    seen = replace(seen, value=np.linalg.norm(place - seen.rsu, axis=1))
+    position = np.array([10.0, 10.0, 1.0])
+    seen = at_rest(position, 0.2, 30, np.random.default_rng(8))
+    seen = replace(seen, value=np.linalg.norm(position - seen.rsu, axis=1))
     before = plain_ekf(seen.take(slice(0, -4)), LEVEL)
     config, dt = PlainConfig(), 0.1
     assert before.statuses[-1].rejected == {"gate": 0}

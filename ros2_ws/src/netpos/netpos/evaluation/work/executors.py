@@ -20,7 +20,7 @@ class WorkerDiedError(RuntimeError):
     """A process ended in the middle of a job: killed, or out of memory."""
 
 
-class Place(Protocol):
+class Executor(Protocol):
     """Takes jobs, and gives their results when asked for them."""
 
     def submit(self, job: Callable[[Any, Any], Any], *arguments: Any) -> Callable[[], Any]:
@@ -35,7 +35,7 @@ class Here:
     """This process: a job is run when its result is asked for."""
 
     def submit(self, job: Callable[[Any, Any], Any], *arguments: Any) -> Callable[[], Any]:
-        """See ``Place``."""
+        """See ``Executor``."""
         return lambda: job(*arguments)
 
     def close(self, *, abandon: bool) -> None:
@@ -60,7 +60,7 @@ class Processes:
             raise
 
     def submit(self, job: Callable[[Any, Any], Any], *arguments: Any) -> Callable[[], Any]:
-        """See ``Place``."""
+        """See ``Executor``."""
         future = self._pool.submit(job, *arguments)
 
         def wait() -> Any:
@@ -72,7 +72,7 @@ class Processes:
         return wait
 
     def close(self, *, abandon: bool) -> None:
-        """See ``Place``."""
+        """See ``Executor``."""
         if abandon:
             for process in multiprocessing.active_children():
                 process.terminate()
@@ -108,7 +108,7 @@ class Cluster:
         self._remote = ray.remote(max_retries=_RETRIES)(_on_one_thread)
 
     def submit(self, job: Callable[[Any, Any], Any], *arguments: Any) -> Callable[[], Any]:
-        """See ``Place``. Results are fetched one by one, so that few are in memory."""
+        """See ``Executor``. Results are fetched one by one, so that few are in memory."""
         reference = self._remote.remote(job, *arguments)
 
         def wait() -> Any:
