@@ -22,7 +22,7 @@ _RSUS = (
 
 
 def resident_bytes() -> int:
-    """Resident memory of this process. Raises ``Unavailable`` where /proc does not tell."""
+    """Resident memory of this process. Raises ``Unavailable`` where /proc does not report it."""
     try:
         pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
     except FileNotFoundError:

@@ -46,8 +46,8 @@ def consumed_topics(path: Path) -> set[str]:
     """The topics ``read_and_track`` takes."""
     with BagReader(path) as bag:
         config = TrackerConfig.from_mapping(bag_settings(bag).parameters)
-        taken = {t for t, info in bag.topics.items() if reading_of(t, info, config) is not None}
-        return {*taken, topics.RSU_INFO}
+        consumed = {t for t, info in bag.topics.items() if reading_of(t, info, config) is not None}
+        return {*consumed, topics.RSU_INFO}
 
 
 def read_and_decode(path: Path, wanted: set[str]) -> int:

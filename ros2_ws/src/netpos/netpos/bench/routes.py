@@ -34,11 +34,11 @@ def run_routes(counts: Sequence[int]) -> tuple[list[float], float]:
         with Work(count, 1, _WORKERS) as work:
             monte_carlo(work, experiment)
         seconds.append(time.perf_counter() - start)
-    own, worker = (
+    own_rss, worker_rss = (
         1024.0 * resource.getrusage(who).ru_maxrss
         for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
     )
-    return seconds, own + _WORKERS * worker
+    return seconds, own_rss + _WORKERS * worker_rss
 
 
 def routes_in_fresh_process(counts: Sequence[int]) -> tuple[list[float], float]:

@@ -87,12 +87,12 @@ def beside(
 def _figures(
     make: Callable[..., Iterable[Row]],
     names: list[str],
-    found: list[Column],
+    columns: list[Column],
     paper: tuple[float, ...],
 ) -> dict[str, float | None]:
     """Figures by the name of their row; where a summary is missing only what became of the tracks
     of each."""
-    if all(isinstance(one, Summary) for one in found):
-        return {row.name: row.ours for row in make(*found, *paper)}
-    lost = {name: one for name, one in zip(names, found, strict=True) if isinstance(one, Routes)}
+    if all(isinstance(one, Summary) for one in columns):
+        return {row.name: row.ours for row in make(*columns, *paper)}
+    lost = {name: one for name, one in zip(names, columns, strict=True) if isinstance(one, Routes)}
     return {row.name: row.ours for name in lost for row in track_rows(name, lost[name])}

@@ -106,20 +106,22 @@ class Setup:
         truth = _truth(simulation.beacons(VUE), heard, len(prior))
         if self._experiment.start_drawn:
             mean = np.random.default_rng([seed, 1]).multivariate_normal(truth[0, :N_CORE], cov)
-        found = self._followed(simulation, epochs, mean, cov, truth)
+        followed = self._followed(simulation, epochs, mean, cov, truth)
         height_m = self.config.device_height_m
-        bound = bound_covariances(*epochs[:3], truth, prior, height_m, found.motions, epochs.bias)
+        bound = bound_covariances(
+            *epochs[:3], truth, prior, height_m, followed.motions, epochs.bias
+        )
         return Track(
             stamps_ns=epochs.stamps_ns,
             truth=truth,
-            mean=found.means,
-            cov=found.covs,
+            mean=followed.means,
+            cov=followed.covs,
             bound=bound,
-            nis=found.nis,
-            dof=found.dof,
-            level=found.level,
-            tracked=found.tracked,
-            losses=found.losses,
+            nis=followed.nis,
+            dof=followed.dof,
+            level=followed.level,
+            tracked=followed.tracked,
+            losses=followed.losses,
         )
 
     def _followed(

@@ -79,7 +79,7 @@ def _part(run: Run, first: int, end: int | None = None) -> Run:
 
 
 class Follower:
-    """A tracker for whole runs: it starts where it is told, and after a loss by a first fix as
+    """A tracker for whole runs: it starts from a given state, and after a loss by a first fix as
     ``tracking.track`` does."""
 
     def __init__(self, config: TrackerConfig, rsus: tuple[Rsu, ...]) -> None:
@@ -113,15 +113,15 @@ class Follower:
         losses = 0
         while start is not None:
             first, mean, cov = start
-            part, own = epochs.since(first, fixed=losses > 0), _part(run, first)
-            own_motions = motions[first:] if imu is not None else motions
+            part, part_run = epochs.since(first, fixed=losses > 0), _part(run, first)
+            part_motions = motions[first:] if imu is not None else motions
             if imu is None and self._config.motion_model != "interacting":
-                done = self._compiled(part, mean, cov, own)
+                done = self._compiled(part, mean, cov, part_run)
             else:
-                done = self._stepped(part, mean, cov, own, imu, own_motions)
+                done = self._stepped(part, mean, cov, part_run, imu, part_motions)
             end = first + done
             level[first:end] = levels(
-                part.measured, _part(own, 0, done), own_motions, part.bias, self._options
+                part.measured, _part(part_run, 0, done), part_motions, part.bias, self._options
             )
             lost = end < count
             tracked[first : end - lost] = True  # nothing is published of the epoch of the loss
@@ -158,8 +158,8 @@ class Follower:
         motions: Array,
     ) -> int:
         """As ``_compiled``, epoch by epoch; ``motions`` (N, Parameter) are filled where an IMU
-        drives the filter. A slow error becomes a state when it is first heard of, as in a tracker:
-        until then it is in the results only."""
+        drives the filter. As in a tracker, a slow error becomes a state with its first
+        measurement; until then it is in the results only."""
         config, first = self._config, self.first_bias
         sd = np.append(self._extra_sd, epochs.bias[0])
         heard_ns, rejected, known = int(epochs.stamps_ns[0]), 0, first
@@ -174,9 +174,9 @@ class Follower:
                     estimate.set_imu_increment(yaw, speed, config.gyro_noise_density)
                 unheard_s, bias = (stamp - heard_ns) / NS, epochs.bias[:, : known - first].copy()
                 step = estimate.step(stamp, unheard_s, rejected, rows, bias)
-                run.nis[k], run.dof[k], taken = step
-                run.groups[k] = taken.sum()
-                rejected = 0 if 2 * taken.sum() >= taken.size else rejected + 1
+                run.nis[k], run.dof[k], accepted = step
+                run.groups[k] = accepted.sum()
+                rejected = 0 if 2 * accepted.sum() >= accepted.size else rejected + 1
                 heard_ns = stamp if run.dof[k] else heard_ns
             run.means[k], run.covs[k] = augmented(estimate.mean, estimate.cov, sd)
             run.radius[k] = estimate.radius(0.0)

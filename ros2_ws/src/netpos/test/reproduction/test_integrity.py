@@ -39,8 +39,8 @@ def test_levels_are_those_of_the_tracker(
     assert apart[1:].sum() <= 2
     assert (track.level[1:] > 0.0).all()
     positions = {o.status.stamp_ns: o.odometry.position for o in outputs if o.odometry}
-    told = np.array([positions[stamp][:2] for stamp in track.stamps_ns.tolist()])
-    astray = np.hypot(*(track.mean[:, POSITION] - told).T) > 1e-6
+    published = np.array([positions[stamp][:2] for stamp in track.stamps_ns.tolist()])
+    astray = np.hypot(*(track.mean[:, POSITION] - published).T) > 1e-6
     assert astray[1:].sum() <= 2
 
 

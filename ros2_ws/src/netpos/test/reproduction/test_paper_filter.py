@@ -95,8 +95,8 @@ def test_it_is_the_textbook_filter(route: dict[str, Any], noise: PaperNoise) -> 
     np.testing.assert_allclose(means[:, POSITION], expected[:, :2], rtol=0, atol=1e-5)
     np.testing.assert_allclose(means[:, VELOCITY], expected[:, 2:4], rtol=0, atol=1e-5)
     np.testing.assert_allclose(means[:, X.CLOCK], expected[:, 4], rtol=0, atol=1e-4)
-    own, other = covs[20:, :4, :4], expected_covs[20:, :4, :4]
-    np.testing.assert_allclose(own, other, rtol=1e-3, atol=1e-6)
+    transient_covs, expected_transient = covs[20:, :4, :4], expected_covs[20:, :4, :4]
+    np.testing.assert_allclose(transient_covs, expected_transient, rtol=1e-3, atol=1e-6)
 
 
 def test_a_run_starts_from_the_pose_and_sees_the_measurements_of_ours(

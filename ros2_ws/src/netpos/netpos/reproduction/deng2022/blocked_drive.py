@@ -180,16 +180,16 @@ def fixes_of(simulation: Simulation, epochs: Epochs) -> dict[str, Fixes]:
 
 
 def loose_epochs(epochs: Epochs, fixes: Fixes, lever: tuple[float, float, float]) -> Epochs:
-    """Epochs of position fixes in place of what they were made from (deng2022:eq.8), each with its
-    covariance."""
+    """Epochs of position fixes, each with its covariance, instead of the measurements they were
+    made from (deng2022:eq.8)."""
     good = fixes.status == FixStatus.CONVERGED
     rows = place_rows(fixes.position[good], fixes.cov[good], lever)
     row_start = np.append(0, np.cumsum(3 * good.astype(np.int64)))
     return Epochs(epochs.stamps_ns, row_start, rows.reshape(-1, rows.shape[-1]))
 
 
-def less_told(fixes: Fixes) -> dict[str, Fixes]:
-    """The fixes with less said of each: its variances without their correlations, or the mean
+def reduced_covariances(fixes: Fixes) -> dict[str, Fixes]:
+    """The fixes with a reduced covariance: variances without correlations, or the mean
     covariance of all."""
     good = fixes.status == FixStatus.CONVERGED
     mean = np.broadcast_to(fixes.cov[good].mean(axis=0), fixes.cov.shape)
@@ -212,11 +212,11 @@ def started(simulation: Simulation, case: Case, config: TrackerConfig) -> tuple[
     seed, sd = simulation.scenario.seed, start_sd(config, *START_SD)
     error = sd * generator(seed, f"{VUE}/start").standard_normal(sd.size)
     turned = Rotation.from_rotvec(error[ERR_ATTITUDE]) * truth.rotation[0]
-    place, velocity = (
+    position, velocity = (
         truth.position[0] + error[ERR_POSITION],
         truth.velocity[0] + error[ERR_VELOCITY],
     )
-    nav, cov = nav_of(place, velocity, turned.as_quat()), np.diag(sd**2)
+    nav, cov = nav_of(position, velocity, turned.as_quat()), np.diag(sd**2)
     return with_clock(config, nav, cov) if case.one_way else (nav, cov)
 
 
@@ -230,7 +230,7 @@ def run(case: Case, seed: int) -> Run:
     inputs = {TIGHT: epochs, VEHICLE: epochs, DEFAULT: epochs, DEFAULT_VEHICLE: epochs}
     loose = {} if case.one_way else {LOOSE: fixes[FIX]}
     if case.nearest <= FEW_STATIONS and loose:
-        loose |= less_told(fixes[FIX])
+        loose |= reduced_covariances(fixes[FIX])
     inputs |= {name: loose_epochs(epochs, used, lever) for name, used in loose.items()}
     return Run(
         stamps_ns=epochs.stamps_ns,

@@ -147,14 +147,16 @@ def _bounds(case: Case, seeds: range) -> dict[str, Squares]:
 def dilution(epochs: Epochs, antenna: Array) -> Array:
     """Horizontal and vertical dilution of precision of ranges alone, (k, 2), of the epochs with at
     least three stations; antenna (N, 3) where it really was."""
-    found = []
-    for place, first, last in zip(antenna, epochs.row_start, epochs.row_start[1:], strict=False):
+    dilutions = []
+    for position, first, last in zip(
+        antenna, epochs.row_start, epochs.row_start[1:], strict=False
+    ):
         if last - first >= 3:
-            away = place - epochs.rows[first:last, ORIGIN : ORIGIN + 3]
+            away = position - epochs.rows[first:last, ORIGIN : ORIGIN + 3]
             u = away / np.linalg.norm(away, axis=1)[:, None]
             var = np.diagonal(np.linalg.inv(u.T @ u))
-            found.append((np.sqrt(var[0] + var[1]), np.sqrt(var[2])))
-    return np.array(found).reshape(-1, 2)
+            dilutions.append((np.sqrt(var[0] + var[1]), np.sqrt(var[2])))
+    return np.array(dilutions).reshape(-1, 2)
 
 
 def _dilutions(case: Case, seeds: range) -> tuple[int, Array]:
@@ -164,8 +166,8 @@ def _dilutions(case: Case, seeds: range) -> tuple[int, Array]:
         epochs = epochs_of(simulation, case)
         truth = simulation.truth(VUE, epochs.stamps_ns)
         lever = simulation.scenario.devices[0].lever_arm_m
-        found = dilution(epochs, truth.position + truth.rotation.apply(lever))
-        n, total = n + len(found), total + found.sum(axis=0)
+        dilutions = dilution(epochs, truth.position + truth.rotation.apply(lever))
+        n, total = n + len(dilutions), total + dilutions.sum(axis=0)
     return n, total
 
 

@@ -1,5 +1,5 @@
 """deng2022 on a real drive: the IMU and the way are real, the stations are simulated along it; and
-what the IMU alone holds when the aiding, RTK, is taken away."""
+the error of the IMU alone while the aid, RTK, is withheld."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ Start = tuple[int, Array, Array]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """The drive, what a tracker needs of it, and its state once RTK and IMU have told the heading:
-    stamp, nav, cov; ``unset``: sensors and start by the library's default parameters."""
+    """The drive, what a tracker needs of it, and its state (stamp, nav, cov) once RTK and IMU have
+    determined the heading; ``unset``: sensors and start by the library's default parameters."""
 
     drive: CarDrive
     imu: Imu
@@ -73,26 +73,26 @@ def recording() -> Recording | None:
     folder = recordings(RECORDING)
     if folder is None:
         return None
-    found = load_car_drive(Path(folder))
-    config, unset = TrackerConfig.from_mapping(found.tracker), default_config()
+    drive = load_car_drive(Path(folder))
+    config, unset = TrackerConfig.from_mapping(drive.tracker), default_config()
     return Recording(
-        drive=found,
-        imu=Imu(found.imu_ns, found.rates),
+        drive=drive,
+        imu=Imu(drive.imu_ns, drive.rates),
         config=config,
         sensors=sensors_of(config),
         gate=gate_thresholds(config.gate_probability),
-        start=_aligned(found, config),
-        unset=(sensors_of(unset), _aligned(found, unset)),
+        start=_aligned(drive, config),
+        unset=(sensors_of(unset), _aligned(drive, unset)),
     )
 
 
-def _aligned(found: CarDrive, config: TrackerConfig) -> Start:
+def _aligned(drive: CarDrive, config: TrackerConfig) -> Start:
     """Coarse alignment from rest, by RTK."""
     start, samples = StrapdownStart(config), SampleBuffer()
-    pending = iter(imu_samples(found, VUE))
+    pending = iter(imu_samples(drive, VUE))
     cov, lever = np.diag(np.square(RTK_SD_M)), np.array(MOUNT.lever_arm_m)
-    for stamp, position in zip(found.rtk_ns.tolist(), found.antenna, strict=True):
-        if stamp < found.imu_ns[0]:
+    for stamp, position in zip(drive.rtk_ns.tolist(), drive.antenna, strict=True):
+        if stamp < drive.imu_ns[0]:
             continue
         for sample in pending:
             samples.add(sample)
@@ -119,21 +119,21 @@ def station_tally(case: Case, seed: int) -> dict[str, Tally]:
     """Errors of the antenna against RTK, by coupling."""
     known = recording()
     assert known is not None
-    made = station_drive(known.drive, fewest=case.fewest, nearest=case.nearest, seed=seed)
-    templates = RowTemplates.of(made.stations, FIELDS)
-    heard, row_start, rows, _ = observation_rows(made.seen, templates, 0)
+    simulated = station_drive(known.drive, fewest=case.fewest, nearest=case.nearest, seed=seed)
+    templates = RowTemplates.of(simulated.stations, FIELDS)
+    heard, row_start, rows, _ = observation_rows(simulated.seen, templates, 0)
     rows[:, LEVER : LEVER + 3] = MOUNT.lever_arm_m
-    after = made.stamps_ns[heard] > known.start[0]
+    after = simulated.stamps_ns[heard] > known.start[0]
     first = int(np.argmax(after))
-    epochs = Epochs(made.stamps_ns[heard][first:], row_start[first:], rows)
-    fixes = fix_each(epochs, ground_height_m(made.stations), 0.0)
+    epochs = Epochs(simulated.stamps_ns[heard][first:], row_start[first:], rows)
+    fixes = fix_each(epochs, ground_height_m(simulated.stations), 0.0)
     variants = _variants(known)
     inputs = dict.fromkeys(variants, epochs)
     variants[LOOSE], inputs[LOOSE] = (
         variants[TIGHT],
         loose_epochs(epochs, fixes, MOUNT.lever_arm_m),
     )
-    truth, tallies = made.antenna[heard][first:], {}
+    truth, tallies = simulated.antenna[heard][first:], {}
     for name, variant in variants.items():
         done = _run(known, inputs[name], *variant)
         error = ned(_antenna(done.nav) - truth)[_SKIP:]

@@ -209,23 +209,23 @@ def _bounds(work: Work, blocked: dict[str, Tally]) -> Iterator[Row]:
     """The posterior Cramér-Rao bound of what misses its target."""
     loose = blocked[LOOSE].plane_m
     for case in (OPEN, BLOCKED, OUTAGES, LONG_OUTAGES):
-        for variant, found in bounds(work, case).items():
+        for variant, bound in bounds(work, case).items():
             label = f"Bound, {case.name}, SINS, {variant}"
-            for axis, ours in zip(AXES, found.rms_m.tolist(), strict=True):
+            for axis, ours in zip(AXES, bound.rms_m.tolist(), strict=True):
                 yield shown(f"{label}: RMS {axis}", "m", ours)
-            plane = float(np.hypot(*found.rms_m[:2]))
+            plane = float(np.hypot(*bound.rms_m[:2]))
             if case == BLOCKED:
                 yield shown(f"{label}: horizontal RMS over our loose", "1", plane / loose)
             if case.outage_s:
-                end = float(np.hypot(*found.end_rms_m[:2]))
+                end = float(np.hypot(*bound.end_rms_m[:2]))
                 yield shown(f"{label}: after {case.outage_s} s, RMS, horizontal", "m", end)
 
 
 def _smoothed(work: Work) -> Iterator[Row]:
     """Errors inside the outages, as the filter had them and given what came later."""
     for case in (OUTAGES, LONG_OUTAGES):
-        for variant, found in in_outages(work, case).items():
-            plane = float(np.hypot(*found.rms_m[:2]))
+        for variant, smoothed in in_outages(work, case).items():
+            plane = float(np.hypot(*smoothed.rms_m[:2]))
             yield shown(f"Inside {case.name}, SINS, {variant}: RMS, horizontal", "m", plane)
 
 

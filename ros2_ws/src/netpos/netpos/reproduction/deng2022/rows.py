@@ -90,8 +90,8 @@ def troubles(tally: Tally) -> dict[str, float]:
 
 def clock_cells(tally: Tally) -> dict[str, float]:
     """Offset of the clock [ns]."""
-    error, said = tally.clock_ns
-    return {"RMS clock offset": error, "clock offset sd as stated": said}
+    error, stated = tally.clock_ns
+    return {"RMS clock offset": error, "clock offset sd as stated": stated}
 
 
 def outage_cells(tally: Tally) -> dict[str, float]:

@@ -83,8 +83,8 @@ class Tally:
     @property
     def clock_ns(self) -> tuple[float, float]:
         """RMS error of the clock's offset, and that its covariance says."""
-        error, said = (1e9 / SPEED_OF_LIGHT_MPS * np.sqrt(self.clock_m2 / self.n)).tolist()
-        return error, said
+        error, stated = (1e9 / SPEED_OF_LIGHT_MPS * np.sqrt(self.clock_m2 / self.n)).tolist()
+        return error, stated
 
     def nees_test(self, states: int) -> MeanTest:
         """Mean NEES of ``states`` of ``NEES_STATES``, tested by the spread between drives."""

@@ -34,7 +34,7 @@ class Crossing:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CrossingRun:
-    """swapped: two objects were ever taken for one; renamed: a device's name ever went to another
+    """swapped: two objects were ever fused as one; renamed: a device's name ever went to another
     object; fused_share: of the devices reported after ``SETTLED_S``, those in which both networks
     are."""
 

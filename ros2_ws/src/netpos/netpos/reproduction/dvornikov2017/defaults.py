@@ -85,9 +85,9 @@ def run_defaults(setting: Setting, seed: int) -> Estimates:
         tracks = [o.track for o in outputs if o.track and o.track.network == network.name]
         estimates[network.name] = _moved(tracks, stamps, truth)
     fused = _empty(len(stamps))
-    place = {int(stamp): k for k, stamp in enumerate(stamps.tolist())}
+    row_of_stamp = {int(stamp): k for k, stamp in enumerate(stamps.tolist())}
     for output in outputs:
-        k = place.get(output.status.stamp_ns)
+        k = row_of_stamp.get(output.status.stamp_ns)
         same = output.status.vue_id == VUE and output.status.sources
         if k is not None and same and output.odometry is not None:
             fused[0][k] = output.odometry.position[:2] - truth[k]

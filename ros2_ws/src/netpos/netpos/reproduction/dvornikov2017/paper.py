@@ -153,12 +153,12 @@ def reproduce(work: Work) -> Outcome:
         summarise_defaults(work, s) for s in (PAPER, COMMON_NOISE, MANOEUVRE[0])
     )
     crossings = [_crossing_runs(work, entry) for entry in CROSSINGS]
-    own = Sides(ours=paper, paper=paper, defaults=defaults)
+    sides = Sides(ours=paper, paper=paper, defaults=defaults)
     shared = Sides(ours=common, paper=common_floored, defaults=common_defaults)
     rows = [
-        *claims(own),
+        *claims(sides),
         *gain_rows(paper, work.seed),
-        *_tertiary(own),
+        *_tertiary(sides),
         *_tertiary(Sides(ours=deaf, paper=paper, defaults=defaults)),
         *_tertiary(shared),
         *lost_rows(shared, FUSED, f"{COMMON_NOISE.name}, fused"),

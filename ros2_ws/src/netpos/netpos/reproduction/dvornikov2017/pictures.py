@@ -45,9 +45,11 @@ def gains(all_stages: Mapping[str, Stages], network: str, seed: int) -> Figure:
         stage = built.networks[number]
         truth = setting.truth(seed, stage.stamps_ns)
         start = setting.truth(seed, np.array([START_NS]))[0]
-        found = gains_of(stage, setting.tracker.jerk_density, stage.fixes(seed, truth), start)
+        gain_series = gains_of(
+            stage, setting.tracker.jerk_density, stage.fixes(seed, truth), start
+        )
         time = (stage.stamps_ns - START_NS) / NS
-        for panel, values in zip(panels, found.T, strict=True):
+        for panel, values in zip(panels, gain_series.T, strict=True):
             panel.plot(time, values, color=colour, lw=1.0, label=label)
     for panel, label in zip(panels, _GAIN_LABELS, strict=True):
         panel.set(ylabel=label, yscale="log")

@@ -73,7 +73,7 @@ class Setting:
 def common_stamps_ns(setting: Setting) -> Ints:
     """The common instants: every fix of the network that is last."""
     stamps = [network.stamps_ns(setting.duration_s) for network in setting.networks]
-    return max(stamps, key=lambda own: int(own[0]))
+    return max(stamps, key=lambda network_stamps: int(network_stamps[0]))
 
 
 def position_rows(fixes: Array, sd_m: Array) -> Array:
@@ -147,13 +147,13 @@ class Pass:
         estimate = estimates.start(config, START_NS, np.zeros(6), np.eye(6))
         estimate.cov[:] = self._start_cov
         rows = position_rows(np.zeros((self.stamps_ns.size, 2)), self._sd)
-        own: OwnNoise | None = None
+        noise: OwnNoise | None = None
         shares = []
         for k, stamp in enumerate(self.stamps_ns.tolist()):
             epoch = rows[2 * k : 2 * k + 2].copy()
             estimate.step(stamp, 0.0, 0, epoch, NO_BIAS)
-            own = secondary.after(own, stamp, estimate, epoch, NO_BIAS)
-            shares.append(secondary.track(own, 0, estimate, NO_BIAS).own_cov)
+            noise = secondary.after(noise, stamp, estimate, epoch, NO_BIAS)
+            shares.append(secondary.track(noise, 0, estimate, NO_BIAS).own_cov)
         return np.array(shares)
 
 
@@ -188,9 +188,9 @@ class Stages:
         for number, network in enumerate((*self.networks, self.central)):
             covs = network.run(np.zeros((network.stamps_ns.size, 2)), np.zeros(6))[1]
             name = CENTRAL
-            own = np.zeros_like(covs)
+            own_covs = np.zeros_like(covs)
             if number < 2:
-                name, own = self.setting.networks[number].name, network.own_covs()
+                name, own_covs = self.setting.networks[number].name, network.own_covs()
             newest = self._moves[number][0]
             moved = [
                 at_common_instant(
@@ -201,7 +201,7 @@ class Stages:
                             vue_id=VUE,
                             mean=np.zeros(6),
                             cov=covs[i],
-                            own_cov=own[i],
+                            own_cov=own_covs[i],
                         )
                     ],
                     int(stamp),

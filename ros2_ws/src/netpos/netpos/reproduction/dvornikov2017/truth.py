@@ -15,7 +15,7 @@ from netpos.tracking.networks.common_instant import step_matrices
 from netpos.world.quadratic import QuadraticMotion
 
 Ints = npt.NDArray[np.int64]
-Place = tuple[float, float]
+Vector2 = tuple[float, float]
 
 START_NS = NS
 _GRID_NS = NS // 10
@@ -26,9 +26,9 @@ class Quadratic:
     """The same curves of the second order under every seed; ``stretches``: duration [s] and
     acceleration [m/s^2]."""
 
-    start_m: Place
-    velocity_mps: Place
-    stretches: tuple[tuple[float, Place], ...]
+    start_m: Vector2
+    velocity_mps: Vector2
+    stretches: tuple[tuple[float, Vector2], ...]
 
     def __call__(self, seed: int, stamps_ns: Ints) -> Array:
         """States (n, 6)."""
@@ -43,7 +43,7 @@ class Jerky:
     """Acceleration that walks at random: white jerk of a density [m/s^3/sqrt(Hz)], exactly what a
     filter of the same density takes the motion for. Stamps lie on a grid of 0.1 s."""
 
-    velocity_mps: Place
+    velocity_mps: Vector2
     jerk_density: float
     duration_s: float
 

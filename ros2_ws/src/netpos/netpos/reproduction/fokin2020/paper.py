@@ -92,20 +92,20 @@ FIG_5_DRAWN = tuple(
 
 _WITH_IMU = (("motion_model", "inertial"),)
 _WITHOUT_IMU = (("motion_model", "constant_velocity"), ("manoeuvre_speed_sd_mps", 0.0))
-_TOLD = (  # the settings of metis_madrid for 3 m/s: it keeps its speed, its turns are manoeuvres
+_TURNING = (  # metis_madrid at 3 m/s: the device keeps its speed, its turns are manoeuvres
     ("motion_model", "constant_velocity"),
     ("process_noise", "continuous"),
     ("accel_density_mps2_sqrthz", 0.1),
     ("manoeuvre_speed_sd_mps", 3.0 * math.sqrt(2.0)),
 )
-# Per d_los: the paper's filter, which knows of no turn; one that is told; and
+# Per d_los: the paper's filter, which allows no turn; one that allows turns; and
 # bridging with the inertial sensor.
 FIG_6 = tuple(
     tuple(
         Experiment(name=f"Fig. 6, d_los = {d_los_m} m{label}", scenario=scenario, tracker=tracker)
         for label, tracker in (
             ("", _WITHOUT_IMU),
-            (", turns told", _TOLD),
+            (", turns told", _TURNING),
             (", IMU", _WITH_IMU),
         )
     )
@@ -163,11 +163,11 @@ class _Turns(NamedTuple):
     summaries: list[Summary]
 
 
-def _turns(work: Work, alone: Experiment, told: Experiment, imu: Experiment) -> _Turns:
-    """Rows of what drives straight on, of what is told of turns, and of the inertial sensor, each
-    against the first."""
+def _turns(work: Work, alone: Experiment, turning_model: Experiment, imu: Experiment) -> _Turns:
+    """Rows of the model without turns, of the model with turns, and of the inertial model; the
+    last two are compared with the first."""
     straight = in_columns(work, alone, defaults=False, series=True)
-    turning = monte_carlo(work, told, series=True)
+    turning = monte_carlo(work, turning_model, series=True)
     bridged = in_columns(work, imu, series=True)
     rows = [
         *beside(rows_of.turn, straight),

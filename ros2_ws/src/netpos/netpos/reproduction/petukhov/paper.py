@@ -4,7 +4,7 @@ The headline is the whole chain from a simulated gait (``chain_rows``): the trac
 step after the step. Beside it the rectangle is walked in steps of constant velocity, with dead
 reckoning by the paper's error model. There the tracker knows a step's velocity during the step,
 and the name of every such row says so. The column of the paper's own filter is its scheme: the
-sector by the direction of the first step, step velocities taken as white, no gate.
+sector by the direction of the first step, white step velocities, no gate.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from netpos.reproduction.frame import Outcome, Row, at_least, at_most, required,
 from netpos.reproduction.petukhov import chain_rows, person, pictures, rectangle
 from netpos.reproduction.petukhov.chain_rows import PAPER, RATIO, RMSE_M
 from netpos.reproduction.petukhov.rectangle import Case, Walked
-from netpos.reproduction.petukhov.sector_choice import Conditions, Found, sector_choice
+from netpos.reproduction.petukhov.sector_choice import Conditions, SectorShares, sector_choice
 from netpos.reproduction.petukhov.troubles import Trouble
 from netpos.reproduction.petukhov.walk_bound import known_instants_rmse_m
 from netpos.reproduction.petukhov.walk_figures import (
@@ -98,18 +98,18 @@ def reproduce(work: Work) -> Outcome:
     walked = {case: compared(work, case) for case in (LONG, SHORT, HIDDEN)}
     conditions = (TARGET, POOR_HEADING)
     known = {c: sector_choice(work, replace(c, defaults=True)) for c in conditions}
-    found = {c: sector_choice(work, c) for c in (*conditions, *BY_BASELINE, *BY_PHASE)}
+    choices = {c: sector_choice(work, c) for c in (*conditions, *BY_BASELINE, *BY_PHASE)}
     some = work.with_runs(min(work.runs, TROUBLED_RUNS))
     troubled = {case: compared(some, case) for case in TROUBLES}
     during = [
         *_baselines(walked[LONG], walked[SHORT]),
         *_beyond(walked),
         *_troubled(troubled),
-        *_sectors(found, known),
+        *_sectors(choices, known),
         *person.rows(work),
     ]
     rows = (*chain, *_walk(rectangle.setup_of(LONG)), *_during(during))
-    return Outcome(rows=rows, draw=partial(_draw, work.seed, walked, found))
+    return Outcome(rows=rows, draw=partial(_draw, work.seed, walked, choices))
 
 
 def _during(rows: Iterable[Row]) -> Iterator[Row]:
@@ -144,7 +144,7 @@ def compared(work: Work, case: Case) -> Compared:
 
 
 def _walk(setup: rectangle.Setup) -> Iterator[Row]:
-    """What the paper says of the walk itself."""
+    """Claims of the paper about the walk itself."""
     way = float(np.hypot(*np.diff(setup.truth, axis=0).T).sum())
     steps = setup.steps
     for name, unit, paper, ours in (
@@ -232,7 +232,7 @@ def _largest_hidden(figures: Figures, quantile: float) -> float:
 
 
 def _troubled(troubled: dict[Case, Compared]) -> Iterator[Row]:
-    """What no one promises: the tracker is not told of these. Errors of decided estimates."""
+    """Errors of decided estimates in troubles that the tracker does not know of; no target."""
     for case, figures in troubled.items():
         name, ours = case.name, figures.ours
         row = shown(f"{name}: RMSE", "m", ours.rmse_m)
@@ -273,12 +273,14 @@ def _repair_s(error: Array, times_s: Array) -> Array:
     return np.where(bad.any(axis=1), after, 0.0)
 
 
-def _sectors(found: dict[Conditions, Found], known: dict[Conditions, Found]) -> Iterator[Row]:
+def _sectors(
+    choices: dict[Conditions, SectorShares], known: dict[Conditions, SectorShares]
+) -> Iterator[Row]:
     """The paper's scheme decides by one step and keeps to it: its column is its rule on one step.
 
     known : the same by the library's defaults
     """
-    target, defaults = found[TARGET], known[TARGET]
+    target, defaults = choices[TARGET], known[TARGET]
     name, rule = "sector, L = 4 lambda", target.rule_share
     for step, least in RIGHT_AFTER.items():
         share = target.share_right(step)
@@ -292,7 +294,7 @@ def _sectors(found: dict[Conditions, Found], known: dict[Conditions, Found]) -> 
         wrong = target.share_wrong(step)
         row = required(f"{name}: decided wrongly after {step} steps", "1", wrong, wrong <= 0.001)
         yield row.beside(1.0 - rule, defaults.share_wrong(step))
-    poor, defaults = found[POOR_HEADING], known[POOR_HEADING]
+    poor, defaults = choices[POOR_HEADING], known[POOR_HEADING]
     for step in RIGHT_AFTER:
         label = f"{name}, heading sd 6 deg: right after {step} steps"
         row = shown(label, "1", poor.share_right(step))
@@ -301,14 +303,14 @@ def _sectors(found: dict[Conditions, Found], known: dict[Conditions, Found]) -> 
     row = shown(label, "1", poor.share_wrong(5))
     yield row.beside(1.0 - poor.rule_share, defaults.share_wrong(5))
     for conditions in BY_BASELINE + BY_PHASE:
-        result = found[conditions]
+        result = choices[conditions]
         for step in RIGHT_AFTER:
             label = f"{conditions.name}: right after {step} steps"
             yield shown(label, "1", result.share_right(step)).beside(result.rule_share)
 
 
 def _draw(
-    seed: int, walked: dict[Case, Compared], found: dict[Conditions, Found], folder: Path
+    seed: int, walked: dict[Case, Compared], choices: dict[Conditions, SectorShares], folder: Path
 ) -> list[Path]:
     runs = {case: rectangle.setup_of(case).run(seed) for case in (LONG, SHORT)}
     by_baseline = (*BY_BASELINE[:2], TARGET, *BY_BASELINE[2:])
@@ -322,7 +324,7 @@ def _draw(
             {case.name: walked[case].ours.error2 for case in runs},
         ),
         "sectors": pictures.success(
-            [(c, found[c]) for c in by_baseline], [(c, found[c]) for c in by_phase]
+            [(c, choices[c]) for c in by_baseline], [(c, choices[c]) for c in by_phase]
         ),
     }
     paths = []

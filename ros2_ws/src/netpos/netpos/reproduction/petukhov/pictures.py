@@ -14,7 +14,7 @@ from netpos.evaluation.pictures import RSU_COLOUR, TRACK_COLOURS, save
 from netpos.messages.values import Array
 from netpos.radio.anchor import uwb_wavelength_m
 from netpos.reproduction.petukhov.rectangle import Walked
-from netpos.reproduction.petukhov.sector_choice import Conditions, Found
+from netpos.reproduction.petukhov.sector_choice import Conditions, SectorShares
 from netpos.tracking.step_heading import choose_sector
 
 __all__ = ["errors", "residuals", "save", "success", "tracks"]
@@ -95,7 +95,8 @@ def errors(times_s: Array, one: Mapping[str, Array], every: Mapping[str, Array])
 
 
 def success(
-    by_baseline: Sequence[tuple[Conditions, Found]], by_phase: Sequence[tuple[Conditions, Found]]
+    by_baseline: Sequence[tuple[Conditions, SectorShares]],
+    by_phase: Sequence[tuple[Conditions, SectorShares]],
 ) -> Figure:
     """Share of starts in the right sector against baseline and phase noise, the paper's rule
     beside ours."""
@@ -111,8 +112,8 @@ def success(
     return figure
 
 
-def _shares(axes: Axes, x: Sequence[float], found: Sequence[Found]) -> None:
+def _shares(axes: Axes, x: Sequence[float], choices: Sequence[SectorShares]) -> None:
     for step, colour in zip((1, 2, 5), TRACK_COLOURS, strict=False):
         label = f"hypotheses, {step} step" + ("s" if step > 1 else "")
-        axes.plot(x, [f.share_right(step) for f in found], "o-", color=colour, label=label)
-    axes.plot(x, [f.rule_share for f in found], "s--", color=_TRUTH_COLOUR, label="paper's rule")
+        axes.plot(x, [f.share_right(step) for f in choices], "o-", color=colour, label=label)
+    axes.plot(x, [f.rule_share for f in choices], "s--", color=_TRUTH_COLOUR, label="paper's rule")

@@ -138,20 +138,23 @@ class Setup:
         wrong_s = self._case.trouble.wrong_s
         wrong_at = -1 if wrong_s is None else int(np.searchsorted(self.times_s, wrong_s))
         for k, stamp in enumerate(self.stamps_ns.tolist()):
-            own = rows[k] if self.heard[k] else _alone(rows[k, 2:])
-            velocity = reported(stamp, own[-2:])
+            epoch_rows = rows[k] if self.heard[k] else _alone(rows[k, 2:])
+            velocity = reported(stamp, epoch_rows[-2:])
             density = process_noise.density(stamp, [velocity])
             if estimate is None:
                 start.hear(velocity)
-                estimate = start.add(stamp, own, np.zeros(len(own)))
+                estimate = start.add(stamp, epoch_rows, np.zeros(len(epoch_rows)))
             else:
                 if density is not None:
                     estimate.set_process_noise(density)
                 if k == wrong_at:
-                    estimate = _moved(self.config, estimate, own)
+                    estimate = _moved(self.config, estimate, epoch_rows)
                 unheard_s = (stamp - last_ns) / NS
-                nis[k], dof[k], taken = estimate.step(stamp, unheard_s, rejected, own, NO_BIAS)
-                rejected = 0 if taken[0] else rejected + 1  # the anchor's group where it is heard
+                nis[k], dof[k], accepted = estimate.step(
+                    stamp, unheard_s, rejected, epoch_rows, NO_BIAS
+                )
+                # group 0 is the anchor's where it is heard
+                rejected = 0 if accepted[0] else rejected + 1
                 if rejected >= self.config.max_rejected_epochs:
                     start, estimate, rejected = PhaseStart(self.config), None, 0
             last_ns = stamp
@@ -175,9 +178,9 @@ def _moved(config: TrackerConfig, estimate: Estimate, rows: Array) -> Estimate:
 
 def _alone(rows: Array) -> Array:
     """Velocity rows without the anchor's."""
-    own = rows.copy()
-    own[:, GROUP] = 0
-    return own
+    alone = rows.copy()
+    alone[:, GROUP] = 0
+    return alone
 
 
 @lru_cache(maxsize=8)

@@ -59,7 +59,7 @@ class Conditions:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class SectorShares:
     """Of many starts, after each of the first steps: the most probable sector is the right one,
     it is decided, its probability (runs, STEPS); and the paper's rule on that step alone."""
 
@@ -127,7 +127,7 @@ class Setup:
         return rows, turns
 
     def run(self, seed: int) -> tuple[Bools, Bools, Array, Bools]:
-        """One start: right, decided, claimed and rule_right (STEPS,) of ``Found``."""
+        """One start: right, decided, claimed and rule_right (STEPS,) of ``SectorShares``."""
         rng = generator(seed, "sector_choice")
         start, heading = _start(rng)
         way = np.array([math.cos(heading), math.sin(heading)])
@@ -170,17 +170,17 @@ class Setup:
     ) -> Bools:
         right = np.zeros(STEPS, dtype=bool)
         for s in range(STEPS):
-            own = step == s
-            reported = reported_velocity(velocity[own][0])
+            in_step = step == s
+            reported = reported_velocity(velocity[in_step][0])
             choice = choose_sector(
-                self.times_s[own],
-                radio[own, 0, VALUE],
-                radio[own, 1, VALUE],
+                self.times_s[in_step],
+                radio[in_step, 0, VALUE],
+                radio[in_step, 1, VALUE],
                 math.atan2(reported[1], reported[0]),
                 self.info.baseline_m,
                 self.info.wavelength_m,
             )
-            right[s] = choice is not None and choice.chosen == turns[own][0]
+            right[s] = choice is not None and choice.chosen == turns[in_step][0]
         return right
 
 
@@ -205,8 +205,8 @@ def _job(conditions: Conditions, seeds: range) -> list[tuple[Bools, Bools, Array
     return [setup.run(seed) for seed in seeds]
 
 
-def sector_choice(work: Work, conditions: Conditions) -> Found:
+def sector_choice(work: Work, conditions: Conditions) -> SectorShares:
     """All starts of ``work`` under some conditions."""
     runs = [run for part in work.over_seeds(conditions.name, _job, conditions) for run in part]
     right, decided, claimed, rule = (np.array(column) for column in zip(*runs, strict=True))
-    return Found(right, decided, claimed, rule)
+    return SectorShares(right, decided, claimed, rule)

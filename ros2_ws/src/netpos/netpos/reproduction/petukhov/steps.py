@@ -1,4 +1,4 @@
-"""What dead reckoning says of a walk in steps of constant velocity, by the error model of
+"""What dead reckoning reports of a walk in steps of constant velocity, by the error model of
 petukhov:eq.6-8: length and heading of every step have one error each, and standing still is a
 velocity of zero.
 """

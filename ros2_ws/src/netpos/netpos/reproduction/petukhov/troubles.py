@@ -21,10 +21,10 @@ _EXCESS_M, _NOISIER = 0.3, 5.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trouble:
-    """Nothing by default; the tracker is told of none but the heading's sd.
+    """Nothing by default; the tracker knows only the sd of the heading.
 
     phase_outliers : share of epochs whose phase is any, each as probable (multipath)
-    blocked_s : (from, to) a second person stands in the line of sight: the range is longer by
+    blocked_s : (from, to) a second person is in the line of sight: the range is longer by
         0.3 m in the mean (exponential), the phase five times as noisy
     heard_every : the anchor is heard in one of so many epochs
     heading_sd_rad : of a step

@@ -65,7 +65,7 @@ class Walk:
     heard: tuple[Heard, ...]
     stamps_ns: tuple[int, ...]
     truth: Array
-    steps_found: int
+    detected_steps: int
 
     @property
     def times_s(self) -> Array:
@@ -78,7 +78,7 @@ class Chains:
     """Figures of each variant over the same runs, and the steps found in each run (runs,)."""
 
     figures: dict[str, Figures]
-    steps_found: Array
+    detected_steps: Array
 
 
 def simulate(seed: int, wavelengths: float) -> Walk:
@@ -101,7 +101,7 @@ def simulate(seed: int, wavelengths: float) -> Walk:
         heard=tuple(heard),
         stamps_ns=stamps,
         truth=np.array([truth[stamp] for stamp in stamps]),
-        steps_found=steps,
+        detected_steps=steps,
     )
 
 
@@ -142,7 +142,7 @@ def _job(task: _Task, seeds: range) -> list[tuple[Array, int, list[Scores]]]:
     for seed in seeds:
         walk = simulate(seed, task.wavelengths)
         scores = [follow(walk, variant) for variant in task.variants]
-        runs.append((walk.times_s, walk.steps_found, scores))
+        runs.append((walk.times_s, walk.detected_steps, scores))
     return runs
 
 

@@ -32,13 +32,13 @@ def known_instants_rmse_m(setup: Setup, from_s: float, every_step: bool = False)
     motion = motion_parameters(accel=_ACCEL)
     motions, blocks = np.tile(motion, (len(times), 1)), []
     starts, truth = np.zeros(len(times) + 1, dtype=np.int64), np.zeros((len(times), 6))
-    for place, index in enumerate(order.tolist()):
+    for position, index in enumerate(order.tolist()):
         if index < len(rows):
-            own = rows[index, :2] if repeated[index] else rows[index]
-            blocks.append(own)
-            starts[place + 1] = len(own)
+            epoch_rows = rows[index, :2] if repeated[index] else rows[index]
+            blocks.append(epoch_rows)
+            starts[position + 1] = len(epoch_rows)
         else:
-            motions[place, Parameter.VELOCITY_STEP_SD] = _FREE_MPS
+            motions[position, Parameter.VELOCITY_STEP_SD] = _FREE_MPS
     for axis in range(2):
         truth[:, axis] = np.interp(times[order], setup.times_s, setup.truth[:, axis])
     config = setup.config

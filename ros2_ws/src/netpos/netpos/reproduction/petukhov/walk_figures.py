@@ -13,7 +13,7 @@ from netpos.messages.values import Array
 
 LOST_M = 0.5
 FAR_M = 5.0
-_END = 20  # estimates at the end that tell whether a run is lost
+_END = 20  # estimates at the end that decide whether a run is lost
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -163,14 +163,14 @@ def test_reading_before_the_end_changes_nothing() -> None:
 
 def test_the_known_height_is_wrong_by_its_sd() -> None:
     """Over many seeds the prior of the height alone says N(1.5, 3 m), the same at all epochs."""
-    simulation, found = drives.simulation_of(deng2022.BLOCKED), []
+    simulation, heights = drives.simulation_of(deng2022.BLOCKED), []
     for seed in range(SEED, SEED + 200):
         nothing = Epochs(np.arange(2), np.zeros(3, dtype=np.int64), np.zeros((0, ROW_WIDTH)))
         start = drives.fixes_of(simulation.with_seed(seed), nothing)[FIX_HEIGHT].position
         assert start[0, 2] == start[1, 2]
-        found.append(start[0, 2])
-    assert np.mean(found) == pytest.approx(1.5, abs=3 * 3.0 / np.sqrt(200))
-    assert np.std(found) == pytest.approx(3.0, rel=0.15)
+        heights.append(start[0, 2])
+    assert np.mean(heights) == pytest.approx(1.5, abs=3 * 3.0 / np.sqrt(200))
+    assert np.std(heights) == pytest.approx(3.0, rel=0.15)
 
 
 def test_a_fix_starts_on_the_street() -> None:
@@ -190,8 +190,8 @@ def test_dilution_of_three_stations_by_hand() -> None:
     rows = np.zeros((5, ROW_WIDTH))
     rows[:3, ORIGIN : ORIGIN + 3] = [[-9.0, 0.0, 9.0], [0.0, -9.0, 9.0], [9.0, 0.0, 9.0]]
     epochs = Epochs(np.arange(2), np.array([0, 3, 5]), rows)
-    found = drive_bounds.dilution(epochs, np.zeros((2, 3)))
-    np.testing.assert_allclose(found, [[2.0, 1.0]])
+    dilution = drive_bounds.dilution(epochs, np.zeros((2, 3)))
+    np.testing.assert_allclose(dilution, [[2.0, 1.0]])
 
 
 def test_every_cell_has_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -208,12 +208,12 @@ def test_every_cell_has_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
     for case, fix, ins in deng2022.TABLES:
         for name, cells in ((FIX, fix), (f"SINS, {LOOSE}", ins), (f"SINS, {VEHICLE}", ins)):
             label = f"{case.name}, {name}"
-            found = [rows[f"{label}: success"]]
-            found += [rows[f"{label}: RMS {axis}"] for axis in ("north", "east", "down")]
-            assert tuple(row.paper for row in found) == cells
-            assert all(row.ok is not None for row in found)
-            assert all(row.baseline is not None for row in found)
-            assert all((row.defaults is not None) == (VEHICLE in name) for row in found)
+            cell_rows = [rows[f"{label}: success"]]
+            cell_rows += [rows[f"{label}: RMS {axis}"] for axis in ("north", "east", "down")]
+            assert tuple(row.paper for row in cell_rows) == cells
+            assert all(row.ok is not None for row in cell_rows)
+            assert all(row.baseline is not None for row in cell_rows)
+            assert all((row.defaults is not None) == (VEHICLE in name) for row in cell_rows)
             for what in ("time not scored", "drives with a 3-D error above 5 m"):
                 assert rows[f"{label}: {what}"].ours is not None
     one_way = f"{deng2022.ONE_WAY.name}, SINS, {TIGHT}"
@@ -232,61 +232,63 @@ def test_every_cell_has_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_bound_is_kept_and_nearly_reached(tally: dict[str, Tally]) -> None:
     """No unbiased filter is better than its posterior Cramér-Rao bound; the tight one reaches it
     but for chance, and the filter that made it never left the true way."""
-    epochs, made = drive_bounds.bound_drives(deng2022.BLOCKED, SEED)
+    epochs, results = drive_bounds.bound_drives(deng2022.BLOCKED, SEED)
     states = drive_bounds.true_states(
         drives.simulation_of(deng2022.BLOCKED).with_seed(SEED), epochs
     )
     for variant in (TIGHT, VEHICLE):
-        assert np.abs(made[variant].nav[:, :3] - states[:, :3]).max() < 0.02
-        bound = np.sqrt(np.diagonal(made[variant].cov, axis1=1, axis2=2)[:, :2].mean(axis=0).sum())
+        assert np.abs(results[variant].nav[:, :3] - states[:, :3]).max() < 0.02
+        bound = np.sqrt(
+            np.diagonal(results[variant].cov, axis1=1, axis2=2)[:, :2].mean(axis=0).sum()
+        )
         ratio = np.hypot(*tally[variant].rms_m[:2]) / bound
         assert 0.8 < ratio < 1.3
-    exact = np.diagonal(made[drive_bounds.EXACT].cov, axis1=1, axis2=2)[:, :3].sum()
-    assert exact < np.diagonal(made[VEHICLE].cov, axis1=1, axis2=2)[:, :3].sum()
+    exact = np.diagonal(results[drive_bounds.EXACT].cov, axis1=1, axis2=2)[:, :3].sum()
+    assert exact < np.diagonal(results[VEHICLE].cov, axis1=1, axis2=2)[:, :3].sum()
 
 
-def test_less_told_of_a_fix_costs(tally: dict[str, Tally], blocked: Run) -> None:
+def test_a_reduced_covariance_costs(tally: dict[str, Tally], blocked: Run) -> None:
     plane = {name: np.hypot(*t.rms_m[:2]) for name, t in tally.items()}
     assert plane[LOOSE] < plane[LOOSE_DIAGONAL] < plane[LOOSE_FIXED]
     fixes = blocked.fixes[FIX]
-    told = drives.less_told(fixes)
-    np.testing.assert_array_equal(told[LOOSE_DIAGONAL].cov[:, 0, 0], fixes.cov[:, 0, 0])
-    assert not told[LOOSE_DIAGONAL].cov[:, 0, 1].any()
+    reduced = drives.reduced_covariances(fixes)
+    np.testing.assert_array_equal(reduced[LOOSE_DIAGONAL].cov[:, 0, 0], fixes.cov[:, 0, 0])
+    assert not reduced[LOOSE_DIAGONAL].cov[:, 0, 1].any()
     good = fixes.status == FixStatus.CONVERGED
-    np.testing.assert_allclose(told[LOOSE_FIXED].cov[7], fixes.cov[good].mean(axis=0))
+    np.testing.assert_allclose(reduced[LOOSE_FIXED].cov[7], fixes.cov[good].mean(axis=0))
 
 
 def test_one_way_times_find_the_clock() -> None:
-    found = tally_seeds(deng2022.ONE_WAY, range(SEED + 2, SEED + 3))
-    assert set(found) == {FIX, FIX_HEIGHT, TIGHT, VEHICLE, DEFAULT, DEFAULT_VEHICLE}
-    error, said = found[TIGHT].clock_ns
-    assert said < 6.0
-    assert error == pytest.approx(said, rel=0.2)
-    assert found[TIGHT].nees_test(1).consistent
-    assert np.hypot(*found[TIGHT].rms_m[:2]) < 3.0
+    tallies = tally_seeds(deng2022.ONE_WAY, range(SEED + 2, SEED + 3))
+    assert set(tallies) == {FIX, FIX_HEIGHT, TIGHT, VEHICLE, DEFAULT, DEFAULT_VEHICLE}
+    error, stated = tallies[TIGHT].clock_ns
+    assert stated < 6.0
+    assert error == pytest.approx(stated, rel=0.2)
+    assert tallies[TIGHT].nees_test(1).consistent
+    assert np.hypot(*tallies[TIGHT].rms_m[:2]) < 3.0
 
 
 def test_the_clock_is_judged_by_its_own_variance() -> None:
     done = run(deng2022.ONE_WAY, SEED + 2)
-    found = tally_seeds(deng2022.ONE_WAY, range(SEED + 2, SEED + 3))[VEHICLE]
+    drive_tally = tally_seeds(deng2022.ONE_WAY, range(SEED + 2, SEED + 3))[VEHICLE]
     result = done.drives[VEHICLE]
     error, sd = (
         result.nav[:, Nav.CLOCK] - done.clock_m,
         np.sqrt(result.cov[:, Err.CLOCK, Err.CLOCK]),
     )
-    assert found.nees_test(1).mean == pytest.approx(np.mean((error / sd) ** 2))
+    assert drive_tally.nees_test(1).mean == pytest.approx(np.mean((error / sd) ** 2))
     to_ns = 1e9 / 299_792_458.0
-    assert found.clock_ns[0] == pytest.approx(to_ns * np.sqrt(np.mean(error**2)))
-    assert found.clock_ns[1] == pytest.approx(to_ns * np.sqrt(np.mean(sd**2)))
+    assert drive_tally.clock_ns[0] == pytest.approx(to_ns * np.sqrt(np.mean(error**2)))
+    assert drive_tally.clock_ns[1] == pytest.approx(to_ns * np.sqrt(np.mean(sd**2)))
 
 
 def test_smoothing_bridges_outages() -> None:
     """Given what comes after, the error inside is a fraction of the filter's."""
     with Work(1, SEED, 1) as work:
-        found = drive_bounds.in_outages(work, deng2022.OUTAGES)
+        bounds = drive_bounds.in_outages(work, deng2022.OUTAGES)
     for variant in (TIGHT, VEHICLE):
         filtered, smoothed = (
-            np.hypot(*found[f"{variant}, {what}"].rms_m[:2]) for what in ("filtered", "smoothed")
+            np.hypot(*bounds[f"{variant}, {what}"].rms_m[:2]) for what in ("filtered", "smoothed")
         )
         assert smoothed < 0.4 * filtered
 

@@ -46,10 +46,10 @@ def test_rows_answer_the_targets(outcome: Outcome) -> None:
 def test_every_claim_is_judged_for_every_estimator_and_coordinate(outcome: Outcome) -> None:
     for name in ("fused", "wimax", "wifi"):
         for axis in "xy":
-            own = [
+            claim_rows = [
                 r for r in outcome.rows if r.name.startswith(f"paper's motion, {name}, {axis}: ")
             ]
-            judged = {row.name.split(": ", 1)[1]: row for row in own if row.ok is not None}
+            judged = {row.name.split(": ", 1)[1]: row for row in claim_rows if row.ok is not None}
             assert [row.paper for row in judged.values()] == [5.0, 15.0, 5.0, 5.0, 10.0]
             for row in judged.values():
                 assert row.ok is (row.ours is not None and row.ours <= (row.paper or 0.0))
@@ -121,8 +121,8 @@ def test_figures_of_a_summary_by_hand() -> None:
     test = summary.nees_test("a", 5.0)
     assert test is not None
     assert test.mean == 5.0
-    spread = test.bounds[1] - 2.0  # two runs: t of 97.5 % with one degree, standard error 4
-    assert spread == pytest.approx(12.7062 * 4.0, rel=1e-5)
+    half_width = test.bounds[1] - 2.0  # two runs: t of 97.5 % with one degree, standard error 4
+    assert half_width == pytest.approx(12.7062 * 4.0, rel=1e-5)
 
 
 def test_a_figure_settles_where_it_stays() -> None:
@@ -190,9 +190,11 @@ def test_default_networks_hear_the_fixes_the_filters_do(monkeypatch: pytest.Monk
     monkeypatch.setattr(network_defaults, "TRACKER", steady)
     setting = replace(paper.COMMON_NOISE, duration_s=30.0)
     estimates = run_defaults(setting, 5000)
-    own = replace(setting, tracker=replace(paper.JERKY, jerk_density=1.0), start_var=25.0)
-    expected = stages_of(own).errors(5000)["wimax"]
-    late = stages_of(own).time_s > 20.0
+    like_defaults = replace(
+        setting, tracker=replace(paper.JERKY, jerk_density=1.0), start_var=25.0
+    )
+    expected = stages_of(like_defaults).errors(5000)["wimax"]
+    late = stages_of(like_defaults).time_s > 20.0
     np.testing.assert_allclose(estimates["wimax"][0][late], expected[late], atol=0.05)
     assert np.isnan(estimates["wifi"][0]).all()
     np.testing.assert_allclose(

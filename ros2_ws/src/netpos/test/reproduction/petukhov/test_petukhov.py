@@ -15,7 +15,7 @@ from netpos.reproduction.petukhov.sector_choice import (
     AREA_M,
     STEPS,
     Conditions,
-    Found,
+    SectorShares,
     sector_choice,
     setup_of,
 )
@@ -94,12 +94,12 @@ def test_hidden_epochs_hold_no_radio() -> None:
 
 def test_starts_and_ends_stay_in_the_area() -> None:
     with Work(12, SEED, 1) as work:
-        found = sector_choice(work, petukhov.TARGET)
-    assert found.right.shape == (12, STEPS)
-    assert found.share_right(5) >= 0.9
-    assert found.share_right(1) > found.rule_share
+        choice = sector_choice(work, petukhov.TARGET)
+    assert choice.right.shape == (12, STEPS)
+    assert choice.share_right(5) >= 0.9
+    assert choice.share_right(1) > choice.rule_share
     assert setup_of(Conditions(defaults=True)).config == TrackerConfig(device_height_m=1.0)
-    assert (found.claimed > 0.1).all()
+    assert (choice.claimed > 0.1).all()
     assert AREA_M[0][1] > 0.0
 
 
@@ -121,11 +121,11 @@ def test_measurements_of_a_start_are_those_of_its_conditions() -> None:
 def test_shares_count_runs() -> None:
     right = np.array([[True, True], [False, True], [True, False], [True, True]])
     decided = np.array([[True, True], [True, True], [False, True], [False, False]])
-    found = Found(right, decided, right.astype(float), ~right)
-    assert found.share_right(1) == 0.75
-    assert found.share_decided(2) == 0.75
-    assert (found.share_wrong(1), found.share_wrong(2)) == (0.25, 0.25)
-    assert found.rule_share == 0.25
+    choice = SectorShares(right, decided, right.astype(float), ~right)
+    assert choice.share_right(1) == 0.75
+    assert choice.share_decided(2) == 0.75
+    assert (choice.share_wrong(1), choice.share_wrong(2)) == (0.25, 0.25)
+    assert choice.rule_share == 0.25
 
 
 def figures(rmse_m: float, nees: float) -> Figures:
@@ -193,7 +193,7 @@ def test_defaults_keep_facts_only() -> None:
 def test_pictures_are_drawn(tmp_path: Path) -> None:
     with Work(2, SEED, 1) as work:
         walked = {c: petukhov.compared(work, c) for c in (petukhov.LONG, petukhov.SHORT)}
-    some = Found(
+    some = SectorShares(
         *(np.ones((2, STEPS), dtype=bool) for _ in range(2)),
         np.ones((2, STEPS)),
         np.ones((2, STEPS), dtype=bool),

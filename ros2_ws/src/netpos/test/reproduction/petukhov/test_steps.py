@@ -47,15 +47,15 @@ def test_errors_have_the_stated_covariance() -> None:
     """petukhov:eq.7, 8, by many draws of one step and by the rows' own weights."""
     steps = steps_of(np.array([[0.0, 0.0], [3.0, 4.0]]), np.zeros(2), 1.0, 0.6375)
     errors = StepErrors(length_sd_m=0.02, heading_sd_rad=0.05)
-    rng, found, weighed = np.random.default_rng(2), [], []
+    rng, velocities, weighed = np.random.default_rng(2), [], []
     truth = np.array([0.0, 0.0, 0.6, 0.8, 0.0, 0.0])
     for _ in range(3000):
         rows, _ = velocity_rows(np.array([0.1]), steps, errors, rng, 0.0)
-        found.append(reported_velocity(rows[0]))
+        velocities.append(reported_velocity(rows[0]))
         innovation, _ = linearise(rows[0], truth, 0.0)
         weighed.append(innovation**2)
     along, across = np.array([0.6, 0.8]), np.array([-0.8, 0.6])
-    off = np.array(found) - truth[2:4]
+    off = np.array(velocities) - truth[2:4]
     step_s = steps.end_s[0] - steps.start_s[0]
     assert (off @ along).std() == pytest.approx(0.02 / step_s, rel=0.05)
     assert (off @ across).std() == pytest.approx(0.05, rel=0.05)

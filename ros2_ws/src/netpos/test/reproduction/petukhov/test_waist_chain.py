@@ -26,7 +26,7 @@ def walk() -> Walk:
 
 def test_a_step_is_heard_of_after_it(walk: Walk) -> None:
     """Who walks off is heard to walk a step time later at the earliest."""
-    assert walk.steps_found == STEPS
+    assert walk.detected_steps == STEPS
     speed = np.hypot(*np.diff(walk.truth, axis=0).T) / np.diff(walk.times_s)
     moved_s = walk.times_s[np.argmax(speed > WALKING_MPS)]
     stamps = [
@@ -34,8 +34,8 @@ def test_a_step_is_heard_of_after_it(walk: Walk) -> None:
         for value in walk.heard
         if isinstance(value, Velocity) and np.hypot(*value.velocity) > WALKING_MPS
     ]
-    told_s = (min(stamps) - walk.stamps_ns[0]) * 1e-9
-    assert told_s > moved_s + 0.6
+    reported_s = (min(stamps) - walk.stamps_ns[0]) * 1e-9
+    assert reported_s > moved_s + 0.6
 
 
 def test_the_baseline_is_the_only_difference() -> None:

@@ -23,8 +23,8 @@ def test_the_last_bound_is_that_of_one_great_least_squares() -> None:
     information[:2, :2] = np.eye(2) / 100.0
     for i in range(len(edges) - 1):
         free = 1.5**2 if i == 0 else 10.0**2
-        at = 2 + 2 * i
-        information[at : at + 2, at : at + 2] += np.eye(2) / free
+        first = 2 + 2 * i
+        information[first : first + 2, first : first + 2] += np.eye(2) / free
     h = np.zeros(6)
     for k, time in enumerate(setup.times_s.tolist()):
         walked = np.clip(time - np.array(edges[:-1]), 0.0, np.diff(edges))
@@ -42,8 +42,8 @@ def test_the_last_bound_is_that_of_one_great_least_squares() -> None:
             gradient = h[:4] @ map_
             information += np.outer(gradient, gradient) / row[VARIANCE]
     cov = map_[:2] @ np.linalg.inv(information) @ map_[:2].T
-    found = known_instants_rmse_m(setup, float(setup.times_s[-1]))
-    assert found == pytest.approx(np.sqrt(np.trace(cov)), rel=0.01)
+    bound_m = known_instants_rmse_m(setup, float(setup.times_s[-1]))
+    assert bound_m == pytest.approx(np.sqrt(np.trace(cov)), rel=0.01)
 
 
 def test_who_may_change_at_every_step_is_known_less() -> None:
