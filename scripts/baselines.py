@@ -89,12 +89,12 @@ def measure(name: str) -> tuple[str, Baseline]:
 def worsen(name: str) -> list[str]:
     """One line for each way of making a case worse."""
     case, baseline = cases()[name], read_baselines(FOLDER)[name]
-    found: dict[str, list[Any]] = {way: [] for way in WORSE}
+    runs_by_way: dict[str, list[Any]] = {way: [] for way in WORSE}
     for material in case.materials():
         for way, (change, parameters) in WORSE.items():
             changed = parameters(material.settings.parameters)
-            found[way] += track(change(material), changed)
-    return [_notice(name, way, baseline, pooled(runs)) for way, runs in found.items()]
+            runs_by_way[way] += track(change(material), changed)
+    return [_notice(name, way, baseline, pooled(runs)) for way, runs in runs_by_way.items()]
 
 
 def _notice(name: str, way: str, baseline: Baseline, figures: Mapping[str, Any]) -> str:

@@ -35,7 +35,7 @@ MESSAGES = 100_000
 
 def kept_by_mcap(data: bytes) -> Counter:
     """Messages up to the first error, with checksums looked at."""
-    found, channels, schemas = Counter(), {}, {}
+    messages, channels, schemas = Counter(), {}, {}
     try:
         for record in StreamReader(BytesIO(data), validate_crcs=True).records:
             if isinstance(record, Schema):
@@ -45,10 +45,10 @@ def kept_by_mcap(data: bytes) -> Counter:
             elif isinstance(record, Message):
                 channel = channels[record.channel_id]
                 name = schemas[channel.schema_id]
-                found[channel.topic, name, record.log_time, record.data] += 1
+                messages[channel.topic, name, record.log_time, record.data] += 1
     except Exception:
-        return found
-    return found
+        return messages
+    return messages
 
 
 def kept_by_recover(bag: Path) -> Counter:
@@ -74,12 +74,12 @@ def damaged_files(bag: Path, root: Path) -> None:
             shutil.rmtree(folder, ignore_errors=True)
             shutil.copytree(bag, folder / bag.name)
             (folder / bag.name / file.name).write_bytes(bad)
-            for name, found in (
+            for name, messages in (
                 ("mcap", kept_by_mcap(bytes(bad))),
                 ("recover", kept_by_recover(folder / bag.name)),
             ):
-                kept[name] += (found & original).total()
-                wrong[name] += bool(found - original)
+                kept[name] += (messages & original).total()
+                wrong[name] += bool(messages - original)
         for name, count in kept.items():
             share = 100.0 * count / original.total() / BAGS
             print(f"{flips} flips, {name}: {share:.1f} % kept, wrong in {wrong[name]} bags")

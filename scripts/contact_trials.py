@@ -46,9 +46,9 @@ class Walk:
     left_s: np.ndarray
     right_s: np.ndarray
 
-    def score(self, found_ns: np.ndarray) -> str:
+    def score(self, detected_ns: np.ndarray) -> str:
         """Of detections (n,)."""
-        s = score_contacts(found_ns, self.record.bouts)
+        s = score_contacts(detected_ns, self.record.bouts)
         return f"{s.found} of {s.listed} found, {s.false} false, {s.unlisted} untimed"
 
 
@@ -118,22 +118,22 @@ def decode(times_s: np.ndarray, scores: np.ndarray, threshold: float) -> list[fl
                 best, before[foot, i] = float(gain[k]), (other, earlier[k])
         value[foot, i] = scores[foot, i] - threshold + best
     foot, i = np.unravel_index(np.argmax(value), value.shape)
-    found = []
+    detected_s = []
     while i >= 0:
-        found.append(float(times_s[i]))
+        detected_s.append(float(times_s[i]))
         foot, i = before[foot, i]
-    return found[::-1]
+    return detected_s[::-1]
 
 
 def rhythm(walk: Walk, model: tuple[np.ndarray, float], threshold: float) -> np.ndarray:
     """Contacts (n,) ns by ``learn``'s model, bout by bout."""
     scores = np.stack([window @ model[0] + model[1] for window in windows(walk)])
-    found: list[float] = []
+    detected_s: list[float] = []
     for bout in walk.record.bouts:
         first, last = bout.initial_contact_ns[[0, -1]] * 1e-9
         use = (walk.times_s > first - 0.6) & (walk.times_s < last + 0.6)
-        found += decode(walk.times_s[use], scores[:, use], threshold)
-    return np.rint(np.array(found) * 1e9).astype(np.int64)
+        detected_s += decode(walk.times_s[use], scores[:, use], threshold)
+    return np.rint(np.array(detected_s) * 1e9).astype(np.int64)
 
 
 def detected(walk: Walk, config: StepConfig) -> np.ndarray:
@@ -151,24 +151,24 @@ def loosened(walks: dict[str, Walk]) -> None:
         replace(waist, min_prominence=p, prominence_fraction=f, min_impact_hz=hz)
         for p, f, hz in grid
     ]
-    found = {
+    detections = {
         name: [(detected(walk, config), config) for config in configs]
         for name, walk in walks.items()
     }
     for name, walk in walks.items():
-        for ends, c in found[name]:
+        for ends, c in detections[name]:
             if c.min_impact_hz == waist.min_impact_hz:
                 what = f"{c.min_prominence:g} m/s^3, fraction {c.prominence_fraction:g}"
                 print(f"in use, {what}: {name}: {walk.score(ends)}")
     for train, test in (NAMES, NAMES[::-1]):
 
         def merit(index: int, walk: Walk = walks[train], name: str = train) -> int:
-            s = score_contacts(found[name][index][0], walk.record.bouts)
+            s = score_contacts(detections[name][index][0], walk.record.bouts)
             return s.found - s.false
 
         best = max(range(len(configs)), key=merit)
         print(f"in use, best of {len(configs)} for {train}: {test}: ", end="")
-        print(walks[test].score(found[test][best][0]))
+        print(walks[test].score(detections[test][best][0]))
 
 
 def main() -> None:

@@ -45,8 +45,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     asked = parser.parse_args()
     rng = random.Random(asked.seed)
-    found = Counter(trial(1 + k % 2, rng.uniform(*SPAN_S)) for k in range(asked.trials))
-    for end, count in found.most_common():
+    ends = Counter(trial(1 + k % 2, rng.uniform(*SPAN_S)) for k in range(asked.trials))
+    for end, count in ends.most_common():
         print(f"{count}: {end}")
 
 

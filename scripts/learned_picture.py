@@ -58,15 +58,15 @@ def main() -> None:
         for name in ("right", "believed", "learned"):
             figures = evaluate_bag(folder / name).vues["vue_1"].scored.figures
             print(f"{name}: RMSE {figures.rmse_m:.3f} m, NEES {figures.nees_mean:.2f}")
-        make, found = codec(), defaultdict[tuple[str, str], list[float]](list)
+        make, scatter_by_key = codec(), defaultdict[tuple[str, str], list[float]](list)
         with BagReader(folder / "learned") as bag:
             for entry in bag.messages([RSU_LEARNED]):
                 errors = make.rsu_errors_from_msg(entry.message)
                 for quantity, scatter in zip(errors.quantities, errors.scatter, strict=True):
-                    found[errors.rsu_id, quantity].append(scatter)
+                    scatter_by_key[errors.rsu_id, quantity].append(scatter)
     figure = Figure(figsize=(7.0, 4.2))
     axes = figure.add_subplot()
-    for (rsu, _), scatter in sorted(found.items()):
+    for (rsu, _), scatter in sorted(scatter_by_key.items()):
         if len(scatter) >= HEARD_S:
             colour = TRACK_COLOURS[FACTORS.index(factors[rsu])]
             axes.plot(np.arange(1, len(scatter) + 1), scatter, color=colour, lw=0.9, alpha=0.8)

@@ -40,13 +40,13 @@ DOMAIN = "94"
 READY_S = 5.0
 
 
-def of_device(vue: str, place: float) -> dict[str, tuple[Any, bytes]]:
+def of_device(vue: str, x_m: float) -> dict[str, tuple[Any, bytes]]:
     """Type and bytes of the messages about one device, by topic."""
     stamp_ns = 1_000_000_000
     odometry = Odometry(
         stamp_ns=stamp_ns,
         vue_id=vue,
-        position=np.array([place, 0.0, 0.0]),
+        position=np.array([x_m, 0.0, 0.0]),
         quaternion=np.array([0.0, 0.0, 0.0, 1.0]),
         linear_velocity=np.zeros(3),
         pose_cov=np.eye(6),
@@ -58,13 +58,13 @@ def of_device(vue: str, place: float) -> dict[str, tuple[Any, bytes]]:
         sources=RSUS,
         protection_level_m=5.0,
     )
-    made = {
+    messages = {
         topics.ODOMETRY: (OdometryMsg, CODEC.odometry_to_msg(odometry)),
         topics.TRACK_STATUS: (TrackStatusMsg, CODEC.track_status_to_msg(status)),
     }
     return {
         topics.of_vue(vue, name): (kind, serialize_message(message))
-        for name, (kind, message) in made.items()
+        for name, (kind, message) in messages.items()
     }
 
 
@@ -91,8 +91,8 @@ def publish(node: Any, devices: int, rate_hz: float, stop: threading.Event) -> N
     """Send at the rate until it is enough."""
     infos = node.create_publisher(RsuInfoMsg, topics.RSU_INFO, LATCHED)
     for k, name in enumerate(RSUS):
-        place = np.array([30.0 * k, 20.0, 5.0])
-        infos.publish(CODEC.rsu_info_to_msg(RsuInfo(rsu_id=name, position=place)))
+        position = np.array([30.0 * k, 20.0, 5.0])
+        infos.publish(CODEC.rsu_info_to_msg(RsuInfo(rsu_id=name, position=position)))
     measured = node.create_publisher(RsuMeasurementMsg, topics.RSU_MEASUREMENTS, STREAM)
     names = [f"vue_{k}" for k in range(devices)]
     ranges = [cdr for vue in names for cdr in measurements(vue)]

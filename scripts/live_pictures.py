@@ -162,19 +162,19 @@ def arrow(marker: Any) -> Polygon:
     outline = np.array([[0.0, 0.5], [1.0, 0.0], [0.0, -0.5], [0.25, 0.0]]) * [length, width]
     yaw = yaw_of(marker)
     turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
-    place = [marker.pose.position.x, marker.pose.position.y]
-    return Polygon(outline @ turn.T + place, color=colour_of(marker), lw=0, zorder=6)
+    position = [marker.pose.position.x, marker.pose.position.y]
+    return Polygon(outline @ turn.T + position, color=colour_of(marker), lw=0, zorder=6)
 
 
 def draw_marker(axes: Axes, marker: Any) -> None:
     """One marker from above, as RViz and Foxglove draw it."""
-    place, scale, colour = marker.pose.position, marker.scale, colour_of(marker)
+    position, scale, colour = marker.pose.position, marker.scale, colour_of(marker)
     if marker.type == Marker.CUBE:
-        corner = (place.x - scale.x / 2, place.y - scale.y / 2)
+        corner = (position.x - scale.x / 2, position.y - scale.y / 2)
         axes.add_patch(Rectangle(corner, scale.x, scale.y, color=colour, lw=0))
     elif marker.type == Marker.CYLINDER:
         degrees = math.degrees(yaw_of(marker))
-        shape = Ellipse((place.x, place.y), scale.x, scale.y, angle=degrees)
+        shape = Ellipse((position.x, position.y), scale.x, scale.y, angle=degrees)
         shape.set(color=colour, lw=0, zorder=4)
         axes.add_patch(shape)
     elif marker.type == Marker.LINE_STRIP:
@@ -185,7 +185,7 @@ def draw_marker(axes: Axes, marker: Any) -> None:
     elif marker.type == Marker.TEXT_VIEW_FACING:
         above = {"xytext": (0, 9), "textcoords": "offset points", "ha": "center"}
         axes.annotate(
-            marker.text, (place.x, place.y), **above, color=colour, fontsize=8, zorder=7
+            marker.text, (position.x, position.y), **above, color=colour, fontsize=8, zorder=7
         ).set_clip_on(True)
 
 

@@ -181,9 +181,9 @@ def is_noticed(kernel: Callable[..., object], changed: ast.FunctionDef, tests: l
         signal.setitimer(signal.ITIMER_VIRTUAL, CPU_S)
         changed.decorator_list = []
         module = ast.fix_missing_locations(ast.Module([changed], []))
-        made: dict[str, Callable[..., object]] = {}
-        exec(compile(module, "mutant", "exec"), dict(kernel.__globals__), made)
-        kernel.__code__ = made[changed.name].__code__
+        namespace: dict[str, Callable[..., object]] = {}
+        exec(compile(module, "mutant", "exec"), dict(kernel.__globals__), namespace)
+        kernel.__code__ = namespace[changed.name].__code__
         os._exit(run(tests))
     return os.waitpid(child, 0)[1] != 0
 
@@ -249,8 +249,8 @@ def main(rooms: list[str]) -> int:
         run([*tests, "--collect-only", "-qq"])  # imports what all children need
         for node in kernels(module):
             if only in ("", node.name):
-                found = list(survivors(room, getattr(module, node.name), node, tests))
-                total, unnoticed = total + len(found), unnoticed + sum(found)
+                survived = list(survivors(room, getattr(module, node.name), node, tests))
+                total, unnoticed = total + len(survived), unnoticed + sum(survived)
         print(f"{asked}: {total} changes so far, {unnoticed} not noticed", flush=True)
     return unnoticed
 

@@ -38,8 +38,8 @@ def main() -> int:
         sys.stderr.write(f"no recording {car_drive.RECORDING}: set NETPOS_DATA\n")
         return 1
     for name, sensors in _settings(known.sensors):
-        found = car_drive.outages_with(sensors, known.start)
-        ten, thirty = (float(np.median(found.at(seconds))) for seconds in (10.0, 30.0))
+        outages = car_drive.outages_with(sensors, known.start)
+        ten, thirty = (float(np.median(outages.at(seconds))) for seconds in (10.0, 30.0))
         sys.stdout.write(f"{name:24s} {ten:6.2f} m after 10 s {thirty:7.2f} m after 30 s\n")
     return 0
 

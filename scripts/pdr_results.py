@@ -50,9 +50,9 @@ def contact_rows(data: Path) -> Iterator[Row]:
         record = loaders.load_waist_imu(data / f"waist_imu/{name}/data.mat")
         run = run_core(record.imu, carried(placement="waist"))
         s = score_contacts([e.end_ns for e in run.events], record.bouts)
-        found, false = 100 * s.found / s.listed, 100 * s.false / (s.found + s.false)
+        share, false = 100 * s.found / s.listed, 100 * s.false / (s.found + s.false)
         text = f"{s.found} of {s.listed}"
-        yield f"{name}: contacts found", text, f"{found:.1f} %", ">= 95 %", found >= 95
+        yield f"{name}: contacts found", text, f"{share:.1f} %", ">= 95 %", share >= 95
         text = f"{s.false}, and {s.unlisted} untimed"
         yield f"{name}: false detections", text, f"{false:.1f} %", "<= 5 %", false <= 5
         yield waist_distance(name, record, run)

@@ -96,12 +96,13 @@ def import_uwb_tdoa(folder: Path, bag: Path) -> object:
 
 def import_four_anchors(folder: Path, bag: Path) -> object:
     """Ranges of four anchors to a walking person (a ROS 1 bag)."""
-    place = ",".join(f"rsu_{axis}=responder_location.{axis}" for axis in "xyz")
+    position_columns = ",".join(f"rsu_{axis}=responder_location.{axis}" for axis in "xyz")
     return import_ros(
         folder / "data_example.bag",
         bag,
         Columns.parse(
-            f"time=header.stamp,rsu=responder_id,range=distance,{place}", sd=f"range={SHEET_SD_M}"
+            f"time=header.stamp,rsu=responder_id,range=distance,{position_columns}",
+            sd=f"range={SHEET_SD_M}",
         ),
         "/uwb_endorange_info",
         [],

@@ -144,8 +144,8 @@ def subscribe(node: Node, topic: str, callback: Any, *, raw: bool = False) -> No
 def message_class(type_name: str) -> type[Any]:
     """Return the class of ``package/msg/Type``; ImportError where its package is not built."""
     package, _, name = type_name.split("/")
-    found: type[Any] = getattr(importlib.import_module(f"{package}.msg"), name)
-    return found
+    message_type: type[Any] = getattr(importlib.import_module(f"{package}.msg"), name)
+    return message_type
 
 
 def as_plain(value: Any) -> Any:

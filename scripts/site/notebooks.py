@@ -22,8 +22,8 @@ def executed(path: Path, folder: Path) -> nbformat.NotebookNode:
     os.environ["MPLBACKEND"] = "module://matplotlib_inline.backend_inline"
     resources = {"metadata": {"path": str(folder)}}
     with tempfile.TemporaryDirectory() as sockets:  # no port is opened
-        place = f"{sockets}/kernel"
-        kernel = AsyncKernelManager(kernel_name="python3", transport="ipc", ip=place)
+        socket = f"{sockets}/kernel"
+        kernel = AsyncKernelManager(kernel_name="python3", transport="ipc", ip=socket)
         NotebookClient(notebook, km=kernel, timeout=300, resources=resources).execute(
             cleanup_kc=True
         )
@@ -35,13 +35,13 @@ def notebook_page(path: Path) -> tuple[str, dict[str, bytes]]:
     with tempfile.TemporaryDirectory() as folder:
         notebook = executed(path, Path(folder))
     resources = {"unique_key": path.stem, "output_files_dir": path.stem}
-    text, found = MarkdownExporter().from_notebook_node(notebook, resources)
-    pictures = {Path(name).name: data for name, data in found["outputs"].items()}
-    for name in found["outputs"]:
+    text, resources_of_page = MarkdownExporter().from_notebook_node(notebook, resources)
+    pictures = {Path(name).name: data for name, data in resources_of_page["outputs"].items()}
+    for name in resources_of_page["outputs"]:
         text = text.replace(f"]({name})", f"]({Path(name).name})")
-    told = (
+    note = (
         f"!!! note\n    This page is the notebook `docs/notebooks/{path.name}`, run when the site"
         " was built.\n"
     )
     head, _, rest = text.partition("\n\n")
-    return f"{head}\n\n{told}\n{rest}", pictures
+    return f"{head}\n\n{note}\n{rest}", pictures

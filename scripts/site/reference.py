@@ -54,21 +54,21 @@ def node_parameters(package: str) -> Iterator[tuple[str, str, str]]:
     """Name, default and sentence of what a node declares one by one."""
     path = SOURCE / package / package / "parameters.py"
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    found: list[tuple[int, ast.AST]] = [
+    nodes: list[tuple[int, ast.AST]] = [
         (node.lineno, node) for node in ast.walk(tree) if isinstance(node, ast.Assign | ast.Call)
     ]
     text = ""
-    for _, node in sorted(found, key=lambda entry: entry[0]):
+    for _, node in sorted(nodes, key=lambda entry: entry[0]):
         if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "text":
             text = ast.literal_eval(node.value)
         elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "declare":
             _, name, default, about = node.args
             if not isinstance(name, ast.Constant):
                 continue
-            told = text if isinstance(about, ast.Name) else ast.literal_eval(about)
+            description = text if isinstance(about, ast.Name) else ast.literal_eval(about)
             known = isinstance(default, ast.Constant)
             shown = _code(ast.literal_eval(default)) if known else "of the scenario"
-            yield str(name.value), shown, str(told)
+            yield str(name.value), shown, str(description)
 
 
 def _declared(package: str) -> str:
@@ -180,14 +180,14 @@ def _help(flags: Callable[[Sequence[str]], Any]) -> str:
 
 def commands_page() -> str:
     """Every command with its options and examples."""
-    found = _commands(typer.main.get_command(app), "")
+    commands = _commands(typer.main.get_command(app), "")
     return "\n\n".join(
         [
             "# Commands",
             "This page is written from the code; `netpos COMMAND -h` shows the same. "
             "Exit status: 0 done, 1 the work failed, 2 bad usage, 130 interrupted. "
             "`netpos --install-completion` completes commands and options in your shell.",
-            *(_command(name, command) for name, command in found),
+            *(_command(name, command) for name, command in commands),
             "## ros2 run netpos_bag",
             _help(record_flags),
             _help(play_flags),
