@@ -69,7 +69,7 @@ def bench(parts: Iterable[str], quick: bool = False) -> Iterator[tuple[str, list
 
 
 def surroundings(quick: bool) -> dict[str, Any]:
-    """On what the rows are measured: other load on the machine shows in ``load_average``."""
+    """Machine and software of the measurement; ``load_average`` shows other load."""
     return {
         "machine": platform.machine(),
         "python": platform.python_version(),

@@ -37,7 +37,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """A row that could not be measured here, and why, as a sentence."""
+    """A row that could not be measured here, with the reason as a sentence."""
 
     name: str
     reason: str
@@ -47,7 +47,7 @@ Result = Row | LeftOut
 
 
 class Unavailable(RuntimeError):  # noqa: N818 - not an error of the program
-    """What a row needs is not here; the message says what, as a sentence."""
+    """A tool that a row needs is missing; the message names it in a sentence."""
 
 
 def faster(

@@ -80,7 +80,7 @@ def probe(*arguments: str) -> dict[str, Any]:
 
 
 def _end(process: subprocess.Popen[str]) -> None:
-    """Let it end what it has started, then kill what is left of its group."""
+    """Wait until it has ended its nodes, then kill the rest of its group."""
     process.send_signal(signal.SIGTERM)
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(_STOP_S)

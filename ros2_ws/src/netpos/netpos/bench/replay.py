@@ -43,7 +43,7 @@ def read_and_track(path: Path) -> int:
 
 
 def consumed_topics(path: Path) -> set[str]:
-    """The topics ``read_and_track`` takes."""
+    """The topics that ``read_and_track`` reads."""
     with BagReader(path) as bag:
         config = TrackerConfig.from_mapping(bag_settings(bag).parameters)
         consumed = {t for t, info in bag.topics.items() if reading_of(t, info, config) is not None}

@@ -1,4 +1,4 @@
-"""Several bags tracked anew, each on its own."""
+"""Replay several bags, each with a tracker of its own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far what each RSU measured is from the track: by RSU and quantity, without ground truth.
+"""Residuals of each RSU and quantity against the track, without ground truth.
 
 The track was made of these measurements, so residuals are smaller than errors; but a track of
 several RSUs follows none of them, and what one of them keeps to one side shows.
@@ -168,7 +168,7 @@ def correlation_s(stamp_ns: Array, residual: Array) -> float | None:
 
 
 def newest(errors: Iterable[RsuErrors]) -> dict[tuple[str, str], RsuErrors]:
-    """The newest that was learned, by RSU and quantity."""
+    """The newest learned errors, by RSU and quantity."""
     newest_by_key: dict[tuple[str, str], RsuErrors] = {}
     for report in errors:
         for quantity in report.quantities:

@@ -1,4 +1,4 @@
-"""What smoothing gained over the filter in a recording."""
+"""Gain of smoothing over the filter in a recording."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ class VueSurvey:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VueRecord:
-    """What a recording holds of one device."""
+    """Data of one device in a recording."""
 
     track: Trajectory
     statuses: Sequence[TrackStatus]
@@ -186,7 +186,7 @@ def _suggestions(
     measurements: Iterable[RsuMeasurement],
     learns: bool,
 ) -> Iterable[str]:
-    """What to look at first, worst first."""
+    """Suggestions, the most important first."""
     unknown = sorted({m.rsu_id for m in measurements} - rsus.keys())
     if unknown:
         yield f"no RsuInfo of {', '.join(unknown)}: what they measured was not used"

@@ -222,7 +222,7 @@ class AttitudeFilter:
         return True
 
     def _take(self, vqf: VQF) -> None:
-        """Take over attitude and bias of VQF."""
+        """Copy attitude and bias of VQF."""
         w, x, y, z = vqf.getQuat6D().tolist()
         self._q = multiply(_about_up(self._turned), (w, x, y, z))
         bias, _ = vqf.getBiasEstimate()

@@ -54,7 +54,7 @@ _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_STRICT)
 class GaitModel:
-    """How a person walks. ``bounce_m``, ``sway_m`` and ``surge_m`` are peak to peak, the swings
+    """Gait of a person. ``bounce_m``, ``sway_m`` and ``surge_m`` are peak to peak, the swings
     amplitudes; ``stance_pause_s`` is a pause after every step."""
 
     step_length_m: float = Field(default=0.6375, gt=0)
@@ -85,7 +85,7 @@ class _Run:
 
 @plain_dataclass(frozen=True, slots=True)
 class _Stand:
-    """Standing at a place, the body turning evenly eased from ``yaw`` by ``turn``."""
+    """A pause at a point, while the body turns smoothly from ``yaw`` by ``turn``."""
 
     start_s: float
     end_s: float

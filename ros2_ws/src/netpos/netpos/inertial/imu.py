@@ -60,7 +60,7 @@ class ImuModel:
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_STRICT)
 class MagneticDisturbance:
-    """A place where iron or a current adds to the field: ``field_t`` (east, north, up) at
+    """Iron or a current that adds to the field near a point: ``field_t`` (east, north, up) at
     ``center`` (x, y) in map [m], fading with the distance d as exp(-d^2 / (2 radius_m^2))."""
 
     center: tuple[float, float]
@@ -68,7 +68,7 @@ class MagneticDisturbance:
     field_t: tuple[float, float, float]
 
     def at(self, position: Array) -> Array:
-        """(n, 3) field [T] at places (n, 2 or 3)."""
+        """(n, 3) field [T] at positions (n, 2 or 3)."""
         away = np.sum((position[:, :2] - np.array(self.center)) ** 2, axis=1)
         share: Array = np.exp(-away / (2 * self.radius_m**2))
         return np.outer(share, self.field_t)

@@ -245,7 +245,7 @@ class PedestrianDeadReckoning:
         self._restart_detector()
 
     def _lose_heading(self, unseen_s: float) -> None:
-        """Widen the heading's sd by what the device may have turned unseen."""
+        """Widen the heading's sd by the turn that the samples may have missed."""
         unseen = self.config.gap_rate_sd_radps * unseen_s
         self._gap_sd_rad = min(math.hypot(self._gap_sd_rad, unseen), math.pi)
 
@@ -285,7 +285,7 @@ class PedestrianDeadReckoning:
         )
 
     def _watch_field(self, stamp_ns: int) -> None:
-        """Tell when the heading has done without the magnetic field for a while, and why."""
+        """Report when the heading had no magnetic field for a while, and why."""
         since_ns = max(self._heading_fix_ns, self._aligned_ns or 0)
         late = (stamp_ns - since_ns) * 1e-9 > self.config.field_patience_s
         heard = self._last_field_ns is not None and (

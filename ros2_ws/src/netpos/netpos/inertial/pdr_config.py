@@ -113,7 +113,7 @@ class PdrConfig:
 
     @classmethod
     def of(cls, placement: Placement) -> PdrConfig:
-        """Defaults for where the device is worn.
+        """Defaults for a placement of the device.
 
         Raises
         ------

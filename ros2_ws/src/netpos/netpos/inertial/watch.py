@@ -1,4 +1,4 @@
-"""What is wrong with an IMU stream: refused samples by reason, and conditions reported once.
+"""Faults of an IMU stream: refused samples by reason, and conditions reported once.
 
 A *fault* refuses one sample. A *condition* lasts; it is reported in one sentence when it begins
 and in one when it ends.

@@ -1,4 +1,4 @@
-"""An experiment beside itself: ours, the paper's own filter, and ours with default parameters."""
+"""One experiment by three estimators: ours, the paper's filter, ours with default parameters."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Column = Summary | Routes | None
 
 
 def track_rows(name: str, routes: Routes, *, judged: bool = False) -> Iterator[Row]:
-    """What became of the tracks of an experiment; ``judged``: none may go astray."""
+    """Rows of lost tracks and large errors of an experiment; ``judged``: there must be none."""
     share = routes.astray / routes.runs
     ok = share == 0.0 if judged else None
     label = f"{name}: routes with an error above 5 m or lost"

@@ -51,7 +51,7 @@ class Epochs(NamedTuple):
 
 
 class Followed(NamedTuple):
-    """What an estimator makes of the N epochs of a run.
+    """Result of an estimator for the N epochs of a run.
 
     means (N, n), covs (N, n, n), level (N,) [m]: NaN while there is no track; nis, dof and groups
     (N,): of the accepted rows, their number and the number of accepted RSUs; motions (1 or N,

@@ -77,7 +77,7 @@ def _scored(figures: Figures) -> list[str]:
 
 
 def _surveyed(figures: VueSurvey) -> list[str]:
-    """Without ground truth most is not known."""
+    """Row of a recording without ground truth: most figures are unknown."""
     total = figures.accepted + sum(figures.rejected.values())
     refused = sum(figures.rejected.values()) / total if total else None
     unknown = [NOTHING] * 3

@@ -1,4 +1,4 @@
-"""Where jobs are run. All give the same results: every job computes on one thread."""
+"""Executors of jobs. All give the same results: every job computes on one thread."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Seeds to run, and where they are run."""
+"""Seeds to run, and the executor that runs them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Progress = Callable[[str, int, int], None]
 
 
 class Work:
-    """Seeds to run and a place to run them; a context manager.
+    """Seeds to run and their executor; a context manager.
 
     Every job computes on one thread: the threads of a linear algebra library would wait for each
     other in loops, and results would depend on their number.
@@ -81,7 +81,7 @@ class Work:
         self._threads.restore_original_limits()
 
     def with_runs(self, runs: int) -> Work:
-        """The same work and place for another number of runs."""
+        """The same work and executor for another number of runs."""
         other = copy(self)
         other.runs = runs
         return other

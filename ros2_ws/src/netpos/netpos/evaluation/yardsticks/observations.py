@@ -1,4 +1,4 @@
-"""Measurements as neutral arrays, and what each should read at a place.
+"""Measurements as neutral arrays, and their expected values at a point.
 
 a         = p + R(heading) l                     antenna with lever arm l
 azimuth   = atan2(u_y, u_x), or asin(u_y / |u|) of a cone array; u = a - rsu in the RSU's axes

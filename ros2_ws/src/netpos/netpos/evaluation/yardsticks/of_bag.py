@@ -1,4 +1,4 @@
-"""Measurements of a bag as neutral arrays: what the tracker is given, and no more."""
+"""Measurements of a bag as neutral arrays: the same input as the tracker's."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ class Case:
 
     @property
     def one_way(self) -> bool:
-        """Times of arrival by the device's clock, of which nothing is known."""
+        """Times of arrival by the device's clock, whose offset is unknown."""
         return "toa" in self.quantities
 
 
@@ -121,7 +121,7 @@ def config_of(case: Case) -> TrackerConfig:
 
 
 def default_config() -> TrackerConfig:
-    """What a user has who names the motion model and sets nothing else: the library's noise of the
+    """Parameters of a user who sets only the motion model: the library's noise of the
     IMU and of the clock, no vehicle constraints."""
     return TrackerConfig(motion_model="strapdown")
 
@@ -162,7 +162,7 @@ def silence_ends(epochs: Epochs) -> Mask:
 
 
 def ground_height_m(stations: tuple[RsuInfo, ...]) -> float:
-    """Where a fix starts that knows no height: the street, by the usual height of the masts."""
+    """Start height of fixes without a known height: the street, by the usual height of masts."""
     return float(np.mean([info.position[2] for info in stations])) - MAST_M
 
 
@@ -206,8 +206,8 @@ def imu_of(simulation: Simulation) -> Imu:
 
 
 def started(simulation: Simulation, case: Case, config: TrackerConfig) -> tuple[Array, Array]:
-    """State nav and covariance handed to the filters at the first beacon, wrong by a draw of
-    it."""
+    """Start of the filters at the first beacon: a covariance, and the true state plus a draw
+    from it."""
     truth = simulation.truth(VUE, simulation.beacons(VUE).stamp_ns[:1])
     seed, sd = simulation.scenario.seed, start_sd(config, *START_SD)
     error = sd * generator(seed, f"{VUE}/start").standard_normal(sd.size)

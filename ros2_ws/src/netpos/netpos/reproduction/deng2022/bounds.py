@@ -1,9 +1,7 @@
-"""What no filter can beat on deng2022's drives, how good their geometry is, and what smoothing
-makes of their outages.
+"""Bounds of all filters on deng2022's drives, dilution of their geometry, and smoothed outages.
 
-The posterior Cramér-Rao bound along the true way: the covariance of a filter whose measurements
-and IMU are free of errors, so that it linearises at the truth, and which takes them to be as
-uncertain as they are.
+The bound is the posterior Cramér-Rao bound along the true way: the covariance of a filter with
+error-free measurements and IMU, so that it linearises at the truth, and with their real variances.
 """
 
 from __future__ import annotations
@@ -86,7 +84,7 @@ class Squares:
 
 
 def variants(sensors: Sensors) -> dict[str, Sensors]:
-    """What the filter takes to be true, by variant."""
+    """Parameters of the filter, by variant."""
     exact = sensors.constraints._replace(sideways_sd_mps=_EXACT_MPS, upwards_sd_mps=_EXACT_MPS)
     return {
         TIGHT: sensors._replace(constraints=UNCONSTRAINED),

@@ -106,7 +106,7 @@ def _aligned(drive: CarDrive, config: TrackerConfig) -> Start:
 
 
 def _variants(known: Recording) -> dict[str, tuple[Sensors, Start]]:
-    """Of the tight coupling: what the filter takes to be true, and where it starts."""
+    """Variants of the tight coupling: parameters of the filter, and its start."""
     free = known.sensors._replace(constraints=UNCONSTRAINED)
     return {
         TIGHT: (free, known.start),
@@ -167,12 +167,12 @@ class Outages:
     error: Array
 
     def at(self, seconds: float) -> Array:
-        """(outages,) errors after so long."""
+        """(outages,) errors [m] after ``seconds``."""
         return np.asarray(self.error[:, int(np.argmin(np.abs(self.time_s - seconds)))])
 
 
 def outages(variant: str) -> Outages:
-    """``outages_with`` what the filter takes to be true."""
+    """``outages_with`` the parameters of the filter."""
     known = recording()
     assert known is not None
     return outages_with(*_variants(known)[variant])

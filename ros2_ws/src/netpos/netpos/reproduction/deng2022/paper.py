@@ -1,7 +1,7 @@
 """deng2022: stations' ranges and angles with a strapdown INS, open and blocked.
 
 Tables 1 and 2, each cell over many drives. The paper couples loosely: least-squares fixes go into
-the filter. Beside it stand the tight coupling, in which every range and angle is an update of its
+the filter. Beside it is the tight coupling, in which every range and angle is an update of its
 own, and the tight coupling of a vehicle that neither slips nor leaves the ground.
 """
 
@@ -165,7 +165,7 @@ def _largest_rms(tally: Tally) -> dict[str, float]:
 
 
 def _geometry(work: Work) -> Iterator[Row]:
-    """How good the geometry is, which no filter changes."""
+    """Dilution of precision, which no filter changes."""
     for what, ours, paper in zip(
         ("horizontal", "vertical"), mean_dilution(work, OPEN_TOA), PAPER_DILUTION, strict=True
     ):
@@ -173,8 +173,8 @@ def _geometry(work: Work) -> Iterator[Row]:
 
 
 def _blocked(tallies: dict[str, Tally]) -> Iterator[Row]:
-    """What the paper says of SINS where stations are blocked, and the horizontal RMS of the tight
-    coupling over that of the loose one, ours and the paper's."""
+    """Claims of the paper about SINS where stations are blocked; the horizontal RMS of the tight
+    over that of the loose coupling, ours and the paper's."""
     for variant in _COUPLINGS:
         line, label = Line.of(tallies, variant), f"{BLOCKED.name}, SINS, {variant}"
         yield from line.at_most(label, "m", _largest_rms, BLOCKED_LIMIT_M)
@@ -222,7 +222,7 @@ def _bounds(work: Work, blocked: dict[str, Tally]) -> Iterator[Row]:
 
 
 def _smoothed(work: Work) -> Iterator[Row]:
-    """Errors inside the outages, as the filter had them and given what came later."""
+    """Errors inside the outages, filtered and smoothed."""
     for case in (OUTAGES, LONG_OUTAGES):
         for variant, smoothed in in_outages(work, case).items():
             plane = float(np.hypot(*smoothed.rms_m[:2]))
@@ -230,7 +230,7 @@ def _smoothed(work: Work) -> Iterator[Row]:
 
 
 def _one_way(tallies: dict[str, Tally]) -> Iterator[Row]:
-    """Times of arrival by a clock of which nothing is known at the start."""
+    """Times of arrival by a clock with an unknown offset at the start."""
     for variant in (TIGHT, VEHICLE):
         line, label = Line.of(tallies, variant), f"{ONE_WAY.name}, SINS, {variant}"
         yield from line.shown(label, "m", rms_cells)

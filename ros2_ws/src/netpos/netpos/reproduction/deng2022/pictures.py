@@ -1,4 +1,4 @@
-"""What deng2022 draws: errors along a drive, and through an outage."""
+"""Pictures of deng2022: errors along a drive, and through an outage."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class Line:
 
     @classmethod
     def of(cls, tallies: Mapping[str, Tally], variant: str) -> Line:
-        """From the tallies of a case; what it has no tally of stays empty."""
+        """From the tallies of a case; a figure without a tally stays empty."""
         paper = tallies.get(_PAPERS.get(variant, LOOSE))
         return cls(tallies[variant], paper, tallies.get(_DEFAULTS.get(variant, "")))
 
@@ -76,7 +76,7 @@ def lost_tracks(tally: Tally) -> dict[str, float]:
 
 
 def unscored(tally: Tally) -> dict[str, float]:
-    """What a mean hides [%]."""
+    """Shares that a mean hides [%]."""
     return {
         "time not scored": 100.0 - tally.success_percent,
         f"drives with a 3-D error above {LARGE_ERROR_M:.0f} m": tally.large_percent,

@@ -1,4 +1,4 @@
-"""What dvornikov2017 claims, judged for both networks and for the fused track; and the columns of
+"""Claims of dvornikov2017, judged for both networks and for the fused track; and the columns of
 its rows."""
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ def _reduction(sides: Sides, network: FixNetwork) -> Iterator[Row]:
 
 
 def gain_rows(summary: NetworkSummary, seed: int) -> Iterator[Row]:
-    """Fig. 6: the gains of each network begin near one and come to rest on the floor."""
+    """Fig. 6: the gains of each network begin near one and end on the floor."""
     stages = stages_of(summary.setting)
     for network, stage in zip(summary.setting.networks, stages.networks, strict=True):
         truth = summary.setting.truth(seed, stage.stamps_ns)

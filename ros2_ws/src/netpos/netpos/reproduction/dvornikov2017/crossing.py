@@ -1,4 +1,4 @@
-"""Objects whose paths cross: are the tracks of two networks still put together rightly?"""
+"""Objects whose paths cross: does the fusion still pair the tracks of two networks correctly?"""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ no estimate."""
 
 
 def _fixes(network: FixNetwork, setting: Setting, seed: int) -> list[RsuMeasurement]:
-    """What a network's fixes are as messages: those of ``Pass.fixes``."""
+    """Fixes of a network (``Pass.fixes``) as messages."""
     stamps = network.stamps_ns(setting.duration_s)
     fixes = np.zeros((stamps.size, 3))
     fixes[:, :2] = setting.truth(seed, stamps)[:, :2]
@@ -60,7 +60,7 @@ def _fixes(network: FixNetwork, setting: Setting, seed: int) -> list[RsuMeasurem
 
 
 def _outputs(setting: Setting, seed: int) -> list[TrackOutput]:
-    """What all trackers and the fusion give."""
+    """Outputs of all trackers and of the fusion."""
     chain = Chain([network.name for network in setting.networks], TRACKER, FUSION)
     server = np.zeros(3)
     server[:2] = setting.truth(seed, np.array([START_NS]))[0, :2]

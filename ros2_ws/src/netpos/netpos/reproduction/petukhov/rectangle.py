@@ -95,7 +95,7 @@ class Walked:
 
 
 class Setup:
-    """What all seeds of a case share."""
+    """Set-up that all seeds of a case share."""
 
     def __init__(self, case: Case) -> None:
         changes = {"devices.0": _DEVICE, _BASELINE: case.wavelengths}

@@ -87,7 +87,7 @@ class SectorShares:
 
 
 class Setup:
-    """What all starts under the same conditions share."""
+    """Set-up that all starts under the same conditions share."""
 
     def __init__(self, conditions: Conditions) -> None:
         wavelength_m = uwb_wavelength_m(5)
@@ -113,7 +113,7 @@ class Setup:
     def measured(
         self, rng: np.random.Generator, places: Array
     ) -> tuple[Array, npt.NDArray[np.int64]]:
-        """Rows (n, 2, ROW_WIDTH) at places (n, 2), and the true turns of each phase (n,)."""
+        """Rows (n, 2, ROW_WIDTH) at positions (n, 2), and the true turns of each phase (n,)."""
         conditions = self.conditions
         noise = rng.standard_normal((len(places), 2))
         ranges = np.hypot(places[:, 0] - self.info.baseline_m / 2, places[:, 1])

@@ -33,7 +33,7 @@ class StepErrors:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Person:
-    """What is wrong with all steps of a person alike: true over reported length, angle from
+    """Common errors of all steps of a person: true over reported length, angle from
     reported to true heading."""
 
     length_factor: float = 1.0

@@ -1,4 +1,4 @@
-"""What goes wrong on the rectangle beyond the paper's noise: reflections, people in the way, an
+"""Troubles on the rectangle beyond the paper's noise: reflections, people in the way, an
 anchor heard too seldom to follow the phase, poor headings, a tracker that believes the wrong
 sector."""
 

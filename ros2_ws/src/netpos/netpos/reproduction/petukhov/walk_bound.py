@@ -1,4 +1,4 @@
-"""What can be had on the rectangle at all: the posterior Cramér-Rao bound of a filter that knows
+"""Best possible error on the rectangle: the posterior Cramér-Rao bound of a filter that knows
 the sector and the instants at which the walker starts, stops and turns."""
 
 from __future__ import annotations
