@@ -39,15 +39,15 @@ def publish(node: Any, devices: int, rate_hz: float, seconds: float, recorder: i
     ]
     measurement = serialize_message(RsuMeasurement(rsu_id="rsu_1", vue_id="vue_1"))
     time.sleep(READY_S)
-    start_s, told_s, epochs = time.monotonic(), 0.0, round(seconds * rate_hz)
+    start_s, reported_s, epochs = time.monotonic(), 0.0, round(seconds * rate_hz)
     for epoch in range(1, epochs + 1):
         for _ in range(MEASUREMENTS * devices):
             measured.publish(measurement)
         for publisher, message in estimates:
             publisher.publish(message)
         passed_s = time.monotonic() - start_s
-        if passed_s - told_s >= SAMPLE_S:
-            told_s = passed_s
+        if passed_s - reported_s >= SAMPLE_S:
+            reported_s = passed_s
             tell(recorder, passed_s)
         time.sleep(max(epoch / rate_hz - passed_s, 0.0))
     return epochs * devices * (MEASUREMENTS + len(KINDS))

@@ -241,8 +241,8 @@ class AttitudeFilter:
         """
         if self._q is None:
             return "not_aligned"
-        taken_at = quaternion if quaternion is not None else self._q
-        mx, my, mz = rotate(taken_at, field_tesla)
+        sample_attitude = quaternion if quaternion is not None else self._q
+        mx, my, mz = rotate(sample_attitude, field_tesla)
         horizontal = math.hypot(mx, my)
         norm = math.hypot(horizontal, mz)
         if horizontal <= 0.05 * norm:

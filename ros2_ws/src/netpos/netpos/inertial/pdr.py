@@ -200,8 +200,8 @@ class PedestrianDeadReckoning:
                 self._counters["magnetic_not_aligned"] += 1
                 continue
             was_relative = self._attitude.reference == "relative"
-            taken_at = self._attitudes[0][1]
-            result = self._attitude.add_magnetic_field(stamp_ns, value, taken_at)
+            sample_attitude = self._attitudes[0][1]
+            result = self._attitude.add_magnetic_field(stamp_ns, value, sample_attitude)
             self._field_refused = result != "used"
             if self._field_refused:
                 self._counters[f"magnetic_{result}"] += 1

@@ -27,7 +27,7 @@ BIAS = np.array([0.3, -0.2, 0.25, -0.3, 0.1])
 INFOS = [RsuInfo(rsu_id=f"a{i}", position=site) for i, site in enumerate(SITES)]
 
 
-def place(t: float) -> np.ndarray:
+def position_of(t: float) -> np.ndarray:
     return np.array([8.0 * math.cos(t / 8), 5.0 * math.sin(t / 8), 0.0])
 
 
@@ -37,7 +37,7 @@ def recorded(path: Path, seed: int, **tracker: object) -> Path:
     for k in range(300):
         t = k / 5.0
         stamp = round((1.0 + t) * S)
-        d = np.linalg.norm(place(t) - SITES, axis=1) + BIAS + rng.normal(0.0, 0.1, 5)
+        d = np.linalg.norm(position_of(t) - SITES, axis=1) + BIAS + rng.normal(0.0, 0.1, 5)
         measurements += [
             RsuMeasurement(
                 stamp_ns=stamp,
@@ -52,7 +52,7 @@ def recorded(path: Path, seed: int, **tracker: object) -> Path:
         pose = Odometry(
             stamp_ns=stamp,
             vue_id="vue_1",
-            position=place(t),
+            position=position_of(t),
             quaternion=np.array([0.0, 0.0, 0.0, 1.0]),
             linear_velocity=np.zeros(3),
         )

@@ -23,7 +23,7 @@ ANCHORS = {"A3": (-8, -8, 2), "A5": (8, -8, 0.5), "A9": (8, 8, 2), "A12": (-8, 8
 SPEED_MPS, RADIUS_M, SD_M, SECONDS = 1.0, 6.0, 0.05, 20
 
 
-def place(seconds: np.ndarray) -> np.ndarray:
+def position_of(seconds: np.ndarray) -> np.ndarray:
     """A circle: (n, 2) m."""
     turn = seconds * SPEED_MPS / RADIUS_M
     return RADIUS_M * np.column_stack([np.cos(turn), np.sin(turn)])
@@ -38,7 +38,7 @@ def _data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rng = np.random.default_rng(17)
     for name, site in ANCHORS.items():
         times = np.arange(SECONDS * 10) * 0.1 + 1.0
-        level = place(times) - site[:2]
+        level = position_of(times) - site[:2]
         length = np.sqrt((level**2).sum(axis=1) + (TAG_HEIGHT_M - site[2]) ** 2)
         length += SD_M * rng.standard_normal(len(length))
         rows = [
@@ -47,7 +47,9 @@ def _data(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ]
         (los / f"{name}.csv").write_text("\n".join(["header", *rows]) + "\n")
     times = np.arange(SECONDS * 8 + 1) / 8 + 1.0
-    rows = [f"{t * S:.0f},{x},{y},0.0,0.0" for t, (x, y) in zip(times, place(times), strict=True)]
+    rows = [
+        f"{t * S:.0f},{x},{y},0.0,0.0" for t, (x, y) in zip(times, position_of(times), strict=True)
+    ]
     (los / "trajectory.csv").write_text("\n".join(["timestamp,x,y,z,heading", *rows]) + "\n")
     (los / "authors_results.txt").write_text(
         "LS RMSE_2d: 1.5\nESKF RMSE: 0.2\nESKF RMSE_2d: 0.5\n"
@@ -65,7 +67,7 @@ def test_baselines_are_scored_at_the_epochs_that_count_and_at_their_own(bag: Pat
     """Against a truth that is wrong by 3 m in its second half: only what is counted knows."""
     seen = observations_of_bag(bag, range_sd_m=0.2)
     stamps = np.unique(seen.stamp_ns)
-    true = place(stamps / S)
+    true = position_of(stamps / S)
     true[len(stamps) // 2 :] += [3.0, 0.0]
     n = len(stamps)
     truth = Trajectory(
