@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from netpos.estimation.compile import kernel
+from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.measurement import (
     LEVER,
     ORIGIN,
@@ -38,7 +38,9 @@ _RING_MIN, RING_MAX = 12, 128
 _OUTLIERS = 1e-2  # of all values; those of a range lie anywhere within
 _OUTLIER_RANGE_M = 100.0
 _LEAST_WEIGHT = 1e-8
+_LEAST_PIVOT = 1e-300
 _COMPONENTS_MAX = 64
+_AT_ONCE_MAX = 256  # components that are merged at once
 RING_MERGE_COST = 2e-4  # divergence (Runnalls' bound) that merging parts of a ring may cost
 _APART2 = 9.0  # squared Mahalanobis distance of means from which components are two modes
 
@@ -145,67 +147,146 @@ def split_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Mi
     return Mixture(means, covs, logs)
 
 
-@kernel
-def _log_det(cov: Array) -> float:
-    """Log determinant of the covariance of position and velocity."""
-    end = _VELOCITY_END
-    return float(np.linalg.slogdet(cov[:end, :end].copy())[1])
+@leaf
+def _log_det(P: Array) -> float:
+    """Log determinant of a covariance (k, k), which its Cholesky factor replaces; a direction
+    without variance counts as one of almost none."""
+    total = 0.0
+    for i in range(P.shape[0]):
+        for j in range(i + 1):
+            left = P[i, j]
+            for k in range(j):
+                left -= P[i, k] * P[j, k]
+            if i == j:
+                pivot = max(left, _LEAST_PIVOT)
+                P[i, i] = math.sqrt(pivot)
+                total += math.log(pivot)
+            else:
+                P[i, j] = left / P[j, j]
+    return total
 
 
-@kernel
-def _merged(
-    i: int, j: int, means: Array, covs: Array, weights: Array
-) -> tuple[float, Array, Array]:
-    """Weight, mean and covariance of two components as one, which keeps their moments."""
-    total = weights[i] + weights[j]
-    a, b = weights[i] / total, weights[j] / total
-    away = means[i] - means[j]
-    mean = a * means[i] + b * means[j]
-    return total, mean, a * covs[i] + b * covs[j] + a * b * np.outer(away, away)
+@leaf
+def _log_det_of(cov: Array, work: Array) -> float:
+    """Log determinant of the covariance of position and velocity in ``cov`` (n, n)."""
+    for a in range(_VELOCITY_END):
+        for b in range(_VELOCITY_END):
+            work[a, b] = cov[a, b]
+    return float(_log_det(work))
 
 
-@kernel
+@leaf
 def _merge_cost(
-    i: int, j: int, means: Array, covs: Array, weights: Array, log_dets: Array
+    i: int, j: int, means: Array, covs: Array, weights: Array, log_dets: Array, work: Array
 ) -> float:
     """Runnalls 2007, eq. 21: what the merging of two components adds to the divergence, at most;
     by position and velocity."""
-    end = _VELOCITY_END
-    total, _, cov = _merged(i, j, means[:, :end], covs[:, :end, :end], weights)
-    parts = weights[i] * log_dets[i] + weights[j] * log_dets[j]
-    return float(0.5 * (total * _log_det(cov) - parts))
+    total = weights[i] + weights[j]
+    u, v = weights[i] / total, weights[j] / total
+    for a in range(_VELOCITY_END):
+        for b in range(a + 1):
+            apart = (means[i, a] - means[j, a]) * (means[i, b] - means[j, b])
+            work[a, b] = u * covs[i, a, b] + v * covs[j, a, b] + u * v * apart
+    return float(
+        0.5 * (total * _log_det(work) - weights[i] * log_dets[i] - weights[j] * log_dets[j])
+    )
+
+
+@leaf
+def _merge(i: int, j: int, means: Array, covs: Array, weights: Array) -> None:
+    """Put the component ``j`` into ``i``; together they keep their moments."""
+    total = weights[i] + weights[j]
+    u, v, n = weights[i] / total, weights[j] / total, means.shape[1]
+    for a in range(n):
+        for b in range(n):
+            apart = (means[i, a] - means[j, a]) * (means[i, b] - means[j, b])
+            covs[i, a, b] = u * covs[i, a, b] + v * covs[j, a, b] + u * v * apart
+    for a in range(n):
+        means[i, a] = u * means[i, a] + v * means[j, a]
+    weights[i], weights[j] = total, 0.0
+
+
+@kernel
+def _find_partner(
+    i: int,
+    components: tuple[Array, Array, Array],
+    log_dets: Array,
+    partner: Ints,
+    cost: Array,
+    work: Array,
+) -> None:
+    """Find the component after ``i`` with which merging costs least."""
+    means, covs, weights = components
+    partner[i], cost[i] = -1, np.inf
+    for j in range(i + 1, weights.size):
+        if weights[j] > 0.0:
+            found = _merge_cost(i, j, means, covs, weights, log_dets, work)
+            if found < cost[i]:
+                partner[i], cost[i] = j, found
+
+
+@kernel
+def _merge_alike(
+    means: Array, covs: Array, weights: Array, merge_cost: float
+) -> tuple[Array, Array, Array]:
+    """Merge, in place, the two components for which it costs least, again and again while that is
+    at most ``merge_cost`` or there are too many; what is left of means (K, n), covs (K, n, n),
+    weights (K,)."""
+    count = left = weights.size
+    cost, log_dets = np.full(count, np.inf), np.empty(count)
+    partner, work = np.full(count, -1), np.empty((_VELOCITY_END, _VELOCITY_END))
+    for k in range(count):
+        log_dets[k] = _log_det_of(covs[k], work)
+    for i in range(count):
+        _find_partner(i, (means, covs, weights), log_dets, partner, cost, work)
+    while left > 1:
+        i = int(np.argmin(cost))
+        j = partner[i]
+        if cost[i] > merge_cost and left <= _COMPONENTS_MAX:
+            break
+        _merge(i, j, means, covs, weights)
+        log_dets[i], cost[j], left = _log_det_of(covs[i], work), np.inf, left - 1
+        for k in range(j):
+            if weights[k] <= 0.0:
+                continue
+            if k == i or partner[k] == i or partner[k] == j:
+                _find_partner(k, (means, covs, weights), log_dets, partner, cost, work)
+            elif k < i:
+                merging = _merge_cost(k, i, means, covs, weights, log_dets, work)
+                if merging < cost[k]:
+                    partner[k], cost[k] = i, merging
+    alive = np.flatnonzero(weights > 0.0)
+    return means[alive], covs[alive], weights[alive]
 
 
 @kernel
 def reduced(components: Mixture, merge_cost: float) -> Mixture:
     """The mixture normalised, without components of no weight; components are merged while that
-    costs at most ``merge_cost`` (Runnalls' bound of the divergence)."""
+    costs at most ``merge_cost`` (Runnalls' bound of the divergence).
+
+    The time is quadratic in the components, so that many are first merged in parts that lie side
+    by side from west to east.
+    """
     means, covs, log_weights = components
     top = log_weights.max()
     logs = log_weights - (top + math.log(np.exp(log_weights - top).sum()))
     kept = np.flatnonzero(logs > math.log(_LEAST_WEIGHT))
     means, covs, weights = means[kept], covs[kept], np.exp(logs[kept])
-    count = left = kept.size
-    costs, log_dets = np.full((count, count), np.inf), np.empty(count)
-    for k in range(count):
-        log_dets[k] = _log_det(covs[k])
-    for i in range(count):
-        for j in range(i + 1, count):
-            costs[i, j] = _merge_cost(i, j, means, covs, weights, log_dets)
-    while left > 1:
-        i, j = divmod(int(np.argmin(costs)), count)
-        if costs[i, j] > merge_cost and left <= _COMPONENTS_MAX:
-            break
-        weights[i], means[i], covs[i] = _merged(i, j, means, covs, weights)
-        weights[j], log_dets[i], left = 0.0, _log_det(covs[i]), left - 1
-        costs[j, :] = costs[:, j] = np.inf
-        for k in range(count):
-            if weights[k] > 0.0 and k != i:
-                low, high = min(i, k), max(i, k)
-                costs[low, high] = _merge_cost(low, high, means, covs, weights, log_dets)
-    alive = np.flatnonzero(weights > 0.0)
-    weights = weights[alive] / weights[alive].sum()
-    return Mixture(means[alive], covs[alive], np.log(weights))
+    while weights.size > _AT_ONCE_MAX:
+        order, end = np.argsort(means[:, 0]), 0
+        means, covs, weights = means[order], covs[order], weights[order]
+        for start in range(0, weights.size, _AT_ONCE_MAX):
+            part = slice(start, start + _AT_ONCE_MAX)
+            some = _merge_alike(
+                means[part].copy(), covs[part].copy(), weights[part].copy(), merge_cost
+            )
+            size = some[2].size
+            means[end : end + size], covs[end : end + size] = some[0], some[1]
+            weights[end : end + size] = some[2]
+            end += size
+        means, covs, weights = means[:end], covs[:end], weights[:end]
+    means, covs, weights = _merge_alike(means, covs, weights, merge_cost)
+    return Mixture(means, covs, np.log(weights / weights.sum()))
 
 
 @kernel

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+from typing import Any
+
 import numpy as np
 import pytest
 from filter_rows import make_cov, row
@@ -171,6 +174,61 @@ def test_components_without_weight_go_and_never_too_many_stay() -> None:
     kept, _, weights = mixture.reduced(mixture.Mixture(means, covs, logs), mixture.RING_MERGE_COST)
     assert weights.size == 64
     assert not (np.abs(kept[:, 0] - 700.0) < 1.0).any()
+
+
+def crowd(rng: np.random.Generator, count: int) -> mixture.Mixture:
+    """Components round a ring of 5 m."""
+    angle = rng.uniform(0.0, 2.0 * np.pi, count)
+    means = np.column_stack(
+        [5.0 * np.cos(angle), 5.0 * np.sin(angle), *rng.normal(0.0, 0.3, (4, count))]
+    )
+    covs = np.array([0.2 * make_cov(rng, 6, 1.0) for _ in range(count)])
+    return mixture.Mixture(means, covs, rng.normal(0.0, 1.0, count))
+
+
+def merged_step_by_step(parts: mixture.Mixture, cost: float) -> list[tuple[float, Array]]:
+    """Weights and means after Runnalls' algorithm as he writes it: all pairs, each time."""
+    weights = np.exp(parts.log_weights)
+    left = list(zip(weights / weights.sum(), parts.means, parts.covs, strict=True))
+
+    def together(a: Any, b: Any) -> Any:
+        w = a[0] + b[0]
+        u, v, d = a[0] / w, b[0] / w, a[1] - b[1]
+        return w, u * a[1] + v * b[1], u * a[2] + v * b[2] + u * v * np.outer(d, d)
+
+    def log_det(P: Array) -> float:
+        return float(np.linalg.slogdet(P[:4, :4])[1])
+
+    while True:
+        costs = {}
+        for i, j in itertools.combinations(range(len(left)), 2):
+            w, _, P = together(left[i], left[j])
+            parts_of = left[i][0] * log_det(left[i][2]) + left[j][0] * log_det(left[j][2])
+            costs[i, j] = 0.5 * (w * log_det(P) - parts_of)
+        i, j = min(costs, key=lambda pair: costs[pair])
+        if costs[i, j] > cost:
+            return [(w, mean) for w, mean, _ in left]
+        left[i] = together(left[i], left[j])
+        del left[j]
+
+
+def test_the_pair_that_costs_least_is_merged_first() -> None:
+    parts = crowd(np.random.default_rng(8), 25)
+    expected = merged_step_by_step(parts, 0.05)
+    means, _, logs = mixture.reduced(parts, 0.05)
+    assert 3 < len(expected) == logs.size < 20
+    np.testing.assert_allclose(np.exp(logs), [w for w, _ in expected], rtol=1e-9)
+    np.testing.assert_allclose(means, [mean for _, mean in expected], rtol=1e-9)
+
+
+def test_very_many_are_merged_in_parts_and_keep_their_moments() -> None:
+    parts = crowd(np.random.default_rng(9), 1500)
+    few = mixture.reduced(parts, 1e-5)
+    assert few.log_weights.size <= 64
+    weights = np.exp(parts.log_weights)
+    normal = mixture.Mixture(parts.means, parts.covs, np.log(weights / weights.sum()))
+    for ours, expected in zip(moments(few), moments(normal), strict=True):
+        np.testing.assert_allclose(ours, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_an_outlier_leaves_the_wide_prior_as_it_was_with_its_weight() -> None:
