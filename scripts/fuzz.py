@@ -1,9 +1,12 @@
 #!/usr/bin/env python3
 """Malformed messages, damaged bags and damaged scenarios: nothing raises, nothing wrong is taken.
 
-    scripts/fuzz.py --messages 1000000 --bags 10000 --yaml 1000 --seed 1
+    scripts/fuzz.py --messages 1000000 --bags 10000 --contents 1000 --yaml 1000 --seed 1
 
-prints a table of what became of them, and every seed that failed. Exit status 1 if one did.
+prints a table of what became of them, and every seed that failed. Exit status 1 if one did. Ctrl-C
+ends it after the item it is at; the table then tells how far it came.
+``bags`` have damaged bytes; ``contents`` are whole bags in which other messages, times, topics or
+facts were written.
 """
 
 from __future__ import annotations
@@ -11,11 +14,14 @@ from __future__ import annotations
 import argparse
 import random
 import shutil
+import signal
 import sys
 import tempfile
+import time
 import warnings
 from collections import Counter
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +32,7 @@ from netpos.bags.recover import recover
 from netpos.cli.main import app
 from netpos.messages import topics
 from netpos.messages.network_tracks import network_track_from_msg
+from netpos.messages.values import RsuInfo
 from netpos.scenario.load import ScenarioError, load_scenario, scenario_files
 from netpos.scenario.settings import bag_settings
 from netpos.tracking import Tracker, TrackerConfig
@@ -34,6 +41,9 @@ from typer.testing import CliRunner
 
 BATCH = 500  # messages of one tracker
 COMMANDS = ("read", "recover", "evaluate", "replay", "report", "compare", "rsus", "import")
+CONTENT_COMMANDS = (*COMMANDS, "load", "truth")
+SCENARIOS = ("fast_pass", "tdoa_yard", "pedestrian_walk", "intersection_turn")  # of messages
+SLOW_S = 60.0  # for one message, bag or scenario
 ODD = (0.0, -0.0, 5e-324, 1e-300, 1e300, -1e300, float("nan"), float("inf"), 1e9, -1e9)
 _READ = {
     topics.RSU_INFO: "rsu_info",
@@ -43,8 +53,18 @@ _READ = {
     topics.CLOCK_STATE: "clock_state",
     topics.TRACK_STATUS: "track_status",
     topics.BEACON: "beacon",
-    topics.IMU: "imu",
+    topics.MAG: "magnetic_field",
 }
+_READ_OF = {  # what the topic, not the message, says whose it is
+    topics.IMU: "imu",
+    topics.INITIAL_POSE: "initial_pose",
+    topics.STEP_VELOCITY: "velocity",
+    topics.GROUND_SPEED: "ground_speed",
+}
+FED = ("RsuMeasurement", "InitialPose", "ImuSample", "Velocity", "GroundSpeed")
+
+
+_stopped: list[int] = []
 
 
 class FuzzError(AssertionError):
@@ -77,12 +97,21 @@ def recorded(path: Path) -> list[tuple[str, str, bytes]]:
         return [(e.topic, e.type_name, e.cdr) for e in bag.messages()]
 
 
+@cache
+def described(path: Path) -> tuple[TrackerConfig, list[RsuInfo]]:
+    """Parameters and RSUs of a bag."""
+    with BagReader(path) as bag:
+        config = TrackerConfig.from_mapping(dict(bag_settings(bag).parameters))
+        infos = bag.messages([topics.RSU_INFO])
+        return config, [codec().rsu_info_from_msg(entry.message) for entry in infos]
+
+
 def tracker_of(path: Path) -> Tracker:
     """One with the RSUs and the parameters of a bag."""
-    with BagReader(path) as bag:
-        made = Tracker(TrackerConfig.from_mapping(dict(bag_settings(bag).parameters)))
-        for entry in bag.messages([topics.RSU_INFO]):
-            made.add_rsu(codec().rsu_info_from_msg(entry.message))
+    config, infos = described(path)
+    made = Tracker(config)
+    for info in infos:
+        made.add_rsu(info)
     return made
 
 
@@ -101,8 +130,8 @@ def value_of(topic: str, type_name: str, cdr: bytes) -> Any:
         message = typestore().deserialize_cdr(cdr, type_name)
     except (ValueError, KeyError, IndexError, MemoryError) as error:  # as BagReader.decode
         raise BagError(str(error)) from error
-    if name == topics.INITIAL_POSE:
-        return codec().initial_pose_from_msg(message, vue_id)
+    if name in _READ_OF:
+        return getattr(codec(), f"{_READ_OF[name]}_from_msg")(message, vue_id)
     if type_name.endswith("/NetworkTrack"):
         return network_track_from_msg(message)
     read = _READ.get(name)
@@ -117,6 +146,12 @@ def finite(tracker: Tracker, outputs: list[Any]) -> None:
             if not all(np.isfinite(v).all() for v in (o.position, o.pose_cov, o.linear_velocity)):
                 raise FuzzError(f"not finite: {o}")
             cdr_codec().odometry(o)
+        clock = output.clock
+        if (
+            clock is not None
+            and not np.isfinite([clock.offset_s, clock.drift, *clock.cov.flat]).all()
+        ):
+            raise FuzzError(f"not finite: {clock}")
         cdr_codec().track_status(output.status)
     tracker.findings({}, {})
 
@@ -125,7 +160,7 @@ def message_batch(source: list[tuple[str, str, bytes]], path: Path, seed: int, n
     """Feed ``n`` messages, seven of ten spoilt, to the codecs and a tracker."""
     rng, counts = random.Random(seed), Counter[str]()
     tracker = tracker_of(path)
-    measured = [entry for entry in source if entry[0] == topics.RSU_MEASUREMENTS]
+    measured = [e for e in source if e[0] == topics.RSU_MEASUREMENTS or _is_input(e[0])]
     by_topic = list({entry[0]: entry for entry in source}.values())
     start = rng.randrange(len(measured))
     for i in range(n):  # measurements in their order, now and then something else
@@ -145,13 +180,17 @@ def message_batch(source: list[tuple[str, str, bytes]], path: Path, seed: int, n
                 counts["taken"] += 1
             except ValueError:
                 counts["refused"] += 1
-        elif type(value).__name__ in ("RsuMeasurement", "InitialPose", "ImuSample"):
+        elif type(value).__name__ in FED:
             counts["refused" if tracker.add(value) else "taken"] += 1
             finite(tracker, tracker.process())
         else:
             counts["decoded"] += 1
     finite(tracker, tracker.flush())
     return counts
+
+
+def _is_input(topic: str) -> bool:
+    return topics.split(topic)[1] in (topics.IMU, topics.STEP_VELOCITY, topics.INITIAL_POSE)
 
 
 # bags
@@ -188,24 +227,61 @@ def damaged(source: Path, folder: Path, rng: random.Random) -> Path:
     return bag
 
 
+def rewritten(source: Path, folder: Path, rng: random.Random) -> Path:
+    """A whole bag with one to fifty of its messages spoilt, and sometimes other times, topics or
+    facts; every checksum is right."""
+    bag, share = folder / source.name, rng.choice((0.003, 0.03, 0.3))
+    odd_times = rng.random() < 0.2
+    with BagReader(source) as whole:
+        facts = dict(whole.metadata)
+        if facts and rng.random() < 0.3:
+            name = rng.choice(sorted(facts))
+            spoilt = spoil(rng, facts[name].encode(), rng.randrange(1, 20))
+            facts[name] = spoilt.decode(errors="replace")
+        names = {name: name for name in whole.topics}
+        if rng.random() < 0.2:
+            names[rng.choice(sorted(names))] = rng.choice(("/x", "/vue_1", "/a/b/c", "/rsu/odd"))
+        with BagWriter(bag, metadata=facts) as copy:
+            for entry in whole.messages():
+                cdr, time_ns = entry.cdr, entry.log_time_ns
+                if rng.random() < share:
+                    cdr = spoil(rng, cdr, rng.randrange(4)).ljust(4, b"\0")
+                if odd_times and rng.random() < share:
+                    time_ns = rng.choice((0, 1, time_ns // 2, 2**62, 2**63 - 1))
+                copy.write_raw(names[entry.topic], entry.type_name, cdr, time_ns)
+    return bag
+
+
+def one_content(source: Path, seed: int) -> str:
+    """What became of one bag with other content, with the command of its seed."""
+    rng, command = random.Random(seed), CONTENT_COMMANDS[seed % len(CONTENT_COMMANDS)]
+    folder = Path(tempfile.mkdtemp(prefix="netpos_fuzz_"))
+    try:
+        bag = rewritten(source, folder, rng)
+        return f"{command}: {_outcome(command, source, bag, folder, content(bag))}"
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def one_bag(source: Path, original: Any, seed: int) -> str:
     """What became of one damaged bag with the command of its seed."""
     rng, command = random.Random(seed), COMMANDS[seed % len(COMMANDS)]
     folder = Path(tempfile.mkdtemp(prefix="netpos_fuzz_"))
     try:
         bag = damaged(source, folder, rng)
-        if command in ("read", "recover"):
-            try:
-                if command == "read":
-                    compare(bag, original)
-                else:
-                    compare(recover(bag).output or bag, original)
-            except BagError:
-                return f"{command}: refused"
-            return f"{command}: done"
-        return f"{command}: {_command(command, source, bag, folder, original)}"
+        return f"{command}: {_outcome(command, source, bag, folder, original)}"
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _outcome(command: str, source: Path, bag: Path, folder: Path, original: Any) -> str:
+    if command not in ("read", "recover"):
+        return _command(command, source, bag, folder, original)
+    try:
+        compare(bag if command == "read" else recover(bag).output or bag, original)
+    except BagError:
+        return "refused"
+    return "done"
 
 
 def _command(command: str, source: Path, bag: Path, folder: Path, original: Any) -> str:
@@ -221,7 +297,11 @@ def _command(command: str, source: Path, bag: Path, folder: Path, original: Any)
             "time=header.stamp,rsu=rsu_id,azimuth=azimuth,toa=toa",
             *("--sd", "azimuth=0.03,toa=5e-8"),
         ],
+        "load": ["rsus", "load", str(bag / "rsus.yaml"), str(bag), out],
+        "truth": ["evaluate", str(source), "--truth", str(bag)],
     }[command]
+    if command == "load":
+        (bag / "rsus.yaml").write_text("rsus: {rsu_1: [0, 0, 0], rsu_2: [9, 0, 0]}\n")
     done = CliRunner().invoke(app, arguments)
     if done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception
@@ -284,8 +364,13 @@ def campaign(
     """Counts of what became of all, and what failed, by seed."""
     counts, failed = Counter[str](), []
     for seed in seeds:
+        if _stopped:
+            break
+        begin_s = time.monotonic()
         try:
             told = run(seed)
+            if time.monotonic() - begin_s > SLOW_S:
+                raise FuzzError(f"took {time.monotonic() - begin_s:.0f} s")
             counts.update(told if isinstance(told, Counter) else [told])
         except Exception as error:
             counts["FAILED"] += 1
@@ -295,10 +380,11 @@ def campaign(
     return counts, failed
 
 
-def example(folder: Path) -> Path:
+def example(folder: Path, scenario: str = "fast_pass") -> Path:
     """A tracked run, in chunks of 50 messages."""
-    run, tracked, bag = folder / "run", folder / "tracked", folder / "example"
-    netpos.simulate(netpos.load_scenario("fast_pass", seed=1), run)
+    run, tracked = folder / f"{scenario}_run", folder / f"{scenario}_tracked"
+    bag = folder / scenario
+    netpos.simulate(netpos.load_scenario(scenario, seed=1), run)
     netpos.track(run, tracked)
     with BagReader(tracked) as source, BagWriter(bag, metadata=source.metadata) as copy:
         for name, info in source.topics.items():
@@ -311,18 +397,28 @@ def example(folder: Path) -> Path:
 
 
 def fuzz(
-    messages: int, bags: int, yaml: int, seed: int, bag: Path
+    counts: dict[str, int], seed: int, bags: list[Path]
 ) -> tuple[dict[str, Counter], list[str]]:
-    """All campaigns, with damaged copies of ``bag``: counts by name, failures."""
-    source, original = recorded(bag), content(bag)
+    """Campaigns by name, so many items each, with damaged copies of the first of ``bags`` and with
+    messages of all: counts by name, failures."""
+    sources = [(recorded(path), path) for path in bags]
+    original, bag = content(bags[0]), bags[0]
+    messages = counts.get("messages", 0)
+
+    def batch(s: int) -> Counter:
+        return message_batch(*sources[s % len(sources)], s, min(BATCH, messages))
+
+    runs: dict[str, Callable[[int], Counter | str]] = {
+        "yaml": one_yaml,
+        "bags": lambda s: one_bag(bag, original, s),
+        "contents": lambda s: one_content(bag, s),
+        "messages": batch,
+    }
     found, failures = {}, []
-    batches = range(seed, seed + -(-messages // BATCH))
-    for name, seeds, run in (
-        ("messages", batches, lambda s: message_batch(source, bag, s, min(BATCH, messages))),
-        ("bags", range(seed, seed + bags), lambda s: one_bag(bag, original, s)),
-        ("yaml", range(seed, seed + yaml), one_yaml),
-    ):
-        found[name], failed = campaign(name, seeds, run)
+    for name, run in runs.items():
+        count = counts.get(name, 0)
+        items = -(-count // BATCH) if name == "messages" else count
+        found[name], failed = campaign(name, range(seed, seed + items), run)
         failures += failed
     return found, failures
 
@@ -330,13 +426,15 @@ def fuzz(
 def main() -> None:
     """Run the campaigns that were asked for."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    for name, default in (("messages", 10_000), ("bags", 100), ("yaml", 100), ("seed", 1)):
+    defaults = {"messages": 10_000, "bags": 100, "contents": 100, "yaml": 100}
+    for name, default in (*defaults.items(), ("seed", 1)):
         parser.add_argument(f"--{name}", type=int, default=default)
-    wanted = parser.parse_args()
+    wanted = vars(parser.parse_args())
     warnings.simplefilter("ignore")
+    signal.signal(signal.SIGINT, lambda number, _: _stopped.append(number))
     with tempfile.TemporaryDirectory(prefix="netpos_fuzz_") as folder:
-        bag = example(Path(folder))
-        found, failures = fuzz(wanted.messages, wanted.bags, wanted.yaml, wanted.seed, bag)
+        bags = [example(Path(folder), name) for name in SCENARIOS]
+        found, failures = fuzz({name: wanted[name] for name in defaults}, wanted["seed"], bags)
     print("| campaign | what became of it | count |\n| --- | --- | --- |")
     for name, counts in found.items():
         for what, count in sorted(counts.items()):

@@ -28,13 +28,17 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return fuzz.example(tmp_path_factory.mktemp("fuzz"))
 
 
-def test_small_campaign(bag: Path) -> None:
-    found, failures = fuzz.fuzz(4000, 48, 60, 500, bag)
+def test_small_campaign(bag: Path, tmp_path: Path) -> None:
+    walk = fuzz.example(tmp_path, "pedestrian_walk")
+    counts = {"messages": 4000, "bags": 48, "contents": 50, "yaml": 60}
+    found, failures = fuzz.fuzz(counts, 500, [bag, walk])
     assert not failures
     assert found["messages"].total() == 4000
     assert min(found["messages"][kind] for kind in ("bytes refused", "refused", "taken")) > 100
     assert found["bags"].total() == 48
     assert {what.partition(":")[0] for what in found["bags"]} == set(fuzz.COMMANDS)
+    assert found["contents"].total() == 50
+    assert {what.partition(":")[0] for what in found["contents"]} == set(fuzz.CONTENT_COMMANDS)
     assert found["yaml"].total() == 60
 
 
@@ -42,6 +46,12 @@ def test_small_campaign(bag: Path) -> None:
 def test_bags_that_once_failed(bag: Path, seed: int) -> None:
     """15: import of a bag with a damaged chunk."""
     assert fuzz.one_bag(bag, fuzz.content(bag), seed).endswith((": refused", ": done"))
+
+
+@pytest.mark.parametrize("seed", [118])
+def test_contents_that_once_failed(bag: Path, seed: int) -> None:
+    """118: rsus load with a nanosec of more than a second."""
+    assert fuzz.one_content(bag, seed).endswith((": refused", ": done"))
 
 
 @pytest.mark.parametrize("seed", [174, 278])

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from graph import LATCHED, Collector, Graph, Process, wait_until
 from nav_msgs.msg import Odometry
 from netpos.messages.fields import stamp_ns
+from netpos.messages.policy import ENCLAVES, allows
 from netpos_msgs.msg import Beacon, ClockState, RsuInfo, RsuMeasurement, TrackStatus
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
@@ -44,6 +46,8 @@ TOPICS: dict[str, tuple[type[Any], str]] = {
     "/tf": (TFMessage, "ekf_tracker"),
 }
 
+NODES = ("vue_sim", "rsu_sensor", "ekf_tracker")
+
 
 @dataclass
 class Run:
@@ -54,9 +58,21 @@ class Run:
     heard: dict[str, Collector]
     offered: dict[str, list[Any]] = field(default_factory=dict)
     clock: list[tuple[float, int]] = field(default_factory=list)  # (wall s, stamp ns)
+    used: dict[str, tuple[set[str], set[str], set[str]]] = field(default_factory=dict)
+    """By node: topics published, topics heard, services."""
 
     def messages(self, topic: str) -> list[Any]:
         return list(self.heard[topic].messages)
+
+
+def _used(graph: Graph, node: str) -> tuple[set[str], set[str], set[str]]:
+    asked = (
+        graph.node.get_publisher_names_and_types_by_node,
+        graph.node.get_subscriber_names_and_types_by_node,
+        graph.node.get_service_names_and_types_by_node,
+    )
+    published, heard, served = ({name for name, _ in ask(node, "/")} for ask in asked)
+    return published, heard, served
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +102,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
             "vue_sim", "vue_sim", parameters=scenario | {"rate": RATE, "subscribers": 2}
         )
         heard["/vue_1/odometry"].wait_for(1, 90.0)
+        made.used = {node: _used(graph, node) for node in NODES}
         made.offered = {t: graph.node.get_publishers_info_by_topic(t) for t in TOPICS}
         assert simulator.wait() == 0, simulator.describe()
         last = len(made.messages("/vue_1/beacon"))
@@ -104,6 +121,17 @@ def test_topic_type_and_publisher(run: Run, topic: str) -> None:
     latched = offer.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
     assert latched is (topic in ("/rsu/info", "/vue_1/initialpose"))
     assert run.heard[topic].messages
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_the_security_policy_permits_what_a_node_does(run: Run, node: str) -> None:
+    (rights,) = [r for r in ENCLAVES.values() if fnmatchcase(node, r.node)]
+    published, heard, served = run.used[node]
+    assert len(published) > 2
+    assert served
+    assert [name for name in published if not allows(rights.published, name)] == []
+    assert [name for name in heard if not allows(rights.subscribed, name)] == []
+    assert [name for name in served if not allows(rights.replied, name)] == []
 
 
 def test_a_late_listener_learns_every_rsu(run: Run) -> None:

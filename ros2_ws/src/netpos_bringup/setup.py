@@ -11,6 +11,7 @@ setup(
         ("share/netpos_bringup", ["package.xml"]),
         ("share/netpos_bringup/launch", sorted(glob("launch/*.launch.py"))),
         ("share/netpos_bringup/scenarios", sorted(glob("scenarios/*.yaml"))),
+        ("share/netpos_bringup/sros2", ["sros2/policy.xml"]),
         ("share/netpos_bringup/rviz", ["rviz/netpos.rviz"]),
         ("share/netpos_bringup/foxglove", ["foxglove/netpos.json"]),
     ],
@@ -22,6 +23,7 @@ setup(
         "console_scripts": [
             "bench_probe = netpos_bringup.bench_probe:main",
             "bench_relay = netpos_bringup.bench_relay:main",
+            "faults = netpos_bringup.faults:main",
             "live = netpos_bringup.live:main",
             "viz = netpos_bringup.viz:main",
         ],

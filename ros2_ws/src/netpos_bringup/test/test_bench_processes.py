@@ -15,7 +15,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages.values import Field, RsuMeasurement
-from netpos_bringup import bench_probe
+from netpos_bringup.bench_common import stamp_of
 from netpos_bringup.bench_process import Measured
 from netpos_bringup.bench_relay import MEASUREMENTS, ODOMETRY, RelayNode
 from netpos_bringup.bench_traffic import RSUS, START_NS, Device
@@ -75,18 +75,18 @@ def test_pose_is_where_the_device_is() -> None:
     msg = deserialize_message(device.pose(4), PoseWithCovarianceStamped)
     position = msg.pose.pose.position
     assert (position.x, position.y) == device.position(0.4)
-    assert bench_probe.stamp_of(device.pose(4)) == START_NS + 400_000_000
+    assert stamp_of(device.pose(4)) == START_NS + 400_000_000
 
 
 def test_stamp_is_read_from_the_bytes() -> None:
     msg = Odometry()
     msg.header.stamp.sec, msg.header.stamp.nanosec = 12, 345_678_901
-    assert bench_probe.stamp_of(serialize_message(msg)) == 12_345_678_901
+    assert stamp_of(serialize_message(msg)) == 12_345_678_901
 
 
 def test_offsets_shift_the_stamps() -> None:
     first, second = Device.draw("vue_1", 1).measurements(2, (-1, 0))
-    assert bench_probe.stamp_of(second) - bench_probe.stamp_of(first) == 1
+    assert stamp_of(second) - stamp_of(first) == 1
 
 
 def test_relay_answers_with_the_stamp(context: Context) -> None:

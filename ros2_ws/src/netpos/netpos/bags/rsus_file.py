@@ -16,6 +16,7 @@ from netpos.bags.reader import BagReader
 from netpos.bags.types import codec
 from netpos.bags.writer import whole_bag
 from netpos.common.files import write_text
+from netpos.messages.fields import bad_stamp, malformed_nanosec
 from netpos.messages.topics import RSU_INFO, RSU_LEARNED, is_tracker_output
 from netpos.messages.values import RsuErrors, RsuInfo
 
@@ -106,6 +107,12 @@ def load_rsus(file: Path, bag: Path, out: Path) -> list[str]:
             for entry in source.messages([t for t in source.topics if not is_tracker_output(t)]):
                 if entry.topic == RSU_INFO and entry.message.rsu_id in wanted:
                     old = make.rsu_info_from_msg(entry.message)
+                    nanosec = malformed_nanosec(old.stamp_ns)
+                    if nanosec is not None:
+                        raise BagError(
+                            f"{bag}: RsuInfo of {old.rsu_id}: {bad_stamp(nanosec)}; its time "
+                            "cannot be kept"
+                        )
                     new = replace(wanted[old.rsu_id], stamp_ns=old.stamp_ns, network=old.network)
                     copy.write(RSU_INFO, make.rsu_info_to_msg(new), entry.log_time_ns)
                 else:

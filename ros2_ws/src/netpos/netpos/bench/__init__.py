@@ -7,6 +7,7 @@
 ``memory``      the tracker's core over an hour
 ``routes``      Monte Carlo over METIS routes
 ``live``        the running node: latency, load, start
+``soak``        a simulated day of the core, an hour of the running node; only where asked for
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any
 from netpos.bench.common import LeftOut, Result, Row, Unavailable, as_json
 
 __all__ = [
+    "ONLY_ASKED",
     "PARTS",
     "LeftOut",
     "Result",
@@ -41,11 +43,15 @@ PARTS = {
     "ready": ("live", "ready_rows"),
     "latency": ("live", "latency_rows"),
     "load": ("live", "load_rows"),
+    "soak": ("soak", "soak_rows"),
+    "live_soak": ("soak", "live_soak_rows"),
 }
+ONLY_ASKED = ("soak", "live_soak")
+"""Parts that take minutes or an hour."""
 
 
 def chosen(names: Iterable[str]) -> list[str]:
-    """The parts named, in the order of the benchmark; all where none is named.
+    """The parts named, in the order of the benchmark; where none is named all but the long ones.
 
     Raises ``ValueError`` for a name that is no part.
     """
@@ -53,7 +59,7 @@ def chosen(names: Iterable[str]) -> list[str]:
     unknown = [name for name in names if name not in PARTS]
     if unknown:
         raise ValueError(f"no part {unknown[0]!r} to measure; the parts are {', '.join(PARTS)}")
-    return [name for name in PARTS if name in names or not names]
+    return [name for name in PARTS if (name in names if names else name not in ONLY_ASKED)]
 
 
 def bench(parts: Iterable[str], quick: bool = False) -> Iterator[tuple[str, list[Result]]]:

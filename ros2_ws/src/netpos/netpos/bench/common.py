@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -16,7 +16,7 @@ class Row:
     """One ratio of what was measured to a reference measured beside it (or to a stated limit).
 
     ``ours`` and ``reference_value`` are in ``unit``; ``ratio`` is how ``relation`` to ``target``
-    is read.
+    is read. ``series``: values over time behind it, by name.
     """
 
     name: str
@@ -28,6 +28,7 @@ class Row:
     relation: Literal[">=", "<="]
     target: float
     note: str = ""
+    series: Mapping[str, Sequence[float]] | None = None
 
     @property
     def ok(self) -> bool:
@@ -128,6 +129,13 @@ def as_json(results: Iterable[Result], surroundings: Mapping[str, Any]) -> dict[
     results = list(results)
     return {
         "surroundings": dict(surroundings),
-        "rows": [{**asdict(row), "ok": row.ok} for row in results if isinstance(row, Row)],
+        "rows": [_plain(row) for row in results if isinstance(row, Row)],
         "left_out": [asdict(row) for row in results if isinstance(row, LeftOut)],
     }
+
+
+def _plain(row: Row) -> dict[str, Any]:
+    values = {**asdict(row), "ok": row.ok}
+    if row.series is None:
+        del values["series"]
+    return values

@@ -49,7 +49,7 @@ def surroundings() -> dict[str, str]:
     }
 
 
-def probe(*arguments: str) -> dict[str, Any]:
+def probe(*arguments: str, timeout_s: float | None = None) -> dict[str, Any]:
     """Figures of one run of the probe, which starts and ends the nodes itself.
 
     Raises ``Unavailable`` with its last words where it fails.
@@ -66,11 +66,13 @@ def probe(*arguments: str) -> dict[str, Any]:
         start_new_session=True,
     ) as process:
         try:
-            out, error = process.communicate(timeout=_TIMEOUT_S)
+            out, error = process.communicate(timeout=timeout_s or _TIMEOUT_S)
         except BaseException as reason:
             _end(process)
             if isinstance(reason, subprocess.TimeoutExpired):
-                raise Unavailable(f"the probe did not end within {_TIMEOUT_S:g} s.") from None
+                raise Unavailable(
+                    f"the probe did not end within {timeout_s or _TIMEOUT_S:g} s."
+                ) from None
             raise
     if process.returncode:
         words = error.strip().splitlines() or [f"exit code {process.returncode}"]

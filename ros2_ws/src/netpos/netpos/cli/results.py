@@ -332,7 +332,8 @@ def bench(
         Path | None, typer.Option("--json", metavar="FILE", help="Write the ratios as JSON.")
     ] = None,
 ) -> None:
-    """Measure speed as ratios, side by side in one run."""
+    """Measure speed as ratios, side by side in one run. Two parts are measured only where they are
+    asked for: --only soak, a simulated day, and --only live_soak, an hour."""
     from rich.console import Console  # noqa: PLC0415
 
     from netpos.bench import as_json, chosen, surroundings  # noqa: PLC0415

@@ -282,7 +282,9 @@ class TrackerConfig:
         " the first pose of each RSU stands) | any (anybody's newest)",
     )
     max_rate_hz: int = count(
-        500, "measurements of one device by one RSU in a second of their stamps; more are refused"
+        500,
+        "measurements of one device by one RSU in a second of their stamps; more are refused, and"
+        " stamps closer together than half of its inverse",
     )
     max_rsu_rate_hz: int = count(
         5000, "measurements by one RSU in a second of their stamps; more are refused"

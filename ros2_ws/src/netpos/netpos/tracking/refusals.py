@@ -42,6 +42,8 @@ _SENTENCES = {
     "future_stamp": "its stamp is {ahead:.3g} s ahead of all others",
     "clock_ahead": "its stamp is {ahead:.3g} s ahead of those of the other RSUs; set its clock",
     "duplicate": "another one with the same stamp came before it",
+    "conflict": "two of the same stamp differ, neither is used; does somebody else send in its"
+    " name?",
     "initialpose_off": "initial poses are refused; set accept_initialpose to true",
     "disabled": "the tracker is disabled; call its service enable with data: true",
     "not_finite": "a value is not finite, or beyond 1e9",
@@ -49,8 +51,8 @@ _SENTENCES = {
 }
 
 _RATE_SENTENCE = (
-    f"{RATE}: more in a second of its stamps than max_rate_hz or max_rsu_rate_hz allow; stop its "
-    "sender, or raise them"
+    f"{RATE}: more in a second of its stamps, or closer together, than max_rate_hz or "
+    "max_rsu_rate_hz allow; stop its sender, or raise them"
 )
 
 

@@ -15,6 +15,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from netpos.messages.values import GroundSpeed, InitialPose, RsuMeasurement, Velocity
 from netpos.tracking.clocks import Clocks, Verdict
 
@@ -37,6 +39,20 @@ _FORGETS = 8  # stamps after which an RSU that is no longer late is taken to be 
 _SET_BACK_AFTER = 10  # stamps in a row from before the history: the device's time was set back
 
 
+_VALUES = tuple(
+    name
+    for name in RsuMeasurement.__slots__
+    if name not in ("sequence", "expected", "line_of_sight", "rssi_dbm")
+)
+
+
+def says_the_same(one: Item, other: Item) -> bool:
+    """Whether an RSU measured the same in both; of other items only one can be of a stamp."""
+    return not (isinstance(one, RsuMeasurement) and isinstance(other, RsuMeasurement)) or all(
+        np.array_equal(getattr(one, name), getattr(other, name)) for name in _VALUES
+    )
+
+
 def channel_and_source(item: Item) -> tuple[str, str]:
     """Channel an item arrived on and who sent it; their order is the order of application within
     an epoch."""
@@ -50,16 +66,22 @@ def channel_and_source(item: Item) -> tuple[str, str]:
 
 @dataclass(slots=True)
 class Epoch:
-    """All items of one stamp, ordered by channel and source."""
+    """All items of one stamp, ordered by channel and source. ``withdrawn``: of whom two items
+    contradicted each other; neither is among the items."""
 
     stamp_ns: int
     items: dict[tuple[str, str], Item] = field(default_factory=dict)
+    withdrawn: frozenset[tuple[str, str]] = frozenset()
     _measured: int = 0
     _expected: int = 0
     _poses: int = 0
 
     def put(self, key: tuple[str, str], item: Item) -> None:
-        """Take an item under its channel and source."""
+        """Take an item under its channel and source; a second one of an RSU withdraws both."""
+        if key[0] == RSU and (key in self.items or key in self.withdrawn):
+            self.items.pop(key, None)
+            self.withdrawn |= {key}
+            return
         self.items[key] = item
         if key[0] == RSU:
             self._measured += 1
@@ -175,8 +197,9 @@ class Sequencer:
 
     def add(self, item: Item) -> str | None:
         """Take an item; returns the reason when it is refused (``late``, ``future_stamp``,
-        ``clock_ahead`` or ``duplicate``). One that waits for a second voice may be refused later
-        (``take_refused``)."""
+        ``clock_ahead``, ``duplicate`` or ``conflict``). One that waits for a second voice may be
+        refused later (``take_refused``), and so is one that another of its RSU and stamp
+        contradicts."""
         self.idle = False
         if isinstance(item, InitialPose):
             late = item.stamp_ns <= self._released_ns
@@ -202,11 +225,15 @@ class Sequencer:
         if in_past and stamp < self._released_ns:
             return "late"
         epoch = self._pending.get(stamp)
-        if self._last_of.get(key) == stamp or (epoch is not None and key in epoch.items):
+        if self._last_of.get(key) == stamp:
             return "duplicate"
         if epoch is None:
             epoch = self._pending[stamp] = Epoch(stamp)
-        epoch.put(key, item)
+        fault, withdraws = self._second(epoch, key, item, [])
+        if fault is None or withdraws:
+            epoch.put(key, item)
+        if fault is not None:
+            return fault
         self.mark(key[0], stamp)
         alone = len(self._pending) == 1 and stamp == self.newest_ns and self._max_delay_ns > 0
         complete = epoch.rsu_complete(self._delays.count)
@@ -272,14 +299,34 @@ class Sequencer:
 
     def _add_late(self, stamp: int, key: tuple[str, str], item: Item) -> str | None:
         epoch = self._applied.get(stamp)
-        waiting = any((stamp, key) == (s, channel_and_source(i)) for s, i in self._late)
-        if waiting or (epoch is not None and key in epoch.items):
-            return "duplicate"
-        self._late.append((stamp, item))
+        waiting = [i for s, i in self._late if (s, channel_and_source(i)) == (stamp, key)]
+        fault, withdraws = self._second(epoch, key, item, waiting)
+        if fault is None or withdraws:
+            self._late.append((stamp, item))
+        if fault is not None:
+            return fault
         if key[0] == RSU and epoch is not None and epoch.rsu_complete():
             more = sum(s == stamp for s, _ in self._late)
             self._delays.announced_too_few(epoch.measured + more)
         return None
+
+    def _second(
+        self, epoch: Epoch | None, key: tuple[str, str], item: Item, waiting: list[Item]
+    ) -> tuple[str | None, bool]:
+        """What is wrong with an item of a stamp and source of which another is there or waits for
+        its epoch, and whether it withdraws that one."""
+        if epoch is not None and key in epoch.withdrawn:
+            return "conflict", False
+        known = [epoch.items[key]] if epoch is not None and key in epoch.items else []
+        known += waiting
+        if not known:
+            return None, False
+        if any(says_the_same(item, other) for other in known):
+            return "duplicate", False
+        if len(known) > 1:
+            return "conflict", False
+        self._refused.append((known[0], "conflict"))
+        return "conflict", True
 
     def release(self) -> list[Epoch]:
         """Epochs that may be applied now, in stamp order."""

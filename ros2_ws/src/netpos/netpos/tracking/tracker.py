@@ -138,6 +138,8 @@ class Tracker:
                 self._refuse(refused, why)
             if reason is None and self.refusals.any:
                 self.refusals.take(item)
+            if reason is None and isinstance(item, RsuMeasurement):
+                self._rate.took(*source)
             if sequencer.set_back:
                 self.reset(item.vue_id)
             elif sequencer.idle:
@@ -231,6 +233,7 @@ class Tracker:
             if self._shared is not None:
                 self._shared.clear()
         for name in [vue_id] if vue_id is not None else list(self._tracks):
+            self._rate.forget(name)
             dropped = self._sequencers.pop(name, None)
             if dropped is not None and dropped.set_back:
                 self._clocks[name] = dropped.clocks

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from netpos import bench as package
-from netpos.bench import PARTS, as_json, bench, chosen
+from netpos.bench import ONLY_ASKED, PARTS, as_json, bench, chosen
 from netpos.bench.common import (
     LeftOut,
     Row,
@@ -85,7 +85,8 @@ def test_seconds_are_per_operation(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_parts_keep_their_order_and_unknown_ones_are_named() -> None:
-    assert chosen([]) == list(PARTS)
+    assert chosen([]) == [name for name in PARTS if name not in ONLY_ASKED]
+    assert chosen(["soak"]) == ["soak"]
     assert chosen(["load", "ekf"]) == ["ekf", "load"]
     with pytest.raises(ValueError, match=r"'speed'.*ekf, srukf"):
         chosen(["speed"])

@@ -12,10 +12,19 @@ from netpos.evaluation.faults import FAULTS, Entry, Outcome, Plan, campaign, loa
 from netpos.evaluation.faults.campaign import strike, undisturbed
 from netpos.evaluation.faults.geometry import measured_from
 from netpos.evaluation.faults.page import HEADS, markdown, worst_first
-from netpos.evaluation.faults.stream import NS, Arrival, Hit
+from netpos.evaluation.faults.piecewise import Piecewise, possible_live
+from netpos.evaluation.faults.stream import NS, Arrival, Hit, in_order
 from netpos.evaluation.pairing import Trajectory
 from netpos.evaluation.work import Work
-from netpos.messages.values import AngleConvention, Field, Odometry, RsuInfo, RsuMeasurement
+from netpos.messages.values import (
+    AngleConvention,
+    Field,
+    ImuSample,
+    Odometry,
+    RsuInfo,
+    RsuMeasurement,
+    Velocity,
+)
 from typer.testing import CliRunner
 
 C = 299_792_458.0
@@ -79,6 +88,31 @@ def test_a_fault_touches_its_rsus_and_its_time_only(name: str) -> None:
         assert all(id(a.what) in left for a in others)
     assert all(id(a.what) in left for a in before if not 4 * NS <= a.at_ns < 6 * NS)
     assert [a.at_ns for a in struck] == sorted(a.at_ns for a in struck)
+
+
+def device_stream() -> list[Arrival]:
+    """With IMU samples, step velocities and a description between the measurements."""
+    found = stream()
+    for k in range(1, 101):
+        stamp, value = k * NS // 10 + 1, np.array([1.0, 0.1 * k, 0.0])
+        imu = ImuSample(
+            stamp_ns=stamp, vue_id="vue_1", angular_velocity=value, specific_force=value
+        )
+        step = Velocity(stamp_ns=stamp, vue_id="vue_1", velocity=value[:2], cov=np.eye(2))
+        found += [Arrival(stamp, imu), Arrival(stamp, step)]
+    return in_order([Arrival(5 * NS, SCENE["a"]), *found])
+
+
+@pytest.mark.parametrize("name", sorted(possible_live()))
+def test_piece_by_piece_a_fault_does_the_same(name: str) -> None:
+    size = 40.0 if name in {"invented_devices", "flood"} else 0.5
+    whole = FAULTS[name].apply(device_stream(), hit(size, ("a", "b")))
+    live = Piecewise(FAULTS[name], hit(size, ("a", "b")))
+    pieces = live.own() + [found for a in device_stream() for found in live.of(a)]
+    assert sorted((a.at_ns, repr(a.what)) for a in pieces) == sorted(
+        (a.at_ns, repr(a.what)) for a in whole
+    )
+    assert len(pieces) != 401 or name not in {"drop", "silence", "replayed", "invented_rsus"}
 
 
 def test_the_same_seed_strikes_the_same_messages() -> None:

@@ -287,10 +287,11 @@ def test_late_before_the_first_epoch(world: Any) -> None:
 def test_older_than_the_history_is_refused_and_counted(world: Any, history_s: float) -> None:
     batches = epochs(world, 30)
     tracker = ran(world, batches, history_s=history_s)
+    tracker.add_rsu(replace(world.rsus["a"], rsu_id="z"))  # whose other stamps are not near
     newest = batches[-1][0].stamp_ns
     before = state(tracker)
     at_the_edge = newest - round(history_s * 1e9)
-    item = replace(batches[-1][0], rsu_id="a", fields=Field.RANGE, stamp_ns=at_the_edge - 1)
+    item = replace(batches[-1][0], rsu_id="z", fields=Field.RANGE, stamp_ns=at_the_edge - 1)
     assert tracker.add(item) == "late"
     assert tracker.process() == []
     assert state(tracker) == before
@@ -313,6 +314,26 @@ def test_duplicates_among_late_items(world: Any) -> None:
     assert tracker.process() == []
     assert tracker.rejected()["vue_1"] == {"duplicate": 3}
     assert state(tracker) == state(ran(world, epochs(world, 10)))
+
+
+@pytest.mark.parametrize("merged", [False, True])
+def test_a_measurement_that_another_contradicts_is_taken_back(world: Any, merged: bool) -> None:
+    """The track is then that of a run without either of them."""
+    batches = epochs(world, 10)
+    lie = replace(batches[4][1], azimuth_rad=batches[4][1].azimuth_rad + 0.1)
+    late = batches[4].pop(1)
+    tracker = ran(world, batches)
+    assert tracker.add(late) is None
+    if merged:
+        tracker.process()
+    assert tracker.add(lie) == "conflict"
+    tracker.process()
+    assert tracker.add(late) == "conflict"
+    assert tracker.process() == []
+    assert tracker.rejected()["vue_1"] == {"conflict": 3}
+    words = tracker.refusals.rsus()[late.rsu_id].words()
+    assert "neither is used" in words
+    assert state(tracker) == state(ran(world, batches))
 
 
 def test_without_history_nothing_goes_back(world: Any) -> None:

@@ -22,13 +22,37 @@ def sent(limit: RateLimit, stamps: list[int], vue_id: str = "v") -> list[bool]:
         within.append(not limit.exceeded("a", vue_id, stamp))
         if within[-1]:
             limit.count("a", vue_id, stamp)
+            limit.took("a", vue_id, stamp)
     return within
 
 
 def test_the_limit_is_met_exactly_and_ends_with_its_second() -> None:
     limit = RateLimit(3, 100)
-    assert sent(limit, [NS + k for k in range(5)]) == [True, True, True, False, False]
+    assert sent(limit, [NS] * 5) == [True, True, True, False, False]
     assert sent(limit, [2 * NS - 1, 2 * NS]) == [False, True]
+
+
+def test_stamps_closer_than_half_a_period_are_one_too_many() -> None:
+    """Of 10 Hz: 50 ms; the same stamp is another pair of the same instant."""
+    limit, half = RateLimit(10, 1000), NS // 20
+    stamps = [NS, NS + 1, NS - 1, NS + half - 1, NS + half, NS - half, NS - half + 1, NS]
+    assert sent(limit, stamps) == [True, False, False, False, True, True, False, True]
+
+
+def test_what_is_refused_for_another_reason_keeps_nobody_away() -> None:
+    limit = RateLimit(10, 1000)
+    limit.count("a", "v", NS)
+    assert not limit.exceeded("a", "v", NS + 1)
+
+
+def test_a_device_that_starts_anew_is_not_held_to_its_old_stamps() -> None:
+    limit = RateLimit(10, 1000)
+    limit.took("a", "v", NS)
+    limit.took("a", "w", NS)
+    assert limit.exceeded("a", "v", NS + 1)
+    limit.forget("v")
+    assert not limit.exceeded("a", "v", NS + 1)
+    assert limit.exceeded("a", "w", NS + 1)
 
 
 def test_all_devices_together_have_a_limit_too() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from netpos.messages.values import GroundSpeed, InitialPose, RsuMeasurement, Velocity
+from netpos.messages.values import Field, GroundSpeed, InitialPose, RsuMeasurement, Velocity
 from netpos.tracking.sequencer import IMU, Epoch, Item, Sequencer, channel_and_source
 
 MS = 1_000_000
@@ -221,6 +221,38 @@ def test_duplicates_are_refused_before_and_after_release() -> None:
     assert s.add(rsu(100, "c", 2)) is None
     assert s.add(rsu(100, "c", 2)) == "duplicate"
     assert len(s.flush()[0].items) == 1
+
+
+def measured(stamp_ms: int, rsu_id: str, range_m: float, expected: int = 2) -> RsuMeasurement:
+    return replace(rsu(stamp_ms, rsu_id, expected), range_m=range_m, fields=Field.RANGE)
+
+
+def test_two_that_differ_are_both_refused() -> None:
+    """Nobody knows which of them is the RSU's; a third one changes nothing, and nobody waits."""
+    s = Sequencer(HOLD)
+    first = measured(100, "a", 5.0)
+    assert s.add(first) is None
+    assert s.add(replace(first, sequence=7, rssi_dbm=-80.0)) == "duplicate"
+    assert s.add(measured(100, "a", 6.0)) == "conflict"
+    assert s.take_refused() == [(first, "conflict")]
+    assert s.add(measured(100, "a", 5.0)) == "conflict"
+    assert s.take_refused() == []
+    assert s.add(measured(100, "b", 5.0)) is None
+    (epoch,) = s.release()
+    assert [item.rsu_id for item in epoch.items.values()] == ["b"]  # type: ignore[union-attr]
+
+
+def test_two_late_ones_that_differ_are_both_refused() -> None:
+    s = Sequencer(HOLD, history_ns=HOLD)
+    s.add(measured(100, "a", 5.0, 1))
+    s.add(measured(200, "a", 5.0, 1))
+    s.release()
+    late = measured(150, "b", 5.0)
+    assert s.add(late) is None
+    assert s.add(measured(150, "b", 6.0)) == "conflict"
+    assert s.take_refused() == [(late, "conflict")]
+    assert s.add(measured(150, "b", 7.0)) == "conflict"
+    assert [item.range_m for _, item in s.take_late()] == [5.0, 6.0]  # type: ignore[union-attr]
 
 
 def test_late_is_before_the_last_released_epoch() -> None:

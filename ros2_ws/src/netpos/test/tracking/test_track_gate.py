@@ -225,13 +225,13 @@ def test_a_gap_forgets_the_biases_too(world: Any, feed: Any) -> None:
     assert track._state.estimate.mean.size == 9
 
 
-def test_coasting_after_silence(world: Any, feed: Any) -> None:
+@pytest.mark.parametrize(
+    ("after_s", "state"), [(2.9, TrackState.TRACKING), (2.9 + 1e-9, TrackState.COASTING)]
+)
+def test_coasting_after_silence(world: Any, feed: Any, after_s: float, state: TrackState) -> None:
     tracker = settled(world, feed, coast_after_s=1.0, inflate_after_epochs=10000)
-    elsewhere = standing(80.0, 30.0)
-    (output,) = feed(tracker, world.measure(2.9, elsewhere))
-    assert output.status.state is TrackState.TRACKING
-    (output,) = feed(tracker, world.measure(2.9 + 1e-9, elsewhere))
-    assert output.status.state is TrackState.COASTING
+    (output,) = feed(tracker, world.measure(after_s, standing(80.0, 30.0)))
+    assert output.status.state is state
     assert output.odometry is not None
 
 

@@ -128,7 +128,9 @@ def test_late_and_duplicate_are_counted_in_the_status(
     tracker = world.tracker(history_s=history_s)
     feed(tracker, world.measure(1.0, at(1.0)))
     assert tracker.add(world.measure(1.0, at(1.0))[0]) == "duplicate"
-    assert tracker.add(world.measure(1.0 - history_s - 1e-9, at(1.0))[0]) == "late"
+    tracker.add_rsu(replace(world.rsus["a"], rsu_id="z"))  # whose other stamps are not near
+    late = world.measure(1.0 - history_s - 1e-9, at(1.0))[0]
+    assert tracker.add(replace(late, rsu_id="z")) == "late"
     (output,) = feed(tracker, world.measure(1.1, at(1.1)))
     assert output.status.rejected == {"duplicate": 1, "late": 1}
 

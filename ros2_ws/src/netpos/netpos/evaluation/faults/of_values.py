@@ -28,10 +28,9 @@ def drift(stream: Stream, hit: Hit) -> Stream:
 
 def freeze(stream: Stream, hit: Hit) -> Stream:
     """Stamps go on, values stay those of the first message of each RSU and device."""
-    first: dict[tuple[str, str, str], RsuMeasurement] = {}
 
     def change(m: RsuMeasurement) -> tuple[RsuMeasurement]:
-        old = first.setdefault((m.rsu_id, m.vue_id, m.reference_rsu_id), m)
+        old = hit.memory.setdefault((m.rsu_id, m.vue_id, m.reference_rsu_id), m)
         return (replace(old, stamp_ns=m.stamp_ns, sequence=m.sequence, expected=m.expected),)
 
     return each(stream, hit, change)
@@ -122,12 +121,11 @@ def device_turned(stream: Stream, hit: Hit) -> Stream:
 
 def device_frozen(stream: Stream, hit: Hit) -> Stream:
     """IMU samples and step velocities repeat the first values."""
-    first: dict[type, ImuSample | Velocity] = {}
 
     def change(what: object) -> object:
         if not isinstance(what, ImuSample | Velocity):
             return what
-        old = first.setdefault(type(what), what)
+        old = hit.memory.setdefault((type(what), what.vue_id), what)
         return replace(old, stamp_ns=what.stamp_ns)
 
     return _of_device(stream, hit, change)

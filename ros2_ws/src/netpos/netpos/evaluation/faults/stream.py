@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
@@ -44,7 +45,8 @@ class Hit:
 
     start_ns, end_ns : when, ``end_ns`` not included; rsus : names of the RSUs it concerns;
     size : how strong, in the unit of the fault; rng : draws of this fault alone;
-    scene : descriptions of all RSUs; truth : trajectories by device
+    scene : descriptions of all RSUs; truth : trajectories by device; memory : what a fault keeps
+    from one message to the next
     """
 
     start_ns: int
@@ -54,6 +56,7 @@ class Hit:
     rng: np.random.Generator
     scene: Mapping[str, RsuInfo]
     truth: Mapping[str, Trajectory]
+    memory: dict[Any, Any] = field(default_factory=dict)
 
     def during(self, arrival: Arrival) -> bool:
         """Whether something arrives while the fault lasts."""

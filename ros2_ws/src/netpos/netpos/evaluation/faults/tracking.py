@@ -20,6 +20,7 @@ from netpos.tracking.tracker import Tracker
 _STALE_NS = 3 * NS
 _QUIET_NS = 2 * NS
 NO_MESSAGE = "no message"
+NO_INFO = "RsuInfo"
 _NUMBER = re.compile(r"[-+]?\d[\d.e+-]*")
 
 
@@ -89,7 +90,10 @@ class _Node:
             case Order.CLOCK_BACK:
                 tracker.reset()
             case RsuInfo():
-                tracker.add_rsu(what)
+                try:
+                    tracker.add_rsu(what)
+                except ValueError:
+                    self.answer.refused[NO_INFO] += 1
             case bytes():
                 self._add_bytes(tracker, what, arrival.at_ns)
             case Order.START:
