@@ -19,8 +19,12 @@ class RateLimit:
     """
 
     def __init__(self, of_device: int, of_all: int) -> None:
-        self._of_device, self._of_all = of_device, of_all
+        self.set_limits(of_device, of_all)
         self._counts: dict[tuple[str, str], dict[int, int]] = {}
+
+    def set_limits(self, of_device: int, of_all: int) -> None:
+        """Go on with other limits; what was counted stays."""
+        self._of_device, self._of_all = of_device, of_all
 
     def exceeded(self, rsu_id: str, vue_id: str, stamp_ns: int) -> bool:
         """Whether another measurement with this stamp is one too many."""
