@@ -82,10 +82,14 @@ def launched(launch_file: ModuleType, **chosen: str) -> set[tuple[Any, ...]]:
         (
             *(node[key] for key in ("package", "executable", "name")),
             tuple(node["arguments"]),
-            tuple(sorted((n, str(v)) for p in node["parameters"] for n, v in _items(p))),
+            tuple(sorted((n, _text(v)) for p in node["parameters"] for n, v in _items(p))),
         )
         for node in nodes(launch_file, **chosen)
     }
+
+
+def _text(value: Any) -> str:
+    return f"{value:.6f}" if isinstance(value, float) else str(value)
 
 
 def _items(parameters: Any) -> Iterable[tuple[str, Any]]:

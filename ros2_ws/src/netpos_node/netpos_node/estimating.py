@@ -85,6 +85,7 @@ class EstimatingNode(LifecycleNode):
     def __init__(self, name: str, **node_options: Any) -> None:
         super().__init__(name, **node_options)
         self._fault: Exception | None = None
+        self._starts = False
         self._inputs: list[tuple[Subscription, Callable[[Any], None]]] = []
         self._timers_of_life: list[Timer] = []
         self._offers: list[Publisher | Service] = []
@@ -98,19 +99,27 @@ class EstimatingNode(LifecycleNode):
         if not declare(self, "autostart", True, text):
             self.get_logger().info("waits to be configured")
             return
+        self._starts = True
         for step in (self.trigger_configure, self.trigger_activate):
             if step() is not _DONE and self._fault is not None:
                 raise self._fault
+        self._starts = False
 
     # life
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Make the core, offer topics and services."""
-        return self._done(self._configure)
+        done = self._done(self._configure)
+        if done is _FAILED:
+            self._clean_up()
+        return done
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Listen and estimate."""
-        return self._done(self._activate)
+        done = self._done(self._activate)
+        if done is _FAILED:
+            self._stop_listening()
+        return done
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Give out what follows from all that has arrived, and listen no more."""
@@ -143,7 +152,8 @@ class EstimatingNode(LifecycleNode):
             step()
         except Exception as error:  # rclpy would drop it
             self._fault = error
-            self.get_logger().error(str(error) or repr(error))
+            if not self._starts:  # else it is raised
+                self.get_logger().error(str(error) or repr(error))
             return _FAILED
         return _DONE
 
@@ -155,6 +165,10 @@ class EstimatingNode(LifecycleNode):
 
     def _deactivate(self) -> None:
         self._give_out()
+        self._stop_listening()
+        see_delivered(self)
+
+    def _stop_listening(self) -> None:
         for subscription, _ in self._inputs:
             self.destroy_subscription(subscription)
         self._inputs = []
@@ -167,7 +181,6 @@ class EstimatingNode(LifecycleNode):
         if self._jump_handle is not None:
             self._jump_handle.unregister()
             self._jump_handle = None
-        see_delivered(self)
 
     def _clean_up(self) -> None:
         for vue_id in list(self._outputs):

@@ -43,7 +43,8 @@ class GraphNode:
         if self.params_file:
             ros += ["--params-file", self.params_file]
         for name, value in self.parameters.items():
-            ros += ["-p", f"{name}:={value}"]
+            text = f"{value:.6f}" if isinstance(value, float) else f"{value}"  # 5.0, never 5
+            ros += ["-p", f"{name}:={text}"]
         tail = ["--ros-args", *ros] if ros or self.stage == TRACKERS else []
         return [self.package, self.executable, *self.arguments, *tail]
 
