@@ -109,23 +109,30 @@ graph_abandon() { # the script ends early (Ctrl-C, an error): leave nothing runn
   stop "${!pid_of[@]}" 2>/dev/null
 }
 
-start_trackers() { # SCENARIO_OR_BAG [ARGUMENT...]: one tracker, or one per network and the fusion of their tracks; waits
-  local source=$1 network names
+plan() { # KIND ARGUMENT...: the nodes of a graph, as netpos.scenario.graph describes them
+  nodes=$(python "$NETPOS_ROOT/scripts/graph_plan.py" "$@") || give_up
+}
+
+start_stage() { # STAGE [ARGUMENT...]: start the nodes of this stage of the plan; their names are then in $staged
+  local words stage=$1
   shift
-  names=$(python "$NETPOS_ROOT/scripts/networks.py" "$source") || give_up
-  trackers=()
-  for network in $names; do
-    trackers+=("ekf_tracker_$network")
-    start "ekf_tracker_$network" ekf_tracker ekf_tracker --ros-args -r __node:="ekf_tracker_$network" -p network:="$network" -p scenario:="$source" -p subscribers:=1 "$@"
-  done
-  if [ -n "$names" ]; then
-    start track_fusion track_fusion track_fusion --ros-args -p scenario:="$source" -p subscribers:=1
-    start_up track_fusion
-  else
-    trackers=(ekf_tracker)
-    start ekf_tracker ekf_tracker ekf_tracker --ros-args -p scenario:="$source" -p subscribers:=1 "$@"
-  fi
-  start_up "${trackers[@]}"
+  staged=()
+  while IFS=$'\t' read -r -a words; do
+    [ "${words[0]}" = "$stage" ] || continue
+    start "${words[@]:1}" "$@"
+    staged+=("${words[1]}")
+  done <<<"$nodes"
+}
+
+start_up_stage() { # STAGE [ARGUMENT...]: the same, and wait until they are in the graph
+  start_stage "$@"
+  [ "${#staged[@]}" = 0 ] || start_up "${staged[@]}"
+}
+
+start_trackers() { # [ARGUMENT...]: those of the plan, and the fusion of their tracks; waits
+  start_up_stage fusion
+  start_up_stage trackers "$@"
+  trackers=("${staged[@]}")
 }
 
 stop_trackers() { # first those whose last tracks the fusion waits for

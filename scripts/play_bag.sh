@@ -22,10 +22,10 @@ bag=${positional[0]} out=${positional[1]} rate=${positional[2]:-1}
 . "$NETPOS_ROOT/scripts/graph.sh"
 
 graph_begin "$(basename "$out")"
-start netpos_record netpos_bag record --output "$out" --log-time clock
-start_up netpos_record
-start_trackers "$bag" "$@"
-start netpos_play netpos_bag play "$bag" --rate "$rate" --input-only --subscribers "$((1 + ${#trackers[@]}))" --wait-timeout 60
+plan play "$bag" "$out" "$rate"
+start_up_stage recorder
+start_trackers "$@"
+start_stage source
 await netpos_play || give_up
 sleep 1 # the last messages are under way
 stop_trackers

@@ -20,19 +20,13 @@ scenario=${positional[0]} bag=${positional[1]} rate=${positional[2]:-1} seed=${p
 . "$NETPOS_ROOT/scripts/graph.sh"
 
 graph_begin "$(basename "$bag")"
-start netpos_record netpos_bag record --output "$bag" --log-time clock
-start_up netpos_record # first of all: what is published before a recorder is up is lost
-start_trackers "$scenario" "$@"
-start rsu_sensor rsu_sensor rsu_sensor --ros-args -p scenario:="$scenario" -p seed:="$seed" -p subscribers:="$((1 + ${#trackers[@]}))"
-start_up rsu_sensor
-walkers=$(python "$NETPOS_ROOT/scripts/walkers.py" "$scenario") || give_up
-pdr_nodes=()
-for vue in $walkers; do # who walks is dead-reckoned
-  start "pdr_$vue" pdr_node pdr_node --ros-args -r __node:="pdr_$vue" -p vue:="$vue" -p scenario:="$scenario" -p subscribers:=2
-  pdr_nodes+=("pdr_$vue")
-done
-[ "${#pdr_nodes[@]}" = 0 ] || start_up "${pdr_nodes[@]}"
-start vue_sim vue_sim vue_sim --ros-args -p scenario:="$scenario" -p seed:="$seed" -p rate:="$(LC_ALL=C printf '%.6f' "$rate")" -p subscribers:=2
+plan run "$scenario" "$bag" "$rate" "$seed"
+start_up_stage recorder # first of all: what is published before a recorder is up is lost
+start_trackers "$@"
+start_up_stage rsus
+start_up_stage walkers # who walks is dead-reckoned
+pdr_nodes=("${staged[@]}")
+start_stage source
 tell_progress vue_sim simulated
 await vue_sim || give_up
 sleep 1 # the last messages are under way

@@ -24,12 +24,9 @@ done
 # The tracker joins the domain of the RSUs, not one of its own.
 ROS_DOMAIN_ID=${ROS_DOMAIN_ID:-0} ROS_AUTOMATIC_DISCOVERY_RANGE=${ROS_AUTOMATIC_DISCOVERY_RANGE:-SUBNET}
 graph_begin "tracker_$$"
-if [ -n "$bag" ]; then
-  start netpos_record netpos_bag record --output "$bag"
-  start_up netpos_record
-fi
-start ekf_tracker ekf_tracker ekf_tracker --ros-args ${params:+--params-file "$params"} "$@"
-start_up ekf_tracker
+plan tracker "$params" "$bag"
+start_up_stage recorder
+start_up_stage trackers "$@"
 echo "netpos: tracking in ROS domain $ROS_DOMAIN_ID; Ctrl-C ends; log: $graph_logs/ekf_tracker.log" >&2
 trap 'ended=1' INT TERM HUP
 ended=''

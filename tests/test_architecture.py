@@ -22,7 +22,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "radio": {"messages", "world"},
     "inertial": {"messages", "common", "world", "radio"},
     "estimation": {"messages", "inertial"},
-    "tracking": {"messages", "common", "estimation", "inertial"},
+    "tracking": {"messages", "common", "world", "estimation", "inertial"},
     "bags": {"messages", "common", "world", "inertial"},
     # The sensors say what a simulator sends; a replay sends a recording through the tracker.
     "scenario": {

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -60,10 +61,13 @@ def launch_file(
     return module
 
 
-def nodes(launch_file: ModuleType, scenario: str, bag: str = "") -> Iterator[dict[str, Any]]:
+def nodes(launch_file: ModuleType, **chosen: str) -> Iterator[dict[str, Any]]:
     """What is started, with the launch's arguments in place."""
-    context = {"scenario": scenario, "bag": bag, "params": scenario}
     entities = list(launch_file.generate_launch_description().args[0])
+    context = {
+        e.args[0]: e.values["default_value"] for e in entities if "default_value" in e.values
+    }
+    context |= chosen
     while entities:
         entity = entities.pop(0)
         if isinstance(entity, OpaqueFunction):
@@ -72,14 +76,90 @@ def nodes(launch_file: ModuleType, scenario: str, bag: str = "") -> Iterator[dic
             yield entity.values
 
 
+def launched(launch_file: ModuleType, **chosen: str) -> set[tuple[Any, ...]]:
+    """The same as package, executable, name, arguments and parameters."""
+    return {
+        (
+            *(node[key] for key in ("package", "executable", "name")),
+            tuple(node["arguments"]),
+            tuple(sorted((n, _text(v)) for p in node["parameters"] for n, v in _items(p))),
+        )
+        for node in nodes(launch_file, **chosen)
+    }
+
+
+def _text(value: Any) -> str:
+    return f"{value:.6f}" if isinstance(value, float) else str(value)
+
+
+def _items(parameters: Any) -> Iterable[tuple[str, Any]]:
+    return parameters.items() if isinstance(parameters, dict) else [("--params-file", parameters)]
+
+
+def planned(repository: Path, *arguments: str) -> set[tuple[Any, ...]]:
+    """What the shell scripts start, from the lines that they read."""
+    script = str(repository / "scripts" / "graph_plan.py")
+    lines = subprocess.run(
+        [sys.executable, script, *arguments], capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    return {_parsed(line.split("\t")) for line in lines}
+
+
+def _parsed(words: list[str]) -> tuple[Any, ...]:
+    _, name, package, executable, *rest = words
+    at = rest.index("--ros-args") if "--ros-args" in rest else len(rest)
+    values = []
+    for flag, value in zip(rest[at + 1 :: 2], rest[at + 2 :: 2], strict=True):
+        if flag == "-r":
+            assert value == f"__node:={name}"
+        else:
+            text = value if flag == "-p" else f"{flag}:={value}"
+            values.append(tuple(text.split(":=", 1)))
+    return package, executable, name, tuple(rest[:at]), tuple(sorted(values))
+
+
+@pytest.mark.parametrize("scenario", ["metis_madrid", "two_networks", "pedestrian_walk"])
+def test_the_launch_file_starts_what_the_script_starts(
+    launch_file: ModuleType, repository: Path, scenario: str
+) -> None:
+    """Every process, with every argument and parameter."""
+    by_launch = launched(launch_file, scenario=scenario, bag="a_bag", rate="10", seed="3")
+    assert by_launch == planned(repository, "run", scenario, "a_bag", "10", "3")
+    assert {"vue_sim", "rsu_sensor", "record"} < {executable for _, executable, *_ in by_launch}
+
+
+@pytest.mark.parametrize("launch_file", ["tracker"], indirect=True)
+@pytest.mark.parametrize(("params", "bag"), [("mine.yaml", "a_bag"), ("", "")])
+def test_the_tracker_alone(
+    launch_file: ModuleType, repository: Path, params: str, bag: str
+) -> None:
+    by_launch = launched(launch_file, params=params, bag=bag)
+    assert by_launch == planned(repository, "tracker", params, bag)
+    assert len(by_launch) == 1 + bool(bag)
+
+
+@pytest.mark.parametrize("launch_file", ["tracker"], indirect=True)
+def test_the_tracker_in_a_namespace(launch_file: ModuleType) -> None:
+    started = list(nodes(launch_file, namespace="site_a", bag="a_bag"))
+    assert [node["namespace"] for node in started] == ["site_a", "site_a"]
+
+
+@pytest.mark.parametrize("script", ["run_graph", "play_bag", "run_tracker"])
+def test_no_script_names_a_node_of_its_own(repository: Path, script: str) -> None:
+    """What is started comes from the plan."""
+    text = (repository / "scripts" / f"{script}.sh").read_text()
+    assert re.search(r"^plan ", text, re.MULTILINE)
+    assert not re.search(r"^ *start \S+ \w+ \w+|ros2 run ", text, re.MULTILINE)
+
+
 def test_who_walks_is_dead_reckoned(launch_file: ModuleType) -> None:
-    for name in ("pedestrian_walk", "pedestrian_rectangle"):
-        (reckoning,) = [n for n in nodes(launch_file, name) if n["package"] == "pdr_node"]
+    for bag, subscribers in (("", 1), ("a_bag", 2)):  # the recorder hears steps, too
+        started = nodes(launch_file, scenario="pedestrian_walk", bag=bag)
+        (reckoning,) = [n for n in started if n["package"] == "pdr_node"]
         assert reckoning["name"] == "pdr_vue_1"
-        assert reckoning["parameters"] == [{"scenario": name, "vue": "vue_1", "subscribers": 1}]
-    recorded = list(nodes(launch_file, "pedestrian_walk", "a_bag"))
-    (reckoning,) = [n for n in recorded if n["package"] == "pdr_node"]
-    assert reckoning["parameters"][0]["subscribers"] == 2  # the recorder hears steps, too
+        assert reckoning["parameters"] == [
+            {"scenario": "pedestrian_walk", "vue": "vue_1", "subscribers": subscribers}
+        ]
 
 
 def test_every_walker_of_several_has_a_node(
@@ -88,43 +168,15 @@ def test_every_walker_of_several_has_a_node(
     text = (repository / SHIPPED / "pedestrian_walk.yaml").read_text()
     path = tmp_path / "crowd.yaml"
     path.write_text(text.replace("  - route:", "  - count: 3\n    route:"))
-    started = [n["name"] for n in nodes(launch_file, str(path)) if n["package"] == "pdr_node"]
-    assert started == ["pdr_vue_1", "pdr_vue_2", "pdr_vue_3"]
+    started = nodes(launch_file, scenario=str(path))
+    names = [n["name"] for n in started if n["package"] == "pdr_node"]
+    assert names == ["pdr_vue_1", "pdr_vue_2", "pdr_vue_3"]
 
 
-def test_nobody_else_is(launch_file: ModuleType) -> None:
-    packages = [n["package"] for n in nodes(launch_file, "metis_madrid")]
-    assert sorted(packages) == ["ekf_tracker", "netpos_bag", "rsu_sensor", "vue_sim"]
-
-
-def test_launch_file_and_script_start_the_same_kinds_of_nodes(
-    launch_file: ModuleType, repository: Path
-) -> None:
-    scripts = [
-        (repository / "scripts" / name).read_text() for name in ("run_graph.sh", "graph.sh")
-    ]
-    by_script = set(re.findall(r"^ *start \S+ (\w+) (\w+)", "\n".join(scripts), re.MULTILINE))
+def test_all_that_is_started_exists(launch_file: ModuleType, repository: Path) -> None:
     shipped = [path.stem for path in (repository / SHIPPED).glob("*.yaml")]
     assert any(load_scenario(name).walkers for name in shipped)
-    by_launch = {
-        (node["package"], node["executable"])
-        for name in shipped
-        for node in nodes(launch_file, name, "a_bag")
-    }
-    assert by_launch == by_script
-
-
-@pytest.mark.parametrize("launch_file", ["tracker"], indirect=True)
-def test_the_tracker_alone(launch_file: ModuleType, repository: Path) -> None:
-    """With a file of parameters and without; the same nodes as the script."""
-    started = list(nodes(launch_file, "mine.yaml", "a_bag"))
-    assert {n["package"]: n.get("parameters") for n in started} == {
-        "ekf_tracker": ["mine.yaml"],
-        "netpos_bag": None,
-    }
-    (tracker,) = [n for n in nodes(launch_file, "") if n["package"] == "ekf_tracker"]
-    assert tracker["parameters"] == []
-    script = (repository / "scripts" / "run_tracker.sh").read_text()
-    assert set(re.findall(r"^ *start \S+ (\w+) (\w+)", script, re.MULTILINE)) == {
-        (n["package"], n["executable"]) for n in started
-    }
+    for name in shipped:
+        for node in nodes(launch_file, scenario=name, bag="a_bag"):
+            setup = repository / "ros2_ws" / "src" / node["package"] / "setup.py"
+            assert f'"{node["executable"]} = ' in setup.read_text()

@@ -52,7 +52,7 @@ def test_the_tracker_alone_with_a_file_of_parameters(
     assert process.interrupt() == 0
     with BagReader(bag) as reader:
         parameters = bag_settings(reader).parameters
-    wanted = yaml.safe_load(file.read_text(encoding="utf-8"))["ekf_tracker"]["ros__parameters"]
+    wanted = yaml.safe_load(file.read_text(encoding="utf-8"))["/**"]["ros__parameters"]
     assert parameters == {name: value for name, value in wanted.items() if name != "vues"}
     netpos("replay", bag, "--out", tmp_path / "again")
     topics = [topic.replace("vue_1", "tag_7") for topic in ESTIMATES]

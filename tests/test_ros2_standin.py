@@ -69,7 +69,9 @@ def test_run_becomes_the_program(standin: str, prefix: Path) -> None:
         (["pkg", "executables", "tool"], 1, "package 'tool' not found"),
         (["interface", "show", "toolbox/msg/Hammer"], 1, "toolbox/msg/Hammer"),
         (["run", "toolbox"], 2, "usage:"),
-        (["bag", "record"], 2, "usage:"),
+        (["bag", "copy"], 2, "usage:"),
+        (["bag", "record", "--frobnicate"], 2, "usage:"),
+        (["launch", "a"], 2, "usage:"),
         ([], 2, "usage:"),
     ],
 )

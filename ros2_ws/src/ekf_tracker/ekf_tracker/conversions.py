@@ -13,10 +13,10 @@ from netpos_node import CODEC
 __all__ = ["diagnostics_to_msg", "network_track_to_msg"]
 
 
-def diagnostics_to_msg(findings: Iterable[Finding], stamp_ns: int, network: str = "") -> Any:
-    """diagnostic_msgs/DiagnosticArray with one entry per finding; network : the one this tracker
-    is of."""
-    tracker = f"ekf_tracker {network}".rstrip()
+def diagnostics_to_msg(
+    findings: Iterable[Finding], stamp_ns: int, tracker: str = "ekf_tracker"
+) -> Any:
+    """diagnostic_msgs/DiagnosticArray with one entry per finding of ``tracker``."""
     array = DiagnosticArray()
     array.header.stamp = CODEC.time(stamp_ns)
     array.status.extend(

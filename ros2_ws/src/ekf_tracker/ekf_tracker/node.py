@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Sequence
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from netpos.messages import topics
 from netpos.messages.values import RsuMeasurement as Measurement
-from netpos.scenario.settings import tracker_fact
+from netpos.scenario.settings import change_fact, tracker_fact
 from netpos.tracking import Tracker, TrackOutput
 from netpos.tracking.admission import NOT_ALLOWED, TOO_MANY
 from netpos.tracking.rate_limit import RATE
 from netpos.tracking.validation import explanation
 from netpos.tracking.warm_up import warm_up, warm_up_anchors, warm_up_components
+from netpos.world.geodesy import Datum
 from netpos_msgs.msg import NetworkTrack, RsuErrors, RsuInfo, RsuMeasurement
 from netpos_node import (
     BACKLOG,
     CDR,
     CODEC,
     LATCHED,
-    STREAM,
     patience,
     run,
     say_of_run,
@@ -33,7 +34,7 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from ekf_tracker.conversions import diagnostics_to_msg, network_track_to_msg
-from ekf_tracker.parameters import declare_parameters
+from ekf_tracker.parameters import Parameters
 
 _COPY_S = 2.0
 _TELL_S = 2.0  # a word in the log about what is refused
@@ -46,38 +47,73 @@ class EkfTrackerNode(EstimatingNode):
         with patience("compiling the kernels, some minutes, once after a change of the sources"):
             warm_up("")  # before the node is seen: whoever sees it may count on it
         super().__init__("ekf_tracker", **node_options)
-        parameters = declare_parameters(self)
-        if parameters.config.network:
-            warm_up(parameters.config.network)
-        if parameters.config.manoeuvre_sd_mps > 0.0:
+        self._chosen = Parameters(self)
+        self._tracker: Tracker | None = None
+        self._chosen.watch(lambda: self._tracker, self._say_change)
+        self._start_up()
+
+    def _configure(self) -> None:
+        parameters = self._chosen.read()
+        config = parameters.config
+        if config.network:
+            warm_up(config.network)
+        if config.manoeuvre_sd_mps > 0.0:
             warm_up_components()
-        self._tracker = Tracker(parameters.config, parameters.settings.rsu_list)
-        self._network = parameters.config.network
+        tracker = Tracker(config, parameters.rsu_list)
+        self._network = config.network
         self._told_refusal_s = -_TELL_S
         self._poses: dict[str, tuple[Any, float]] = {}
-        self._begin(self._tracker, publish_tf=parameters.publish_tf)
-        self._diagnostics_pub = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
-        self._track_pub = self._errors_pub = None
-        if parameters.config.learn_errors:
-            self._errors_pub = self.create_publisher(RsuErrors, topics.RSU_LEARNED, STREAM)
+        datum = Datum(*config.datum_values) if config.datum_values is not None else None
+        self._begin(tracker, publish_tf=parameters.publish_tf, frames=config.frames, datum=datum)
+        self._tracker = tracker
+        self._diagnostics_pub = self._offer(DiagnosticArray, topics.DIAGNOSTICS)
+        self._errors_pub = self._track_pub = self._run_pub = None
+        if config.learn_errors:
+            self._errors_pub = self._offer(RsuErrors, topics.RSU_LEARNED)
         if self._network:
-            self._track_pub = self.create_publisher(
-                NetworkTrack, topics.tracks_of(self._network), STREAM
-            )
-        self._listen(RsuInfo, topics.RSU_INFO, self._on_rsu_info, LATCHED)
+            self._track_pub = self._offer(NetworkTrack, topics.tracks_of(self._network))
+        self._offers.append(self.create_service(Trigger, "~/accept_rsus", self._on_accept_rsus))
         for vue_id in parameters.vue_ids:
             self._add_device(vue_id)
+
+    def _activate(self) -> None:
+        parameters = self._chosen.read()
+        self._listen(RsuInfo, topics.RSU_INFO, self._on_rsu_info, LATCHED)
+        for vue_id in self._outputs:
+            self._listen_to(vue_id)
         extra = [self._track_pub] if self._track_pub is not None else []
         self._wait_for_subscribers(parameters.subscribers, extra)
         self._listen(RsuMeasurement, topics.RSU_MEASUREMENTS, self._on_measurement, raw=True)
-        facts = tracker_fact(parameters.config, parameters.settings.rsus)
-        say_of_run(self, topics.RUN_ESTIMATOR, facts)
-        self.create_service(Trigger, "~/accept_rsus", self._on_accept_rsus)
+        if self._run_pub is None:
+            facts = tracker_fact(self.tracker.config, parameters.settings.rsus)
+            self._run_pub = say_of_run(self, topics.RUN_ESTIMATOR, facts)
+            self._offers.append(self._run_pub)
         self._be_ready()
         self.get_logger().info(f"tracking {', '.join(parameters.vue_ids)}")
 
+    def _clean_up(self) -> None:
+        super()._clean_up()
+        self._tracker = self._run_pub = None
+
+    @property
+    def tracker(self) -> Tracker:
+        """The core, of a node that is configured."""
+        assert self._tracker is not None
+        return self._tracker
+
+    def _say_change(self, names: Sequence[str]) -> None:
+        """Note in recordings that parameters changed while the tracker ran."""
+        values = {name: getattr(self.tracker.config, name) for name in names}
+        told = ", ".join(f"{name} is now {value!r}" for name, value in values.items())
+        self.get_logger().info(told)
+        if self._run_pub is not None:
+            stamps = [status.stamp_ns for status in self._statuses.values()]
+            fact = change_fact(max(stamps, default=0), values)
+            for key, value in fact.items():
+                self._run_pub.publish(KeyValue(key=key, value=value))
+
     def _on_accept_rsus(self, _: Any, response: Any) -> Any:
-        names = self._tracker.accept_rsus()
+        names = self.tracker.accept_rsus()
         response.success = bool(names)
         response.message = f"accepted: {', '.join(names)}" if names else "no RsuInfo is waiting"
         return response
@@ -85,7 +121,7 @@ class EkfTrackerNode(EstimatingNode):
     def _on_rsu_info(self, msg: Any) -> None:
         try:
             info = CODEC.rsu_info_from_msg(msg)
-            self._tracker.add_rsu(info)
+            self.tracker.add_rsu(info)
         except ValueError as error:
             self.get_logger().error(str(error), throttle_duration_sec=2.0)
             return
@@ -94,7 +130,7 @@ class EkfTrackerNode(EstimatingNode):
 
     def _on_measurement(self, cdr: bytes) -> None:
         source = CDR.source(cdr)
-        if source is not None and self._tracker.floods(*source):
+        if source is not None and self.tracker.floods(*source):
             return
         take_waiting(*self._inputs[0])  # descriptions of RSUs come first
         measurement = CDR.measurement(cdr)
@@ -103,10 +139,10 @@ class EkfTrackerNode(EstimatingNode):
             if message is None:
                 return
             measurement = CODEC.measurement_from_msg(message)
-        if not self._tracker.concerns(measurement):
+        if not self.tracker.concerns(measurement):
             return
         refused = self._add(measurement)
-        for vue_id in self._tracker.take_left():
+        for vue_id in self.tracker.take_left():
             self._remove_device(vue_id)
         new = measurement.vue_id not in self._outputs and topics.is_vue_id(measurement.vue_id)
         if new and refused not in (NOT_ALLOWED, TOO_MANY, RATE):
@@ -114,7 +150,7 @@ class EkfTrackerNode(EstimatingNode):
 
     def _add(self, item: Any) -> str | None:
         """Hand it to the tracker; the reason where it is refused."""
-        reason = self._tracker.add(item)
+        reason = self.tracker.add(item)
         if reason is not None and time.monotonic() - self._told_refusal_s >= _TELL_S:
             self._told_refusal_s = time.monotonic()
             source = ""
@@ -127,11 +163,14 @@ class EkfTrackerNode(EstimatingNode):
         return reason
 
     def _add_device(self, vue_id: str) -> None:
+        self._add_outputs(vue_id, self._network, smoothed=self.tracker.config.fixed_lag_s > 0.0)
+        if self.is_active:
+            self._listen_to(vue_id)
+
+    def _listen_to(self, vue_id: str) -> None:
         def topic(name: str) -> str:
             return topics.of_vue(vue_id, name)
 
-        smoothed = self._tracker.config.fixed_lag_s > 0.0
-        self._add_outputs(vue_id, self._network, smoothed=smoothed)
         pose, twist = PoseWithCovarianceStamped, TwistWithCovarianceStamped
         for qos in (BACKLOG, LATCHED):  # a tool's pose is not latched, one from before us is
             self._listen(
@@ -147,7 +186,7 @@ class EkfTrackerNode(EstimatingNode):
             topic(topics.GROUND_SPEED),
             lambda msg: self._add(CODEC.ground_speed_from_msg(msg, vue_id)),
         )
-        if self._tracker.config.use_imu:
+        if self.tracker.config.use_imu:
             self._listen(Imu, topic(topics.IMU), lambda cdr: self._on_imu(cdr, vue_id), raw=True)
 
     def _on_pose(self, msg: Any, vue_id: str) -> None:
@@ -179,19 +218,25 @@ class EkfTrackerNode(EstimatingNode):
     def _publish_diagnostics(self) -> None:
         silent_s = self._silent_s()
         for vue_id, stamp_ns in self._now_ns(silent_s.keys() & self._seen_ns.keys()).items():
-            coasting = self._tracker.coasting(vue_id, stamp_ns)
+            coasting = self.tracker.coasting(vue_id, stamp_ns)
             if coasting is not None:
                 self._publish_status(coasting.status)
-        findings = self._tracker.findings(
+        findings = self.tracker.findings(
             self._statuses, silent_s, self._unheard_s(), self._warnings()
         )
         newest_ns = max((status.stamp_ns for status in self._statuses.values()), default=0)
-        self._diagnostics_pub.publish(diagnostics_to_msg(findings, newest_ns, self._network))
+        self._diagnostics_pub.publish(diagnostics_to_msg(findings, newest_ns, self._subject()))
+
+    def _subject(self) -> str:
+        """Whose diagnostics they are: of which namespace, of which network."""
+        space = self.get_namespace().strip("/")
+        name = f"{space}/ekf_tracker" if space else "ekf_tracker"
+        return f"{name} {self._network}".rstrip()
 
     def _warnings(self) -> list[str]:
         """What keeps the tracker from hearing anything, or from being heard as the only one."""
         found = self._input_warnings()
-        if not self._tracker.enabled:
+        if not self.tracker.enabled:
             return ["disabled: measurements are refused", *found]
         unheard_s = self._unheard_s()
         if unheard_s and self._statuses:

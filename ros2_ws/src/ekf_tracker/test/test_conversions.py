@@ -9,7 +9,7 @@ from netpos.tracking.diagnosis import Finding, Level
 
 def test_a_finding_is_a_status() -> None:
     findings = [Finding(level, f"rsu {level}", "why", "id", {"key": "1"}) for level in Level]
-    array = diagnostics_to_msg(findings, 1_000_000_005, "wifi")
+    array = diagnostics_to_msg(findings, 1_000_000_005, "ekf_tracker wifi")
     assert (array.header.stamp.sec, array.header.stamp.nanosec) == (1, 5)
     assert [s.level for s in array.status] == [
         DiagnosticStatus.OK,

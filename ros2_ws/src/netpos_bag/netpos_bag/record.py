@@ -18,7 +18,7 @@ import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from netpos import __version__
 from netpos.bags import LOST_METADATA, BagError, BagWriter
-from netpos.messages.topics import CLOCK, DIAGNOSTICS, RUN_TOPICS
+from netpos.messages.topics import CLOCK, DIAGNOSTICS, RUN_TOPICS, below
 from netpos_node import init, message_class, waiting
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -82,7 +82,11 @@ class RecordNode(Node):
                 self._check_publishers(known)
 
     def _subscribe(self, name: str, types: list[str]) -> None:
-        wanted = not self.config.topics or name in (*self.config.topics, *RUN_TOPICS)
+        written = below(name, self.get_namespace())
+        if not written:
+            self._left_out.add(name)
+            return
+        wanted = not self.config.topics or written in (*self.config.topics, *RUN_TOPICS)
         if not wanted and name != CLOCK:
             return
         if len(types) > 1:
@@ -93,7 +97,7 @@ class RecordNode(Node):
         try:
             kind = message_class(types[0])
             if wanted:
-                self.writer.add_topic(name, types[0], noted)
+                self.writer.add_topic(written, types[0], noted)
         except (BagError, ImportError, AttributeError) as error:
             self._leave_out(name, str(error))
             return
@@ -101,7 +105,7 @@ class RecordNode(Node):
         subscription = self.create_subscription(kind, name, lambda _: None, profile, raw=True)
         losses = Losses(partial(self.count_publishers, name))
         self._topics[name] = _Topic(
-            name, types[0] if wanted else "", subscription, profile, losses, len(offered)
+            name, types[0] if wanted else "", subscription, profile, losses, len(offered), written
         )
 
     def _leave_out(self, name: str, reason: str) -> None:
@@ -137,7 +141,7 @@ class RecordNode(Node):
             if topic.name == CLOCK:
                 self.recording.clock(clock_ns(cdr))
             if topic.type_name:
-                self.recording.message(topic.name, topic.type_name, cdr, wall_ns)
+                self.recording.message(topic.written, topic.type_name, cdr, wall_ns)
 
     def _tick(self) -> None:
         jumps = self.recording.backward_jumps
@@ -202,7 +206,15 @@ class RecordNode(Node):
 class _Topic:
     """A topic that is listened to; ``type_name`` is empty where it is not recorded."""
 
-    __slots__ = ("losses", "name", "profile", "publishers", "subscription", "type_name")
+    __slots__ = (
+        "losses",
+        "name",
+        "profile",
+        "publishers",
+        "subscription",
+        "type_name",
+        "written",
+    )
 
     def __init__(
         self,
@@ -212,8 +224,9 @@ class _Topic:
         profile: QoSProfile,
         losses: Losses,
         publishers: int,
+        written: str,
     ) -> None:
-        self.name = name
+        self.name, self.written = name, written
         self.type_name = type_name
         self.subscription = subscription
         self.profile = profile

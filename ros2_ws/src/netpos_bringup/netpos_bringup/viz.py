@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -56,8 +56,12 @@ class VizNode(ListeningNode):
         self.config = declare_config(self, VizConfig)
         self._scene = Scene(declare_config(self, SceneConfig))
         self._numbers, self._map_numbers = Numbers(), Numbers()
-        self._markers_pub = self.create_publisher(MarkerArray, topics.VIZ_MARKERS, 10)
-        self._map_pub = self.create_publisher(MarkerArray, topics.VIZ_MAP, _NEWEST)
+        self._markers_pub = self.create_publisher(
+            MarkerArray, topics.to_resolve(topics.VIZ_MARKERS), 10
+        )
+        self._map_pub = self.create_publisher(
+            MarkerArray, topics.to_resolve(topics.VIZ_MAP), _NEWEST
+        )
         self._path_pubs: dict[tuple[str, str], Publisher] = {}
         self._map_changed = False
 
@@ -74,21 +78,25 @@ class VizNode(ListeningNode):
         """Listen to what is published by now, and no longer to what is not."""
         published = self.published()
         for topic, type_name in published.items():
-            if _reader(topic, type_name) is None or topic in self.heard:
+            name = self._below(topic)
+            if _reader(name, type_name) is None or topic in self.heard:
                 continue
-            if topic == topics.RSU_INFO:
+            if name == topics.RSU_INFO:
                 self._scene.clear_rsus()  # those of a run that is over
             self.listen(topic, type_name)
         for topic in self.heard:
             if topic not in published:
                 self.forget(topic)
 
+    def _below(self, topic: str) -> str:
+        return topics.below(topic, self.get_namespace())
+
     def draw(self) -> None:
         """Take what has arrived; publish what is on the map now."""
         now_s = time.monotonic()
         refused = sum(self._scene.refused.values())
         for arrived in self.take():
-            self._read(arrived, now_s)
+            self._read(replace(arrived, topic=self._below(arrived.topic)), now_s)
         if sum(self._scene.refused.values()) > refused:
             self.get_logger().warning(
                 f"not drawn: {self._scene.refused}", throttle_duration_sec=10.0
@@ -109,7 +117,7 @@ class VizNode(ListeningNode):
         for device, points in paths.items():
             if device not in self._path_pubs:
                 network, vue_id = device
-                topic = topics.path_of(vue_id, network)
+                topic = topics.to_resolve(topics.path_of(vue_id, network))
                 self._path_pubs[device] = self.create_publisher(Path, topic, STREAM)
             if self._path_pubs[device].get_subscription_count():
                 self._path_pubs[device].publish(path_cdr(points))

@@ -19,6 +19,7 @@ import rclpy
 from diagnostic_msgs.msg import KeyValue
 from netpos.bags import cdr_codec
 from netpos.messages.codec import Codec
+from netpos.messages.topics import to_resolve
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.duration import Duration
 from rclpy.exceptions import (
@@ -217,11 +218,13 @@ def take_waiting(subscription: Subscription, on_message: Callable[[Any], None]) 
         on_message(message)
 
 
-def say_of_run(node: Node, topic: str, facts: Mapping[str, str]) -> None:
-    """Tell whoever records, now or later, what a recording should say of its run."""
-    publisher = node.create_publisher(KeyValue, topic, LATCHED)
+def say_of_run(node: Node, topic: str, facts: Mapping[str, str]) -> Publisher:
+    """Tell whoever records, now or later, what a recording should say of its run; the publisher,
+    for more of it."""
+    publisher = node.create_publisher(KeyValue, to_resolve(topic), LATCHED)
     for key, value in facts.items():
         publisher.publish(KeyValue(key=key, value=value))
+    return publisher
 
 
 def see_delivered(node: Node) -> None:
@@ -233,18 +236,30 @@ def see_delivered(node: Node) -> None:
         publisher.wait_for_all_acked(Duration(nanoseconds=round(1e9 * min(left_s, 1.0))))
 
 
-def declare(node: Node, name: str, default: Any, text: str, *, low: int | None = None) -> Any:
-    """Declare one read-only parameter and return its value; ``low``: the least of a number."""
-    spec = ParameterDescriptor(description=text, read_only=True)
+def declare(
+    node: Node,
+    name: str,
+    default: Any,
+    text: str,
+    *,
+    low: int | None = None,
+    read_only: bool = True,
+) -> Any:
+    """Declare one parameter and return its value; ``low``: the least of a number."""
+    spec = ParameterDescriptor(description=text, read_only=read_only)
     if low is not None:
         spec.integer_range = [IntegerRange(from_value=low, to_value=_COUNT_MAX)]
     return node.declare_parameter(name, default, spec).value
 
 
 def declare_config(
-    node: Node, config_class: type[Config], defaults: Mapping[str, Any] | None = None
+    node: Node,
+    config_class: type[Config],
+    defaults: Mapping[str, Any] | None = None,
+    *,
+    read_only: bool = True,
 ) -> Config:
-    """Declare every field of a config dataclass as a read-only parameter and build the config.
+    """Declare every field of a config dataclass as a parameter and build the config.
 
     Ranges and descriptions come from the fields' metadata (``low``, ``high``, ``text``), defaults
     from the dataclass, overridden by ``defaults``. Raises ``ValueError`` for a bad value.
@@ -253,7 +268,7 @@ def declare_config(
     values = {}
     for entry in fields(config_class):  # type: ignore[arg-type]
         default = (defaults or {}).get(entry.name, getattr(plain, entry.name))
-        spec = ParameterDescriptor(description=entry.metadata.get("text", ""), read_only=True)
+        spec = ParameterDescriptor(description=entry.metadata.get("text", ""), read_only=read_only)
         if isinstance(default, int) and not isinstance(default, bool) and "low" in entry.metadata:
             limits = IntegerRange(
                 from_value=entry.metadata["low"], to_value=entry.metadata["high"]

@@ -5,11 +5,14 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Callable, Iterable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from nav_msgs.msg import Odometry
+from netpos.bags import cdr_codec
 from netpos.kernel_memory import give_back_compiler
 from netpos.messages import topics
+from netpos.messages.fields import Frames
+from netpos.messages.values import Odometry as Estimated
 from netpos.messages.values import TrackStatus
 from netpos.tracking import TrackOutput
 from netpos_msgs.msg import ClockState
@@ -18,23 +21,31 @@ from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.node import Node
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy
 from rclpy.serialization import deserialize_message
+from rclpy.service import Service
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
+from sensor_msgs.msg import NavSatFix
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 
 from netpos_node import (
     BACKLOG,
-    CDR,
+    CODEC,
     RELAXED,
     STREAM,
+    declare,
     see_delivered,
     take_waiting,
     wait_until_heard,
 )
+
+if TYPE_CHECKING:
+    from netpos.tracking.map_to_odom import MapToOdom
+    from netpos.world.geodesy import Datum
 
 _SILENCE_S = 2.0  # long: a stalled machine must not look like the end of the measurements
 _PATIENCE_S = 30.0
@@ -57,35 +68,185 @@ class Core(Protocol):
         """Forget all tracks."""
 
 
-class EstimatingNode(Node):
+_DONE, _FAILED = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+
+
+class EstimatingNode(LifecycleNode):
     """Feeds a ``Core``.
 
     Whoever spins the node hands messages over in the order of their arrival, so that no topic
     overtakes another.
+
+    A lifecycle node: it has a core and offers its topics from ``configure`` on, listens and
+    estimates from ``activate`` on, and keeps its tracks over ``deactivate``. Unless ``autostart``
+    is false it does both by itself.
     """
 
-    def _begin(self, core: Core, *, publish_tf: bool) -> None:
-        """Set up what all share; first of all."""
-        self._core = core
+    def __init__(self, name: str, **node_options: Any) -> None:
+        super().__init__(name, **node_options)
+        self._fault: Exception | None = None
+        self._starts = False
         self._inputs: list[tuple[Subscription, Callable[[Any], None]]] = []
+        self._timers_of_life: list[Timer] = []
+        self._offers: list[Publisher | Service] = []
+        self._jump_handle: Any = None
+        self._forget_all()
+
+    def _start_up(self) -> None:
+        """Configure and activate unless told otherwise; last of all. Raises what a bad parameter
+        raises."""
+        text = "configure and activate at the start; false: wait for lifecycle transitions"
+        if not declare(self, "autostart", True, text):
+            self.get_logger().info("waits to be configured")
+            return
+        self._starts = True
+        for step in (self.trigger_configure, self.trigger_activate):
+            if step() is not _DONE and self._fault is not None:
+                raise self._fault
+        self._starts = False
+
+    # life
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Make the core, offer topics and services."""
+        done = self._done(self._configure)
+        if done is _FAILED:
+            self._clean_up()
+        return done
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Listen and estimate."""
+        done = self._done(self._activate)
+        if done is _FAILED:
+            self._stop_listening()
+        return done
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Give out what follows from all that has arrived, and listen no more."""
+        return self._done(self._deactivate)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Forget all tracks and take topics and services back."""
+        return self._done(self._clean_up)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """The same, from any state."""
+        if self.is_active:
+            self._deactivate()
+        return self._done(self._clean_up)
+
+    def destroy_node(self) -> None:
+        """Take the node out of the graph: rclpy keeps it there for as long as its state machine
+        lives."""
+        machine = self._state_machine
+        super().destroy_node()
+        machine.destroy_when_not_in_use()
+
+    @property
+    def is_active(self) -> bool:
+        """Whether it listens."""
+        return bool(self._inputs)
+
+    def _done(self, step: Callable[[], None]) -> TransitionCallbackReturn:
+        try:
+            step()
+        except Exception as error:  # rclpy would drop it
+            self._fault = error
+            if not self._starts:  # else it is raised
+                self.get_logger().error(str(error) or repr(error))
+            return _FAILED
+        return _DONE
+
+    def _configure(self) -> None:
+        raise NotImplementedError
+
+    def _activate(self) -> None:
+        raise NotImplementedError
+
+    def _deactivate(self) -> None:
+        self._give_out()
+        self._stop_listening()
+        see_delivered(self)
+
+    def _stop_listening(self) -> None:
+        for subscription, _ in self._inputs:
+            self.destroy_subscription(subscription)
+        self._inputs = []
+        for timer in self._timers_of_life:
+            self.destroy_timer(timer)
+        self._timers_of_life = []
+        if self._tf_sub is not None:
+            self.destroy_subscription(self._tf_sub)
+            self._tf_sub = None
+        if self._jump_handle is not None:
+            self._jump_handle.unregister()
+            self._jump_handle = None
+
+    def _clean_up(self) -> None:
+        for vue_id in list(self._outputs):
+            self._remove_device(vue_id)
+        for offer in self._offers:
+            if isinstance(offer, Service):
+                self.destroy_service(offer)
+            else:
+                self.destroy_publisher(offer)
+        self._offers = []
+        self._forget_all()
+
+    def _offer(self, kind: Any, topic: str, qos: Any = STREAM) -> Publisher:
+        """A publisher for as long as the node is configured."""
+        publisher = self.create_publisher(kind, topics.to_resolve(topic), qos)
+        self._offers.append(publisher)
+        return publisher
+
+    def _forget_all(self) -> None:
         self._outputs: dict[str, tuple[Publisher, ...]] = {}
         self._statuses: dict[str, TrackStatus] = {}
         self._told_s: dict[str, float] = {}
         self._seen_ns: dict[str, tuple[int, int]] = {}
         self._unheard_topics: set[str] = set()
         self._relaxed: set[str] = set()
+        self._fix_pubs: dict[str, Publisher] = {}
+        self._odoms: dict[str, MapToOdom] = {}
+        self._tf_pub: Publisher | None = None
+        self._tf_sub: Subscription | None = None
+
+    def _begin(
+        self,
+        core: Core,
+        *,
+        publish_tf: bool,
+        frames: Frames | None = None,
+        datum: Datum | None = None,
+    ) -> None:
+        """Set up what all share; first of all when it is configured."""
+        self._core = core
+        self._frames, self._datum = frames or Frames(), datum
+        self._cdr = cdr_codec(self._frames)
         self._heard_since_tick = False
         self._heard_s = time.monotonic()
         self._tick_ns = self._quiet_ns = 0
-        self._tf_pub = self.create_publisher(TFMessage, topics.TF, STREAM) if publish_tf else None
+        if publish_tf:
+            self._tf_pub = self.create_publisher(TFMessage, topics.TF, STREAM)
+            self._offers.append(self._tf_pub)
+        self._offers += [
+            self.create_service(Trigger, "~/reset", self._on_reset),
+            self.create_service(SetBool, "~/enable", self._on_enable),
+        ]
 
     def _be_ready(self) -> None:
-        """Services, timers and the watch over the clock; last of all."""
-        self.create_service(Trigger, "~/reset", self._on_reset)
-        self.create_service(SetBool, "~/enable", self._on_enable)
+        """Transforms of others, timers and the watch over the clock; last of all when it is
+        activated."""
+        if self._frames.odom and self._tf_pub is not None:
+            self._tf_sub = self.create_subscription(
+                TFMessage, topics.TF, self._on_transforms, BACKLOG
+            )
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # /clock may stand still
-        self.create_timer(_SILENCE_S, self._on_silence_tick, clock=steady)
-        self.create_timer(1.0, self._on_diagnostics_tick, clock=steady)
+        self._heard_s = time.monotonic()
+        self._timers_of_life = [
+            self.create_timer(_SILENCE_S, self._on_silence_tick, clock=steady),
+            self.create_timer(1.0, self._on_diagnostics_tick, clock=steady),
+        ]
         threshold = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
         )
@@ -120,6 +281,8 @@ class EstimatingNode(Node):
         *,
         raw: bool = False,
     ) -> None:
+        topic = self.resolve_topic_name(topics.to_resolve(topic))
+
         def on_message(msg: Any) -> None:
             self._heard_since_tick = True
             self._heard_s = time.monotonic()
@@ -164,6 +327,13 @@ class EstimatingNode(Node):
                 found.append(
                     f"another node publishes {topic} too: stop it, or set another ROS_DOMAIN_ID"
                 )
+        found += [
+            f"{vue_id}: no {self._frames.odom_of(vue_id)} -> {self._frames.base_of(vue_id)} on"
+            f" {topics.TF} at the stamps of the estimates, so {self._frames.map} ->"
+            f" {self._frames.odom_of(vue_id)} is not published"
+            for vue_id, odom in self._odoms.items()
+            if odom.is_lost
+        ]
         if self.count_publishers(topics.CLOCK) > 1:
             found.append(f"more than one node publishes {topics.CLOCK}")
         return found
@@ -191,19 +361,29 @@ class EstimatingNode(Node):
         if smoothed:
             outputs.append((Odometry, topics.ODOMETRY_SMOOTHED))
         self._outputs[vue_id] = tuple(
-            self.create_publisher(kind, topics.of_vue(vue_id, name, network), STREAM)
+            self.create_publisher(kind, self._topic_of(vue_id, name, network), STREAM)
             for kind, name in outputs
         )
+        if self._datum is not None:
+            name = self._topic_of(vue_id, topics.FIX, network)
+            self._fix_pubs[vue_id] = self.create_publisher(NavSatFix, name, STREAM)
+
+    def _topic_of(self, vue_id: str, name: str, network: str = "") -> str:
+        return topics.to_resolve(topics.of_vue(vue_id, name, network))
 
     def _remove_device(self, vue_id: str) -> None:
         """Give back the topics of a device that is no longer tracked."""
-        for publisher in self._outputs.pop(vue_id, ()):
-            self.destroy_publisher(publisher)
-        mine = [s for s, _ in self._inputs if topics.split(s.topic_name)[0] == vue_id]
+        for publisher in (*self._outputs.pop(vue_id, ()), self._fix_pubs.pop(vue_id, None)):
+            if publisher is not None:
+                self.destroy_publisher(publisher)
+        names = {
+            self.resolve_topic_name(self._topic_of(vue_id, name)) for name in topics.DEVICE_INPUTS
+        }
+        mine = [s for s, _ in self._inputs if s.topic_name in names]
         self._inputs = [entry for entry in self._inputs if entry[0] not in mine]
         for subscription in mine:
             self.destroy_subscription(subscription)
-        for told in (self._statuses, self._told_s, self._seen_ns):
+        for told in (self._statuses, self._told_s, self._seen_ns, self._odoms):
             told.pop(vue_id, None)
 
     def _publish(self, outputs: list[TrackOutput]) -> None:
@@ -217,19 +397,58 @@ class EstimatingNode(Node):
         self._statuses[vue_id], self._told_s[vue_id] = output.status, time.monotonic()
         odometry_pub, clock_pub, status_pub, *smoothed_pub = self._outputs[vue_id]
         if output.odometry is not None:
-            odometry_pub.publish(CDR.odometry(output.odometry))
-            if self._tf_pub is not None and not output.revised:
-                self._tf_pub.publish(CDR.transform(output.odometry))
+            odometry_pub.publish(self._cdr.odometry(output.odometry))
+            if self._datum is not None:
+                self._fix_pubs[vue_id].publish(self._fix(output.odometry, self._datum))
+            if not output.revised:
+                self._publish_transform(output.odometry)
         if output.clock is not None:
-            clock_pub.publish(CDR.clock_state(output.clock))
-        status_pub.publish(CDR.track_status(output.status))
+            clock_pub.publish(self._cdr.clock_state(output.clock))
+        status_pub.publish(self._cdr.track_status(output.status))
         for odometry in output.smoothed:
-            smoothed_pub[0].publish(CDR.odometry(odometry))
+            smoothed_pub[0].publish(self._cdr.odometry(odometry))
+
+    def _fix(self, odometry: Estimated, datum: Datum) -> Any:
+        frame = self._frames.base_of(odometry.vue_id)
+        place, cov = datum.fix(odometry.position, odometry.pose_cov[:3, :3])
+        return CODEC.fix_to_msg(odometry.stamp_ns, frame, place, cov)
+
+    def _publish_transform(self, odometry: Estimated) -> None:
+        if self._tf_pub is None:
+            return
+        if not self._frames.odom:
+            self._tf_pub.publish(self._cdr.transform(odometry))
+            return
+        joined = self._odom_of(odometry.vue_id)
+        pose = odometry.stamp_ns, odometry.position, odometry.quaternion
+        self._publish_map_to_odom(odometry.vue_id, joined.add_map(*pose))
+
+    def _odom_of(self, vue_id: str) -> MapToOdom:
+        if vue_id not in self._odoms:
+            from netpos.tracking.map_to_odom import MapToOdom  # noqa: PLC0415 - brings SciPy
+
+            self._odoms[vue_id] = MapToOdom()
+        return self._odoms[vue_id]
+
+    def _publish_map_to_odom(self, vue_id: str, poses: Iterable[Any]) -> None:
+        for stamp_ns, position, quaternion in poses:
+            assert self._tf_pub is not None
+            cdr = self._cdr.map_to_odom(vue_id, stamp_ns, position, quaternion)
+            self._tf_pub.publish(cdr)
+
+    def _on_transforms(self, msg: Any) -> None:
+        """Take odom -> base of the devices that are tracked; what else is on /tf is of others."""
+        for transform in msg.transforms:
+            named = transform.header.frame_id, transform.child_frame_id
+            for vue_id in self._outputs:
+                if named == (self._frames.odom_of(vue_id), self._frames.base_of(vue_id)):
+                    pose = CODEC.pose_of_transform(transform)
+                    self._publish_map_to_odom(vue_id, self._odom_of(vue_id).add_odom(*pose))
 
     def _publish_status(self, status: TrackStatus) -> None:
         """Give out a status without an estimate."""
         _, _, status_pub, *_ = self._outputs[status.vue_id]
-        status_pub.publish(CDR.track_status(status))
+        status_pub.publish(self._cdr.track_status(status))
 
     def _on_diagnostics_tick(self) -> None:
         self._hear_all()
@@ -268,10 +487,14 @@ class EstimatingNode(Node):
 
     def finish(self) -> None:
         """Give out what still follows from all that has arrived, and see it delivered."""
+        if self.is_active:
+            self._give_out()
+        see_delivered(self)
+
+    def _give_out(self) -> None:
         for waiting in self._inputs:
             take_waiting(*waiting)
         self._publish(self._core.flush())
-        see_delivered(self)
 
     # time and services
 

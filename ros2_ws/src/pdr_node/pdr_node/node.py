@@ -38,16 +38,18 @@ class PdrNode(Node):
         parameters = declare_parameters(self)
         self._vue_id = vue = parameters.vue_id
         self._core = PedestrianDeadReckoning(parameters.config)
-        self._step_pub = self.create_publisher(Step, topics.of_vue(vue, topics.STEP), STREAM)
+
+        def topic(name: str) -> str:
+            return topics.to_resolve(topics.of_vue(vue, name))
+
+        self._step_pub = self.create_publisher(Step, topic(topics.STEP), STREAM)
         self._velocity_pub = self.create_publisher(
-            TwistWithCovarianceStamped, topics.of_vue(vue, topics.STEP_VELOCITY), STREAM
+            TwistWithCovarianceStamped, topic(topics.STEP_VELOCITY), STREAM
         )
         self._wait_for_subscribers(parameters.subscribers)
-        self._imu_sub = self.create_subscription(
-            Imu, topics.of_vue(vue, topics.IMU), self._on_imu, BACKLOG
-        )
+        self._imu_sub = self.create_subscription(Imu, topic(topics.IMU), self._on_imu, BACKLOG)
         self._mag_sub = self.create_subscription(
-            MagneticField, topics.of_vue(vue, topics.MAG), self._on_magnetic_field, BACKLOG
+            MagneticField, topic(topics.MAG), self._on_magnetic_field, BACKLOG
         )
 
     def _wait_for_subscribers(self, wanted: int) -> None:

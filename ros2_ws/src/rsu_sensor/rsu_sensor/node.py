@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from netpos.messages.topics import BEACON, RSU_INFO, RSU_MEASUREMENTS, of_vue
+from netpos.messages.topics import BEACON, RSU_INFO, RSU_MEASUREMENTS, of_vue, to_resolve
 from netpos_msgs.msg import Beacon, RsuInfo, RsuMeasurement
 from netpos_node import LATCHED, STREAM, run, see_delivered, take_waiting, wait_until_heard
 from rclpy.duration import Duration
@@ -26,14 +26,18 @@ class RsuSensorNode(Node):
         self._settings = declare_parameters(self)
         self._settings.simulation.warm_up()
         self.refused = 0
-        self._info_pub = self.create_publisher(RsuInfo, RSU_INFO, LATCHED)
-        self._measurement_pub = self.create_publisher(RsuMeasurement, RSU_MEASUREMENTS, STREAM)
+        self._info_pub = self.create_publisher(RsuInfo, to_resolve(RSU_INFO), LATCHED)
+        self._measurement_pub = self.create_publisher(
+            RsuMeasurement, to_resolve(RSU_MEASUREMENTS), STREAM
+        )
         for rsu in self._settings.simulation.rsus:
             if rsu.rsu_id in self._settings.rsu_ids:
                 self._info_pub.publish(rsu_info_to_msg(rsu))
         self._wait_for_subscribers()
         self._beacon_subs = [
-            self.create_subscription(Beacon, of_vue(vue_id, BEACON), self._on_beacon, STREAM)
+            self.create_subscription(
+                Beacon, to_resolve(of_vue(vue_id, BEACON)), self._on_beacon, STREAM
+            )
             for vue_id in self._settings.scenario.vue_ids
         ]
         self.get_logger().info(

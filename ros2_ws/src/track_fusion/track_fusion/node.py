@@ -22,17 +22,24 @@ class TrackFusionNode(EstimatingNode):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__("track_fusion", **node_options)
-        parameters = declare_parameters(self)
+        self._chosen = declare_parameters(self)
+        self._start_up()
+
+    def _configure(self) -> None:
+        parameters = self._chosen
         self._fusion = TrackFusion(parameters.networks, parameters.config)
         self._begin(self._fusion, publish_tf=parameters.publish_tf)
-        self._diagnostics_pub = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
+        self._diagnostics_pub = self._offer(DiagnosticArray, topics.DIAGNOSTICS, 10)
         for vue_id in parameters.vue_ids:
             self._add_outputs(vue_id)
+        fact = fusion_fact(parameters.networks, parameters.config)
+        self._offers.append(say_of_run(self, topics.RUN_ESTIMATOR, fact))
+
+    def _activate(self) -> None:
+        parameters = self._chosen
         self._wait_for_subscribers(parameters.subscribers)
         for network in parameters.networks:
             self._listen(NetworkTrack, topics.tracks_of(network), self._on_track)
-        fact = fusion_fact(parameters.networks, parameters.config)
-        say_of_run(self, topics.RUN_ESTIMATOR, fact)
         self._be_ready()
         self.get_logger().info(f"fusing the tracks of {', '.join(parameters.networks)}")
 

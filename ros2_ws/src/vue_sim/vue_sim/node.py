@@ -8,7 +8,16 @@ from contextlib import suppress
 from threading import Thread
 from typing import Any
 
-from netpos.messages.topics import BEACON, CLOCK, IMU, INITIAL_POSE, MAG, RUN_SCENARIO, split
+from netpos.messages.topics import (
+    BEACON,
+    CLOCK,
+    IMU,
+    INITIAL_POSE,
+    MAG,
+    RUN_SCENARIO,
+    split,
+    to_resolve,
+)
 from netpos.messages.values import InitialPose
 from netpos.scenario import Simulation
 from netpos.scenario.load import scenario_text
@@ -64,7 +73,7 @@ class VueSimNode(Node):
         self._settings = declare_parameters(self)
         self._simulation = Simulation(self._settings.scenario)
         self._pubs = {
-            topic: self.create_publisher(message_class, topic, _qos(topic))
+            topic: self.create_publisher(message_class, to_resolve(topic), _qos(topic))
             for topic, message_class in publications(self._settings.scenario).items()
         }
         facts = {

@@ -19,6 +19,7 @@ from rosbags.typesys.store import Typestore
 from netpos.bags.errors import BagError
 from netpos.messages.cdr import STRING, CdrCodec
 from netpos.messages.codec import Codec
+from netpos.messages.fields import Frames
 
 SEPARATOR = "=" * 80
 _OWN_PACKAGE = "netpos_msgs"
@@ -217,6 +218,6 @@ def flat_items(type_name: str) -> Iterator[str]:
 
 
 @cache
-def cdr_codec() -> CdrCodec:
-    """Codec between values and the bytes of messages. Cached."""
-    return CdrCodec(flat_items)
+def cdr_codec(frames: Frames | None = None) -> CdrCodec:
+    """Codec between values and the bytes of messages that name their ``frames`` so. Cached."""
+    return CdrCodec(flat_items, frames)

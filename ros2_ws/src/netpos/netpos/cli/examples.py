@@ -30,6 +30,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "reproduce": ("netpos reproduce fokin2020 --runs 20 --json rows.json --out pictures",),
     "recover": ("netpos recover my_run",),
     "params": ("netpos params hold", "netpos params --dump params.yaml --from fast_pass"),
+    "geojson": ("netpos geojson my_track my_track.geojson --datum '55.75, 37.62, 150'",),
     "import csv": (
         "netpos import csv uwb.csv my_bag --map time=t,rsu=anchor,range=dist --units "
         "time=ms,range=mm --sd range=100 --rsus anchors.yaml",

@@ -7,7 +7,18 @@ from typing import Annotated
 import typer
 
 import netpos
-from netpos.cli import faults, params, recordings, reproduce, results, rsus, runs, sweep, watch
+from netpos.cli import (
+    faults,
+    geojson,
+    params,
+    recordings,
+    reproduce,
+    results,
+    rsus,
+    runs,
+    sweep,
+    watch,
+)
 from netpos.cli.errors import Commands
 from netpos.cli.examples import epilog
 from netpos.cli.interrupts import INTERRUPTED, answer_ctrl_c, leave
@@ -40,6 +51,7 @@ for command in (
     recordings.recover,
     watch.watch,
     params.params,
+    geojson.geojson,
 ):
     app.command(epilog=epilog(command.__name__))(command)
 app.add_typer(recordings.importers, name="import")

@@ -70,7 +70,7 @@ def params_file(values: dict[str, object], vue_ids: tuple[str, ...]) -> str:
 
     lines = [
         "# Parameters of the tracker, with their ranges.",
-        "ekf_tracker:",
+        "/**:  # in any namespace, under any name",
         "  ros__parameters:",
     ]
     lines += entry("vues", vue_ids, "devices whose topics exist from the start")

@@ -33,6 +33,9 @@ def watch(
             "live starts. Default: start one for this shell's ROS domain.",
         ),
     ] = None,
+    namespace: Annotated[
+        str, typer.Option(help="Of the nodes to show, such as /site_a; default: no namespace.")
+    ] = "",
     once: Annotated[bool, typer.Option("--once", help="Print one frame and exit.")] = False,
     period: Annotated[float, typer.Option(help="Seconds between frames.")] = 1.0,
     wait: Annotated[
@@ -50,10 +53,10 @@ def watch(
             raise ValueError(f"{name} must be > 0 s, got {value}")
     try:
         if url is not None:
-            _watch(full_url(url), period, wait if once else None)
+            _watch(full_url(url), period, wait if once else None, namespace)
             return
         with _served() as own:
-            _watch(own, period, wait if once else None)
+            _watch(own, period, wait if once else None, namespace)
     except ViewError as error:
         raise WorkFailedError(str(error)) from error
 
@@ -85,11 +88,11 @@ def _served() -> Iterator[str]:
                 server.kill()
 
 
-def _watch(url: str, period_s: float, once_within_s: float | None) -> None:
+def _watch(url: str, period_s: float, once_within_s: float | None, namespace: str) -> None:
     from netpos.live.board import Board  # noqa: PLC0415
     from netpos.live.client import Viewer  # noqa: PLC0415
 
-    board = Board()
+    board = Board(namespace)
     with Viewer(url, board.wants) as viewer:
         if once_within_s is not None:
             _print_once(viewer, board, once_within_s)

@@ -51,9 +51,11 @@ class HealthLine:
 
 
 class Board:
-    """Takes messages by topic; ``now_s`` is the viewer's steady clock."""
+    """Takes messages by topic; ``now_s`` is the viewer's steady clock. ``namespace``: that of the
+    nodes whose topics count."""
 
-    def __init__(self) -> None:
+    def __init__(self, namespace: str = "") -> None:
+        self._namespace = namespace.strip("/")
         self._devices: dict[str, DeviceLine] = {}
         self._health: dict[str, HealthLine] = {}
         self.rsus: set[str] = set()
@@ -61,9 +63,9 @@ class Board:
         self.unread: dict[str, int] = {}
         """Messages that have no meaning, by topic."""
 
-    @staticmethod
-    def wants(topic: str, type_name: str) -> bool:
+    def wants(self, topic: str, type_name: str) -> bool:
         """Whether a topic says something for the board."""
+        topic = topics.below(topic, self._namespace)
         if topic == topics.DIAGNOSTICS:
             return type_name == "diagnostic_msgs/msg/DiagnosticArray"
         if topic == topics.RSU_INFO:
@@ -75,7 +77,7 @@ class Board:
         """Take one message of a topic that is wanted; one without a meaning is counted."""
         self.network_time_ns = log_time_ns
         try:
-            self._add(topic, message, now_s)
+            self._add(topics.below(topic, self._namespace), message, now_s)
         except ValueError:
             self.unread[topic] = self.unread.get(topic, 0) + 1
 
@@ -117,10 +119,14 @@ class Board:
 
     def _add_diagnostics(self, message: Any) -> None:
         """Lines of devices are left out: their table says more."""
+        above = f"{self._namespace}/" if self._namespace else ""
         for status in message.status:
-            source, _, subject = status.name.partition(": ")
+            if not status.name.startswith(above):
+                continue
+            name = status.name.removeprefix(above)
+            source, _, subject = name.partition(": ")
             if not topics.is_vue_id(subject) or subject == "rsus":
-                key = subject if source == "ekf_tracker" else status.name
+                key = subject if source == "ekf_tracker" else name
                 values = {pair.key: pair.value for pair in status.values}
                 self._health[key] = HealthLine(_level(status.level), key, status.message, values)
 

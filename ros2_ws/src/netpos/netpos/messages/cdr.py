@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from netpos.messages.fields import MAP_FRAME, NS, base_link, vue_of_frame
+from netpos.messages.fields import NS, Frames, vue_of_frame
 from netpos.messages.values import (
     Array,
     ClockState,
@@ -193,7 +193,10 @@ class CdrCodec:
     What reads returns None where the codec of messages has to look.
     """
 
-    def __init__(self, items: Callable[[str], Iterable[str]]) -> None:
+    def __init__(
+        self, items: Callable[[str], Iterable[str]], frames: Frames | None = None
+    ) -> None:
+        self._frames = frames or Frames()
         self._measurement = Layout(items("netpos_msgs/msg/RsuMeasurement"))
         self._imu = Layout(items("sensor_msgs/msg/Imu"))
         self._odometry = Layout(items("nav_msgs/msg/Odometry"))
@@ -270,8 +273,8 @@ class CdrCodec:
         """nav_msgs/Odometry: pose in map, twist in the device's base_link."""
         return self._odometry.pack(
             *divmod(value.stamp_ns, NS),
-            MAP_FRAME,
-            base_link(value.vue_id),
+            self._frames.map,
+            self._frames.base_of(value.vue_id),
             *value.position.tolist(),
             *value.quaternion.tolist(),
             _bytes(value.pose_cov),
@@ -285,17 +288,28 @@ class CdrCodec:
         return self._transform.pack(
             1,
             *divmod(value.stamp_ns, NS),
-            MAP_FRAME,
-            base_link(value.vue_id),
+            self._frames.map,
+            self._frames.base_of(value.vue_id),
             *value.position.tolist(),
             *value.quaternion.tolist(),
+        )
+
+    def map_to_odom(self, vue_id: str, stamp_ns: int, position: Array, q: Array) -> bytes:
+        """tf2_msgs/TFMessage with map -> odom of a device."""
+        return self._transform.pack(
+            1,
+            *divmod(stamp_ns, NS),
+            self._frames.map,
+            self._frames.odom_of(vue_id),
+            *position.tolist(),
+            *q.tolist(),
         )
 
     def clock_state(self, value: ClockState) -> bytes:
         """netpos_msgs/ClockState."""
         return self._clock_state.pack(
             *divmod(value.stamp_ns, NS),
-            base_link(value.vue_id),
+            self._frames.base_of(value.vue_id),
             value.offset_s,
             value.drift,
             _bytes(value.cov),
@@ -306,7 +320,7 @@ class CdrCodec:
         reasons = sorted(value.rejected)
         return self._track_status.pack(
             *divmod(value.stamp_ns, NS),
-            base_link(value.vue_id),
+            self._frames.base_of(value.vue_id),
             value.state,
             value.nis,
             value.nis_dof,

@@ -212,6 +212,27 @@ class CommonCodec:
             cov=square(msg.pose.covariance, 6)[:3, :3].copy(),
         )
 
+    def fix_to_msg(self, stamp_ns: int, frame_id: str, place: Array, cov: Array) -> Any:
+        """sensor_msgs/NavSatFix of latitude, longitude [deg], height [m] (3,) and the covariance
+        (3, 3) in local east, north and up [m^2]."""
+        status = self._resolve("sensor_msgs/msg/NavSatStatus")(status=0, service=0)
+        return self._resolve("sensor_msgs/msg/NavSatFix")(
+            header=self.header(stamp_ns, frame_id),
+            status=status,
+            latitude=float(place[0]),
+            longitude=float(place[1]),
+            altitude=float(place[2]),
+            position_covariance=flat(cov),
+            position_covariance_type=3,  # all of it is known
+        )
+
+    @staticmethod
+    def pose_of_transform(msg: Any) -> tuple[int, Array, Array]:
+        """Stamp [ns], translation (3,) and rotation (4,) x y z w of a TransformStamped."""
+        q = msg.transform.rotation
+        rotation = np.array([q.x, q.y, q.z, q.w], dtype=np.float64)
+        return stamp_ns(msg.header.stamp), xyz(msg.transform.translation), rotation
+
     def transform_to_msg(self, odometry: Odometry) -> Any:
         """tf2_msgs/TFMessage with map -> base_link."""
         transform = self._resolve("geometry_msgs/msg/Transform")(

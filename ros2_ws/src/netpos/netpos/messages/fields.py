@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,9 +15,52 @@ NS = 1_000_000_000
 _MALFORMED_NS = -(2**62)  # below every stamp that a Time can hold
 
 
+_VUE = "{vue}"
+_FRAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*")
+
+
 def base_link(vue_id: str) -> str:
     """Name of a device's body frame (REP-105)."""
     return f"{vue_id}/base_link"
+
+
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """Names of the frames of messages; ``{vue}`` in them stands for the name of a device.
+
+    ``odom`` empty: the tracker gives ``map`` -> ``base`` itself.
+    """
+
+    map: str = MAP_FRAME
+    odom: str = ""
+    base: str = f"{_VUE}/base_link"
+
+    def base_of(self, vue_id: str) -> str:
+        """Body frame of a device."""
+        return self.base.replace(_VUE, vue_id)
+
+    def odom_of(self, vue_id: str) -> str:
+        """Frame in which the device's dead reckoning gives its place."""
+        return self.odom.replace(_VUE, vue_id)
+
+    def check(self) -> None:
+        """Raises ``ValueError`` for a name that no frame can have, or one used twice."""
+        for name, text in (("map_frame", self.map), ("base_frame", self.base)):
+            _check_frame(name, text)
+        if self.odom:
+            _check_frame("odom_frame", self.odom)
+        if _VUE in self.map:
+            raise ValueError(f"map_frame is one for all devices, got {self.map!r}")
+        used = [text for text in (self.map, self.odom, self.base) if text]
+        if len(set(used)) < len(used):
+            raise ValueError(f"map_frame, odom_frame and base_frame must differ, got {used}")
+
+
+def _check_frame(name: str, text: str) -> None:
+    if not _FRAME.fullmatch(text.replace(_VUE, "vue")):
+        raise ValueError(
+            f"{name} {text!r} is no name of a frame; use letters, digits, _ and /, no / first"
+        )
 
 
 def vue_of_frame(frame_id: str) -> str:

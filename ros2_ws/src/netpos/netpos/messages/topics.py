@@ -32,6 +32,7 @@ GROUND_SPEED = "ground_speed"
 INITIAL_POSE = "initialpose"
 ODOMETRY = "odometry"
 ODOMETRY_SMOOTHED = "odometry_smoothed"
+FIX = "fix"
 CLOCK_STATE = "clock_state"
 TRACK_STATUS = "track_status"
 
@@ -39,10 +40,13 @@ TRACK_STATUS = "track_status"
 NETWORKS = "networks"
 TRACKS = "tracks"
 
-TRACKER_OUTPUTS = (ODOMETRY, ODOMETRY_SMOOTHED, CLOCK_STATE, TRACK_STATUS)
+DEVICE_INPUTS = (INITIAL_POSE, STEP_VELOCITY, GROUND_SPEED, IMU)
+TRACKER_OUTPUTS = (ODOMETRY, ODOMETRY_SMOOTHED, FIX, CLOCK_STATE, TRACK_STATUS)
 
 
 _NO_DEVICES = ("rsu", "run", VIZ)
+_OF_ALL = (CLOCK, DIAGNOSTICS, TF)  # of a whole graph, whatever the namespace of a node
+_TRANSITION_EVENT = "transition_event"  # of a lifecycle node: /<node>/transition_event
 _NAME_MAX = 100  # that of a device and of its network fit into a topic, of 247 characters in ROS
 
 
@@ -58,6 +62,23 @@ def of_vue(vue_id: str, name: str, network: str = "") -> str:
     return f"/{NETWORKS}/{network}/{vue_id}/{name}" if network else f"/{vue_id}/{name}"
 
 
+def to_resolve(topic: str) -> str:
+    """The name a node gives its topic: relative, so that its namespace comes in front and
+    remapping works. Clock, diagnostics and transforms are of the whole graph."""
+    return topic if topic in _OF_ALL else topic.removeprefix("/")
+
+
+def below(topic: str, namespace: str) -> str:
+    """The topic as its nodes call it, whose namespace is ``namespace``; empty for one of other
+    nodes, or of the life of a node."""
+    if topic.endswith(f"/{_TRANSITION_EVENT}"):
+        return ""
+    above = namespace.strip("/")
+    if topic in _OF_ALL or not above:
+        return topic
+    return topic.removeprefix(f"/{above}") if topic.startswith(f"/{above}/") else ""
+
+
 def tracks_of(network: str) -> str:
     """Topic of the tracks of a network: ``/networks/wifi/tracks``."""
     return f"/{NETWORKS}/{network}/{TRACKS}"
@@ -71,7 +92,9 @@ def path_of(vue_id: str, network: str = "") -> str:
 def split(topic: str) -> tuple[str, str]:
     """Device and name of a device's topic; ("", topic) for any other."""
     parts = topic.strip("/").split("/")
-    is_of_device = len(parts) == 2 and parts[0] not in _NO_DEVICES
+    is_of_device = (
+        len(parts) == 2 and parts[0] not in _NO_DEVICES and parts[1] != _TRANSITION_EVENT
+    )
     return (parts[0], parts[1]) if is_of_device else ("", topic)
 
 

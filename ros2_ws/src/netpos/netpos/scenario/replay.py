@@ -20,10 +20,13 @@ from netpos.bags import (
     has_common_definition,
     whole_bag,
 )
+from netpos.common.yaml_text import load_yaml
 from netpos.messages import topics
+from netpos.messages.fields import Frames
 from netpos.messages.network_tracks import network_track_to_msg
 from netpos.messages.values import ImuSample, Odometry
 from netpos.scenario.settings import (
+    CHANGE_FACT,
     TrackerSettings,
     bag_settings,
     fusion_fact,
@@ -76,6 +79,7 @@ def replay_bag(
     bag_in, bag_out = Path(bag_in), Path(bag_out)
     with BagReader(bag_in) as source:
         settings = changed(settings or bag_settings(source), overrides or {})
+        _check_changes(source, overrides or {})
         config = TrackerConfig.from_mapping(settings.parameters)
         if topics.RSU_MEASUREMENTS not in source.topics:
             raise BagError(
@@ -96,14 +100,28 @@ def replay_bag(
                 epochs += len(batch)
                 estimates += sum(output.odometry is not None for output in batch)
                 for output in batch:
-                    write_output(out, output)
+                    write_output(out, output, config.frames)
                 if progress is not None:
                     progress(done)
             for vue_id, odometry in tracker.smoothed().items() if smooth else ():
-                _write_smoothed(out, vue_id, odometry)
+                _write_smoothed(out, vue_id, odometry, config.frames)
         rejected = {vue: dict(counts) for vue, counts in tracker.rejected().items()}
         refused = tracker.refused_rsus()
         return ReplaySummary(not_usual(config), epochs, estimates, rejected, refused)
+
+
+def _check_changes(source: BagReader, overrides: Mapping[str, Any]) -> None:
+    """Nobody knows between which measurements a parameter changed while a bag was recorded: what
+    holds for all of it is to be said."""
+    names: set[str] = set()
+    for text in source.facts.get(CHANGE_FACT, ()):
+        names |= (load_yaml(text) or {}).keys() - {"stamp_ns"}
+    unsaid = sorted(names - overrides.keys())
+    if unsaid:
+        raise BagError(
+            f"{source.path}: {', '.join(unsaid)} changed while it was recorded; say what holds"
+            f" for all of it, such as --set {unsaid[0]}=VALUE"
+        )
 
 
 def changed(settings: TrackerSettings, overrides: Mapping[str, Any]) -> TrackerSettings:
@@ -116,7 +134,9 @@ def changed(settings: TrackerSettings, overrides: Mapping[str, Any]) -> TrackerS
     file = rest.pop(_LIST, None)
     return replace(
         settings,
-        rsus=settings.rsus if file is None else list_of(str(file)),
+        rsus=settings.rsus
+        if file is None
+        else list_of(str(file), str(rest.get("datum", settings.parameters.get("datum", "")))),
         parameters={**settings.parameters, **rest},
         fusion={**settings.fusion, **fusion},
     )
@@ -189,16 +209,18 @@ def _short_cut(
     return read
 
 
-def _write_smoothed(out: BagWriter, vue_id: str, odometry: Iterable[Odometry]) -> None:
+def _write_smoothed(
+    out: BagWriter, vue_id: str, odometry: Iterable[Odometry], frames: Frames
+) -> None:
     topic = topics.of_vue(vue_id, topics.ODOMETRY_SMOOTHED)
     for value in odometry:
-        out.write_raw(topic, _ODOMETRY, cdr_codec().odometry(value), value.stamp_ns)
+        out.write_raw(topic, _ODOMETRY, cdr_codec(frames).odometry(value), value.stamp_ns)
 
 
-def write_output(out: BagWriter, output: TrackOutput) -> None:
+def write_output(out: BagWriter, output: TrackOutput, frames: Frames | None = None) -> None:
     """Write what the live node would publish, logged at its stamp; nothing of a device that has
     sent no stamp yet."""
-    make = cdr_codec()
+    make = cdr_codec(frames)
     status = output.status
     if not status.stamp_ns:
         return
@@ -210,7 +232,7 @@ def write_output(out: BagWriter, output: TrackOutput) -> None:
     if output.odometry is not None:
         topic = topics.of_vue(vue_id, topics.ODOMETRY, network)
         write(topic, _ODOMETRY, make.odometry(output.odometry))
-        if not output.revised and not network:
+        if not output.revised and not network and not (frames and frames.odom):
             write(topics.TF, "tf2_msgs/msg/TFMessage", make.transform(output.odometry))
     if output.clock is not None:
         topic = topics.of_vue(vue_id, topics.CLOCK_STATE, network)

@@ -20,6 +20,8 @@ from netpos.tracking.networks.config import FusionConfig
 
 # Name of the fact with the parameters of the tracker, as YAML.
 TRACKER_FACT = "tracker"
+# Name of the facts with parameters that changed while the bag was recorded, as YAML.
+CHANGE_FACT = "tracker_change"
 # Name of the fact with the list of RSUs of the tracker, as YAML.
 RSUS_FACT = "rsus"
 # Name of the fact with the scenario and its seed, for simulated runs, as YAML.
@@ -82,12 +84,19 @@ def tracker_fact(config: TrackerConfig, rsus: str = "") -> dict[str, str]:
     return facts | ({RSUS_FACT: rsus} if rsus else {})
 
 
-def list_of(file: Path | str) -> str:
-    """The RSUs of a file as the text of a list, every digit kept; empty for no file.
+def change_fact(stamp_ns: int, values: Mapping[str, Any]) -> dict[str, str]:
+    """What a bag is told of parameters that changed while its tracker ran, after the estimate of
+    ``stamp_ns``."""
+    return {CHANGE_FACT: yaml.safe_dump({"stamp_ns": stamp_ns, **values})}
+
+
+def list_of(file: Path | str, datum: str = "") -> str:
+    """The RSUs of a file as the text of a list, every digit kept; empty for no file. ``datum``:
+    of a file that gives latitudes and longitudes and no datum of its own.
 
     Raises ``BagError`` for a file that cannot be understood.
     """
-    return rsus_text(read_rsus(Path(file))) if file else ""
+    return rsus_text(read_rsus(Path(file), datum)) if file else ""
 
 
 def not_usual(config: TrackerConfig) -> dict[str, Any]:

@@ -30,7 +30,12 @@ class AdaptiveProcessNoise:
     _explained: float = field(init=False)
 
     def __post_init__(self) -> None:
-        self._explained = float(gate_thresholds(self.config.gate_probability)[2])
+        self.set_config(self.config)
+
+    def set_config(self, config: TrackerConfig) -> None:
+        """Go on with other parameters and what was heard."""
+        self.config = config
+        self._explained = float(gate_thresholds(config.gate_probability)[2])
 
     def copy(self) -> AdaptiveProcessNoise:
         """An independent copy."""

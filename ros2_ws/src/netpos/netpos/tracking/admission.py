@@ -18,12 +18,16 @@ class Admission:
     """
 
     def __init__(self, limit: int, pattern: str, silence_ns: int) -> None:
-        self._limit = limit
-        self._pattern = re.compile(pattern) if pattern else None
-        self._silence_ns = silence_ns
+        self.set_limits(limit, pattern, silence_ns)
         self._sound_ns: dict[str, int] = {}  # stamp of the newest sound item, by device
         self._refused: Counter[str] = Counter()
         self._last_refused = ""
+
+    def set_limits(self, limit: int, pattern: str, silence_ns: int) -> None:
+        """Go on with other limits; who is admitted stays."""
+        self._limit = limit
+        self._pattern = re.compile(pattern) if pattern else None
+        self._silence_ns = silence_ns
 
     def admit(self, vue_id: str, stamp_ns: int, *, sound: bool) -> tuple[str | None, str | None]:
         """Take note of an item of a device; the reason why the device is not admitted, and the

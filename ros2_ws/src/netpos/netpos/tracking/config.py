@@ -10,7 +10,9 @@ from typing import Any
 
 from netpos.common.parameters import check_fields, choice, count, described, from_mapping, real
 from netpos.estimation.motion import ProcessNoise
+from netpos.messages.fields import Frames
 from netpos.tracking.rsus import StepErrors
+from netpos.world.geodesy import datum_of_text
 
 FILTERS = ("ekf", "iekf", "ukf", "srukf", "kf")
 BACKENDS = ("compiled", "filterpy")
@@ -268,6 +270,20 @@ class TrackerConfig:
     integrity_risk: float = real(
         1e-4, 1e-12, 0.5, "probability with which the error may exceed the protection level"
     )
+    map_frame: str = described("map", "frame of RSUs, poses and estimates (REP-105)")
+    odom_frame: str = described(
+        "",
+        "with a name, such as {vue}/odom: /tf gets map_frame -> odom_frame, by the transform from"
+        " there to base_frame that dead reckoning gives on /tf; empty: map_frame -> base_frame",
+    )
+    base_frame: str = described(
+        "{vue}/base_link", "body frame of a device; {vue} stands for its name"
+    )
+    datum: str = described(
+        "",
+        "latitude, longitude [deg] and height [m] on WGS 84 of the origin of map_frame: places"
+        " are given as NavSatFix too; empty: unknown",
+    )
     network: str = described("", "the network whose RSUs count, one of several; empty: all")
     max_devices: int = count(
         200, "devices tracked at once; one that is silent or never sound makes room"
@@ -301,6 +317,9 @@ class TrackerConfig:
             raise ValueError(
                 f"allowed_devices {self.allowed_devices!r} is no regular expression: {error}"
             ) from error
+        self.frames.check()
+        if self.datum:
+            datum_of_text(self.datum)
         if self.require_initial_pose and not self.accept_initialpose:
             raise ValueError("require_initial_pose needs accept_initialpose; set it to true")
         if self.motion_model == "strapdown":
@@ -334,6 +353,16 @@ class TrackerConfig:
                 "filter kf is linear; leave step_length_factor_sd and step_heading_offset_sd_rad"
                 " at 0 or take another filter"
             )
+
+    @property
+    def frames(self) -> Frames:
+        """Names of the frames."""
+        return Frames(self.map_frame, self.odom_frame, self.base_frame)
+
+    @property
+    def datum_values(self) -> tuple[float, float, float] | None:
+        """Latitude, longitude [deg] and height [m] of the datum; None: unknown."""
+        return datum_of_text(self.datum) if self.datum else None
 
     def _check_steady(self) -> None:
         several = self.motion_model in ("interacting", "constant_acceleration")

@@ -126,6 +126,12 @@ class KalmanEstimate(OneModel):
         self._rows = 0
         self._make_room(4)
 
+    def set_config(self, config: TrackerConfig) -> None:
+        """Go on with other live parameters (``live_parameters``)."""
+        self._options = options_of(config)
+        self._motion[Parameter.ACCEL] = motions_of(config)[0][Parameter.ACCEL]
+        self._modes = () if self._components is None else None
+
     def _make_room(self, rows: int) -> None:
         n = self.mean.size
         self._rows = max(rows, self._rows)

@@ -26,11 +26,23 @@ class History(Generic[State]):
         self._length_ns = length_ns
         self._epochs: deque[Epoch] = deque()
         self._snapshots: deque[tuple[int, State]] = deque()
+        self._mark_ns = 0
 
     def clear(self) -> None:
         """Forget all."""
         self._epochs.clear()
         self._snapshots.clear()
+
+    def states(self) -> list[State]:
+        """The states that are kept."""
+        return [state for _, state in self._snapshots]
+
+    def mark(self, state: State) -> None:
+        """Keep the ``state`` after the newest epoch: what comes late but is newer than that never
+        goes back further."""
+        if self._epochs:
+            self._mark_ns = self._epochs[-1].stamp_ns + 1
+            self._snapshots.append((self._mark_ns, state.copy()))  # type: ignore[arg-type]
 
     def remember(self, epoch: Epoch, state: State) -> None:
         """Keep the epoch about to be applied and, from time to time, a copy of the ``state``
@@ -42,7 +54,9 @@ class History(Generic[State]):
         due = not self._snapshots or (
             stamp - self._snapshots[-1][0] >= self._length_ns // _SNAPSHOTS
         )
-        if due:
+        if self._snapshots and self._snapshots[-1][0] < self._mark_ns <= stamp:
+            self._snapshots.append((self._mark_ns, state.copy()))  # type: ignore[arg-type]
+        elif due:
             self._snapshots.append((stamp, state.copy()))  # type: ignore[arg-type]
         while len(self._snapshots) > 1 and self._snapshots[1][0] <= stamp - self._length_ns:
             self._snapshots.popleft()

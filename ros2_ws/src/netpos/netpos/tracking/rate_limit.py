@@ -23,10 +23,16 @@ class RateLimit:
     """
 
     def __init__(self, of_device: int, of_all: int) -> None:
-        self._of_device, self._of_all = of_device, of_all
-        self._apart_ns = max(_NS // (2 * of_device), 1)
         self._counts: dict[tuple[str, str], dict[int, int]] = {}
         self._stamps: dict[tuple[str, str], dict[int, int]] = {}  # by multiples of _apart_ns
+        self.set_limits(of_device, of_all)
+
+    def set_limits(self, of_device: int, of_all: int) -> None:
+        """Go on with other limits; what was counted stays."""
+        self._of_device, self._of_all = of_device, of_all
+        self._apart_ns = max(_NS // (2 * of_device), 1)
+        for source, stamps in self._stamps.items():
+            self._stamps[source] = {ns // self._apart_ns: ns for ns in stamps.values()}
 
     def exceeded(self, rsu_id: str, vue_id: str, stamp_ns: int) -> bool:
         """Whether another measurement with this stamp is one too many."""

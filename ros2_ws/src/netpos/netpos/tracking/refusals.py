@@ -92,7 +92,8 @@ class _Door:
 class Refusals:
     """The refusals of a tracker."""
 
-    def __init__(self) -> None:
+    def __init__(self, map_frame: str = MAP_FRAME) -> None:
+        self._map_frame = map_frame
         self._devices: dict[str, _Door] = {}
         self._rsus: dict[str, _Door] = {}
         self._descriptions: dict[str, str] = {}
@@ -180,7 +181,7 @@ class Refusals:
             tdoa=getattr(item, "tdoa_s", 0.0),
             frame=getattr(item, "frame_id", ""),
             bad_stamp=bad_stamp(malformed_nanosec(item.stamp_ns) or 0),
-            map=MAP_FRAME,
+            map=self._map_frame,
             ahead=ahead_s,
             behind=-ahead_s,
         )

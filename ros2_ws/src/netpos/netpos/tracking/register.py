@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from netpos.messages.fields import MAP_FRAME
 from netpos.messages.values import RsuInfo
 from netpos.tracking import validation
 from netpos.tracking.refusals import SOURCES_MAX, Refusals
@@ -27,9 +28,18 @@ class Register:
     whoever comes; the first pose of each stands. ``any``: whoever comes, with its newest pose.
     """
 
-    def __init__(self, trust: str, listed: Iterable[RsuInfo], refusals: Refusals) -> None:
-        """Raises ``ValueError`` for an unsound list, or ``listed`` without a list."""
-        self._trust = trust
+    def __init__(
+        self,
+        trust: str,
+        listed: Iterable[RsuInfo],
+        refusals: Refusals,
+        map_frame: str = MAP_FRAME,
+    ) -> None:
+        """``map_frame``: what descriptions call the frame of their poses; that of the list is
+        understood.
+
+        Raises ``ValueError`` for an unsound list, or ``listed`` without a list."""
+        self._trust, self._map_frame = trust, map_frame
         self._refusals = refusals
         self._pending: dict[str, RsuInfo] = {}
         self.known: dict[str, Rsu] = {}
@@ -45,7 +55,7 @@ class Register:
 
     def add(self, info: RsuInfo) -> None:
         """Take a description; raises ``ValueError``, and counts it, where it is refused."""
-        fault = validation.rsu_fault(info) or self._contradiction(info)
+        fault = validation.rsu_fault(info, self._map_frame) or self._contradiction(info)
         if fault is not None:
             self._refusals.refuse_description(info.rsu_id, fault)
             raise ValueError(f"RSU refused: {fault}")

@@ -11,8 +11,9 @@ import numpy as np
 from netpos.estimation.protection import NisWindow
 from netpos.messages.values import Array
 from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
+from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import EpochRows
-from netpos.tracking.estimates import Estimate
+from netpos.tracking.estimates import Estimate, KalmanEstimate
 from netpos.tracking.initialise import Initialiser
 from netpos.tracking.networks.secondary import OwnNoise
 from netpos.tracking.nlos_rate import NlosRate
@@ -48,6 +49,13 @@ class TrackSnapshot:
     velocity_ns: dict[str, int] = field(default_factory=dict)
     accepted: int = 0
     rejected: defaultdict[str, int] = field(default_factory=lambda: defaultdict(int))
+
+    def set_config(self, config: TrackerConfig) -> None:
+        """Go on with other live parameters; a first fix under way keeps those it began with."""
+        self.phase_start.config = config
+        self.process_noise.set_config(config)
+        if isinstance(self.estimate, KalmanEstimate):
+            self.estimate.set_config(config)
 
     def copy(self) -> TrackSnapshot:
         """An independent copy, for a track to go back to."""

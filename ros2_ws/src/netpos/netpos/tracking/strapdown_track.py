@@ -146,6 +146,10 @@ class StrapdownTrack:
         """Measurements refused at the door, by reason."""
         self._state = self._fresh()
 
+    def set_config(self, config: TrackerConfig) -> None:
+        """Go on with other live parameters."""
+        self._config = config
+
     def _fresh(self) -> _State:
         return _State(StrapdownStart(self._config), NlosRate.of(self._config))
 

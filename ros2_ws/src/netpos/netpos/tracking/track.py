@@ -32,7 +32,7 @@ from netpos.tracking.epoch_rows import (
     mostly_accepted,
     velocity_inflation,
 )
-from netpos.tracking.estimates import Estimate
+from netpos.tracking.estimates import Estimate, KalmanEstimate
 from netpos.tracking.fit import (
     fits,
     innovations_and_level,
@@ -105,6 +105,22 @@ class Track:
         """Measurements refused at the door, by reason."""
         self._errors: tuple[RsuErrors, ...] = ()
         self._state = self._fresh()
+
+    @property
+    def is_by_sectors(self) -> bool:
+        """Whether the estimate is a bank of filters, one for each sector of a phase."""
+        estimate = self._state.estimate
+        return estimate is not None and not isinstance(estimate, KalmanEstimate)
+
+    def set_config(self, config: TrackerConfig) -> None:
+        """Go on with other live parameters. Epochs that are over keep what they were applied with,
+        unless a measurement comes late that is older than the change."""
+        self._history.mark(self._state)
+        self._config = config
+        self._options = options_of(config)
+        self._gate = self._options.gate_nis
+        for state in (self._state, *self._history.states()):
+            state.set_config(config)
 
     def _fresh(self) -> TrackSnapshot:
         self._lives += 1

@@ -27,6 +27,7 @@ from netpos.tracking.clocks import Clocks, Stranger
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.diagnosis import Finding
 from netpos.tracking.health import HealthConfig, RsuHealth, RsuReport
+from netpos.tracking.live_parameters import LIVE_OF_ONE_MODEL, check_change
 from netpos.tracking.rate_limit import RATE, RateLimit
 from netpos.tracking.refusals import Refusals
 from netpos.tracking.register import Register
@@ -76,19 +77,15 @@ class Tracker:
         self._touched: set[str] = set()
         self._untold: dict[str, int] = {}  # stamps of refusals to be told
         self._errors: dict[str, RsuErrors] = {}  # the newest by RSU
-        self.refusals = Refusals()
+        self.refusals = Refusals(self._config.map_frame)
         """What was refused at the door, by device and RSU."""
-        self._register = Register(self._config.trust, rsus, self.refusals)
+        self._register = Register(self._config.trust, rsus, self.refusals, self._config.map_frame)
         self._rsus = self._register.known
         self._health = RsuHealth(
             HealthConfig(settle_s=settle_s), self._rsus, probation=self._config.trust == "first"
         )
         self.enabled = True
-        self._admission = Admission(
-            self._config.max_devices,
-            self._config.allowed_devices,
-            round(1e9 * self._config.max_gap_s),
-        )
+        self._admission = Admission(*_admission_limits(self._config))
         self._left: list[str] = []
         self._rate = RateLimit(self._config.max_rate_hz, self._config.max_rsu_rate_hz)
 
@@ -96,6 +93,30 @@ class Tracker:
     def config(self) -> TrackerConfig:
         """The effective parameters."""
         return self._config
+
+    def check_config(self, config: TrackerConfig) -> None:
+        """Raises ``ValueError`` where ``set_config`` would, and changes nothing."""
+        changed = check_change(self._config, config)
+        held = sorted(set(changed) & set(LIVE_OF_ONE_MODEL))
+        banks = [v for v, t in self._tracks.items() if isinstance(t, Track) and t.is_by_sectors]
+        if held and banks:
+            raise ValueError(
+                f"{', '.join(held)} cannot change while {', '.join(sorted(banks))} is tracked by"
+                " sectors of a phase; reset the tracker, then set it"
+            )
+
+    def set_config(self, config: TrackerConfig) -> None:
+        """Go on with other parameters, all of them from the next epoch on.
+
+        Raises ``ValueError`` for one that may not change while a tracker runs
+        (``live_parameters``); then nothing changes.
+        """
+        self.check_config(config)
+        self._config = config
+        self._admission.set_limits(*_admission_limits(config))
+        self._rate.set_limits(config.max_rate_hz, config.max_rsu_rate_hz)
+        for track in self._tracks.values():
+            track.set_config(config)
 
     @property
     def rsu_count(self) -> int:
@@ -346,7 +367,7 @@ class Tracker:
             return "disabled"
         match item:
             case RsuMeasurement():
-                fault = validation.measurement_fault(item)
+                fault = validation.measurement_fault(item, self._config.map_frame)
                 if fault is not None:
                     return fault
                 rsu = self._rsus.get(item.rsu_id)
@@ -359,13 +380,13 @@ class Tracker:
                         return fault
                 return rsu.phase_fault() if int(item.fields) & _PHASE else None
             case Velocity():
-                return validation.velocity_fault(item)
+                return validation.velocity_fault(item, self._config.map_frame)
             case GroundSpeed():
                 return validation.speed_fault(item)
             case InitialPose():
                 if not self._config.accept_initialpose:
                     return "initialpose_off"
-                return validation.pose_fault(item)
+                return validation.pose_fault(item, self._config.map_frame)
 
     def _sequencer(self, vue_id: str) -> Sequencer:
         if vue_id not in self._sequencers:
@@ -393,6 +414,10 @@ class Tracker:
             track.posteriors = [] if self._keep_posteriors else None
             self._tracks[vue_id] = track
         return self._tracks[vue_id]
+
+
+def _admission_limits(config: TrackerConfig) -> tuple[int, str, int]:
+    return config.max_devices, config.allowed_devices, round(1e9 * config.max_gap_s)
 
 
 def _strapdown() -> ModuleType:

@@ -104,7 +104,7 @@ def _checks(fields: int) -> _Checks:
     )
 
 
-def measurement_fault(m: RsuMeasurement) -> str | None:
+def measurement_fault(m: RsuMeasurement, map_frame: str = MAP_FRAME) -> str | None:
     """Reason to refuse an RSU measurement whatever the track thinks of it."""
     if not is_vue_id(m.vue_id):
         return "vue_id"
@@ -128,7 +128,7 @@ def measurement_fault(m: RsuMeasurement) -> str | None:
         if refusal.is_bad(value_of(m)):
             return refusal.reason
     if fields & _POSITION:
-        return _frame_fault(m.frame_id) or _gaussian_fault(m.position, m.position_cov)
+        return _frame_fault(m.frame_id, map_frame) or _gaussian_fault(m.position, m.position_cov)
     return None
 
 
@@ -169,11 +169,11 @@ def difference_fault(m: RsuMeasurement, rsu: Rsu, reference: Rsu | None) -> str 
     return "tdoa_too_large" if abs(m.tdoa_s) * SPEED_OF_LIGHT_MPS > reach else None
 
 
-def velocity_fault(v: Velocity) -> str | None:
+def velocity_fault(v: Velocity, map_frame: str = MAP_FRAME) -> str | None:
     """Reason to refuse a velocity."""
     if v.stamp_ns <= 0:
         return stamp_fault(v.stamp_ns)
-    return "frame" if v.frame_id != MAP_FRAME else _gaussian_fault(v.velocity, v.cov)
+    return "frame" if v.frame_id != map_frame else _gaussian_fault(v.velocity, v.cov)
 
 
 def speed_fault(v: GroundSpeed) -> str | None:
@@ -195,24 +195,24 @@ def imu_fault(sample: ImuSample) -> str | None:
     return None if all(abs(v) < _LARGEST for v in values) else "not_finite"
 
 
-def pose_fault(p: InitialPose) -> str | None:
+def pose_fault(p: InitialPose, map_frame: str = MAP_FRAME) -> str | None:
     """Reason to refuse an initial pose; its stamp may be 0 (tools send it so)."""
     if malformed_nanosec(p.stamp_ns) is not None:
         return stamp_fault(p.stamp_ns)
-    return _frame_fault(p.frame_id) or _gaussian_fault(p.position, p.cov)
+    return _frame_fault(p.frame_id, map_frame) or _gaussian_fault(p.position, p.cov)
 
 
-def _frame_fault(frame_id: str) -> str | None:
+def _frame_fault(frame_id: str, map_frame: str) -> str | None:
     """A place is one in the map, or says nothing of where it is."""
-    return None if frame_id in ("", MAP_FRAME) else "frame"
+    return None if frame_id in ("", map_frame) else "frame"
 
 
-def rsu_fault(info: RsuInfo) -> str | None:
+def rsu_fault(info: RsuInfo, map_frame: str = MAP_FRAME) -> str | None:
     """Reason to refuse the description of an RSU."""
     if not info.rsu_id:
         return "rsu_id is empty"
-    if _frame_fault(info.frame_id):
-        return f"pose of {info.rsu_id} is in {info.frame_id!r}; give it in {MAP_FRAME!r}"
+    if _frame_fault(info.frame_id, map_frame):
+        return f"pose of {info.rsu_id} is in {info.frame_id!r}; give it in {map_frame!r}"
     if not (np.isfinite(info.position).all() and np.isfinite(info.quaternion).all()):
         return f"pose of {info.rsu_id} is not finite"
     if abs(float(np.linalg.norm(info.quaternion)) - 1.0) > 1e-3:

@@ -10,11 +10,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-from pyproj import Transformer
 
 from netpos.messages.values import Array
+
+if TYPE_CHECKING:
+    from pyproj import Transformer
 
 HEIGHT_MIN_M, HEIGHT_MAX_M = -2e4, 1e6
 
@@ -35,6 +38,8 @@ class Datum:
 
     @cached_property
     def _topocentric(self) -> Transformer:
+        from pyproj import Transformer  # noqa: PLC0415 - only who has a datum needs it
+
         return Transformer.from_pipeline(
             "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
             "+step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 "
@@ -53,11 +58,37 @@ class Datum:
         longitude, latitude, height = self._topocentric.transform(x, y, z, direction="INVERSE")
         return np.column_stack([latitude, longitude, height])
 
+    def fix(self, position: Array, cov: Array) -> tuple[Array, Array]:
+        """Latitude, longitude [deg], height [m] (3,) of a place (3,) in ``map``, and its
+        covariance (3, 3) in local east, north and up there."""
+        place = self.to_geodetic(np.asarray(position, float)[None])[0]
+        axes = self.enu_axes(place[0], place[1])
+        return place, axes.T @ cov @ axes
+
     def enu_axes(self, latitude_deg: float, longitude_deg: float) -> Array:
         """Local east, north and up at a point, in ``map``: the columns of a rotation (3, 3)."""
         here = _ecef_axes(self.latitude_deg, self.longitude_deg)
         axes: Array = here.T @ _ecef_axes(latitude_deg, longitude_deg)
         return axes
+
+
+def datum_of_text(text: str) -> tuple[float, float, float]:
+    """Latitude, longitude [deg] and height [m] of ``"55.75, 37.62, 150"``.
+
+    Raises ``ValueError`` for anything else, and for what is no place near the earth's surface.
+    """
+    try:
+        values = [float(part) for part in text.replace(",", " ").split()]
+    except ValueError:
+        values = []
+    if len(values) not in (2, 3):
+        raise ValueError(
+            f"datum must be latitude, longitude [deg] and height [m], got {text!r}; write it as"
+            " '55.75, 37.62, 150'"
+        )
+    latitude, longitude, height = (*values, 0.0)[:3]
+    check_geodetic(latitude, longitude, height)
+    return latitude, longitude, height
 
 
 def check_geodetic(latitude_deg: float, longitude_deg: float, height_m: float) -> None:

@@ -37,7 +37,7 @@ def test_a_file_sets_what_its_source_says(tmp_path: Path) -> None:
         code, said = params("--dump", file, "--from", source)
         assert code == 0
         assert f"--params-file {file}" in said.replace("\n", "")
-        values = yaml.safe_load(file.read_text())["ekf_tracker"]["ros__parameters"]
+        values = yaml.safe_load(file.read_text())["/**"]["ros__parameters"]
         settings = settings_from(source)
         assert tuple(values.pop("vues")) == settings.vue_ids
         wanted = TrackerConfig.from_mapping(settings.parameters)

@@ -150,7 +150,7 @@ def test_devices_of_networks_have_names_of_their_own() -> None:
     ],
 )
 def test_other_topics_are_not_wanted(topic: str, type_name: str) -> None:
-    assert not Board.wants(topic, type_name)
+    assert not Board().wants(topic, type_name)
 
 
 def test_health_begins_with_the_worst() -> None:
