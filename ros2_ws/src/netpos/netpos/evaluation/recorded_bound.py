@@ -41,7 +41,7 @@ def recorded_bound_m(
     first_ns, last_ns = int(truth.stamp_ns[0]), int(truth.stamp_ns[-1])
     heard = (m for m in measurements if m.rsu_id in known and first_ns <= m.stamp_ns <= last_ns)
     for stamp, together in itertools.groupby(heard, key=lambda m: m.stamp_ns):
-        found[stamp].append(epoch_rows_of(list(together), known, biases, -1).rows)
+        found[stamp].append(epoch_rows_of(list(together), known, biases).rows)
     if len(found) < 2:
         return None
     stamps = np.array(sorted(found), dtype=np.int64)
