@@ -8,9 +8,10 @@ filters of ``estimates``, ``spatial.SpatialEstimator`` the strapdown filter.
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
@@ -119,6 +120,8 @@ class Estimator(ABC):
     """None before the first fix."""
     biases: BiasStates
     """States for the slow errors of RSUs."""
+    recorder: Any = None
+    """Where posteriors are kept for a smoother; None: nowhere."""
     bias: Array
     """(2, k) standard deviation and correlation time of these states."""
 
@@ -135,17 +138,28 @@ class Estimator(ABC):
         """What a first fix lacks, for people."""
 
     @abstractmethod
-    def fresh(self) -> Estimator:
-        """One without an estimate, of the same device."""
+    def _forget(self) -> None:
+        """Become an estimator that has heard nothing."""
 
-    @abstractmethod
-    def copy(self) -> Estimator:
+    def fresh(self) -> Self:
+        """One without an estimate, of the same device."""
+        twin = copy.copy(self)
+        twin._forget()
+        return twin
+
+    def copy(self) -> Self:
         """An independent copy, to go back to; samples and what is kept for a smoother are
         shared."""
+        twin = copy.copy(self)
+        twin.biases = self.biases.copy()
+        return twin
 
-    @abstractmethod
-    def unrecorded(self) -> Estimator:
-        """A copy that keeps nothing for a smoother: to look ahead."""
+    def ahead(self, stamp_ns: int) -> Self:
+        """A copy that is at ``stamp_ns`` and keeps nothing for a smoother."""
+        twin = self.copy()
+        twin.recorder = None
+        twin.predict(stamp_ns)
+        return twin
 
     # measurements
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping, Sequence
 from itertools import count
+from typing import Self
 
 import numpy as np
 
@@ -52,6 +52,7 @@ class PlanarEstimator(Estimator):
 
     estimate: Estimate | None
     imu: ImuBuffer
+    recorder: PosteriorRecorder | None
 
     def __init__(
         self,
@@ -69,7 +70,6 @@ class PlanarEstimator(Estimator):
         self._steady = config.steady_accel_density_mps2_sqrthz > 0.0
         self._secondary = Secondary(vue_id, config) if config.network else None
         self.recorder = PosteriorRecorder.of(vue_id, config)
-        """Where posteriors are kept for a smoother; None: nowhere."""
         self._forget()
 
     def _forget(self) -> None:
@@ -89,25 +89,14 @@ class PlanarEstimator(Estimator):
         self._pose: tuple[int, Array, Array] | None = None  # waits for its heading
         self._yaw = 0.0
 
-    def fresh(self) -> PlanarEstimator:
-        twin = copy.copy(self)
-        twin._forget()
-        return twin
-
-    def copy(self) -> PlanarEstimator:
-        twin = copy.copy(self)
-        twin.biases = self.biases.copy()
+    def copy(self) -> Self:
+        twin = super().copy()
         twin._process_noise = self._process_noise.copy()
         if self.estimate is None:
             twin._initialiser = self._initialiser.copy()
             twin._phase_start = self._phase_start.copy()
         else:
             twin.estimate = self.estimate.copy()
-        return twin
-
-    def unrecorded(self) -> PlanarEstimator:
-        twin = self.copy()
-        twin.recorder = None
         return twin
 
     @property

@@ -7,9 +7,9 @@ by the biases of RSUs. The IMU moves the estimate between epochs.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -149,6 +149,7 @@ class SpatialEstimator(Estimator):
 
     estimate: StrapdownEstimate | None
     imu: SampleBuffer
+    recorder: Recorder | None = None
 
     def __init__(self, vue_id: str, config: TrackerConfig, rsus: Mapping[str, Rsu]) -> None:
         super().__init__(vue_id, config, rsus, ROWS_3D)
@@ -156,8 +157,6 @@ class SpatialEstimator(Estimator):
         self._sensors, self._gyro = sensors_of(config), config.gyro_noise_density
         self._gate = gate_thresholds(config.gate_probability)
         self._robust = robust_options_of(config)
-        self.recorder: Recorder | None = None
-        """Where what a smoother needs is kept; None: nowhere."""
         self._forget()
 
     def _forget(self) -> None:
@@ -166,23 +165,12 @@ class SpatialEstimator(Estimator):
         self._start = StrapdownStart(self._config)
         self._heard: Recent = ()  # epochs without an estimate
 
-    def fresh(self) -> SpatialEstimator:
-        twin = copy.copy(self)
-        twin._forget()
-        return twin
-
-    def copy(self) -> SpatialEstimator:
-        twin = copy.copy(self)
-        twin.biases = self.biases.copy()
+    def copy(self) -> Self:
+        twin = super().copy()
         if self.estimate is None:
             twin._start = self._start.copy()
         else:
             twin.estimate = self.estimate.copy()
-        return twin
-
-    def unrecorded(self) -> SpatialEstimator:
-        twin = self.copy()
-        twin.recorder = None
         return twin
 
     @property

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from netpos.estimation.chi_square import chi_square_bound
+from netpos.estimation.report import level_of
 from netpos.messages.values import (
     InitialPose,
     Odometry,
@@ -30,7 +31,6 @@ from netpos.tracking.nlos_rate import NlosRate
 from netpos.tracking.observations import FittedEpoch
 from netpos.tracking.planar import PlanarEstimator
 from netpos.tracking.report import (
-    LEVEL_MAX_M,
     EpochResult,
     EstimateStatus,
     TrackOutput,
@@ -124,8 +124,10 @@ class Track:
                 applied = self._apply(epoch.stamp_ns, items)
             for item in watched:
                 self._watch(epoch.stamp_ns, item)
-        output = self._report(applied)
-        smoothed = self._state.estimator.record(self._state.segment)
+        estimator = self._state.estimator
+        estimator.predict(epoch.stamp_ns)
+        output = self._report(applied, estimator)
+        smoothed = estimator.record(self._state.segment)
         return replace(output, smoothed=smoothed) if smoothed else output
 
     def revise(self, late: list[tuple[int, Item]]) -> tuple[list[Epoch], TrackOutput]:
@@ -340,16 +342,11 @@ class Track:
 
     def _ahead(self, stamp_ns: int) -> TrackOutput:
         """Report of a later instant, had nothing been heard until then; nothing changes."""
-        state, estimator = self._state, self._state.estimator
-        state.estimator = estimator.unrecorded()
-        try:
-            return self._report(EpochResult(stamp_ns))
-        finally:
-            state.estimator = estimator
+        return self._report(EpochResult(stamp_ns), self._state.estimator.ahead(stamp_ns))
 
-    def _report(self, epoch: EpochResult) -> TrackOutput:
-        state, config, estimator = self._state, self._config, self._state.estimator
-        estimator.predict(epoch.stamp_ns)
+    def _report(self, epoch: EpochResult, estimator: Estimator) -> TrackOutput:
+        """What is told after an ``epoch``, at which the ``estimator`` is."""
+        state, config = self._state, self._config
         rejected = total(self.refused, state.rejected)
         if estimator.estimate is None:
             open_ = EstimateStatus(missing=self._missing())
@@ -359,7 +356,7 @@ class Track:
         known = EstimateStatus(
             heard_ns=state.last_accepted_ns,
             position_sd_m=described.position_sd_m,
-            level_m=self._level(epoch.stamp_ns, described.radius_m),
+            level_m=estimator.radius(self._level(epoch.stamp_ns, described.radius_m)),
             modes=estimator.modes,
             steps=estimator.step_calibration(),
             refused_in_row=state.rejected_in_row,
@@ -374,13 +371,13 @@ class Track:
         )
 
     def _level(self, stamp_ns: int, radius_m: float) -> float:
-        """Protection level [m]; ``radius_m``: that of the estimate's Gaussian."""
-        state, config = self._state, self._config
-        level = state.nis_window.inflation() * radius_m
+        """Protection level [m] of the estimate's Gaussian, whose error leaves ``radius_m``."""
+        state, inflation = self._state, self._state.nis_window.inflation()
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
-        moved = state.undetected_m + config.manoeuvre_sd_mps * unheard_s
-        level = max(level, min(moved, LEVEL_MAX_M))
-        return state.estimator.radius(level)
+        level: float = level_of(
+            radius_m, inflation, state.undetected_m, self._config.manoeuvre_sd_mps, unheard_s
+        )
+        return level
 
 
 def _estimator_of(
