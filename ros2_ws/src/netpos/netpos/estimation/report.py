@@ -47,7 +47,8 @@ def run_levels(
     epochs: Epochs, run: Run, motions: Array, bias: Array, options: FilterOptions
 ) -> Array:
     """Protection levels [m] (N,) that a track reports of the ``epochs`` of which
-    ``components.run_epochs`` made ``run``; the groups of an epoch have equally many rows.
+    ``components.run_epochs`` made ``run``, or of the first N of them; the groups of an epoch have
+    equally many rows.
 
     motions : (N, Parameter) of each epoch, or (1, Parameter) of all. Where part of the groups was
     refused, which ones is not known here, and the level of a manoeuvre takes them all.
@@ -62,7 +63,7 @@ def run_levels(
 
 def _nis_of_all_groups(epochs: Epochs, run: Run, options: FilterOptions) -> tuple[Array, Array]:
     """NIS and number of rows (N,) of the epochs, refused groups as at their gate."""
-    row_start, rows = epochs.row_start, epochs.rows
+    row_start, rows = epochs.row_start[: run.nis.size + 1], epochs.rows
     dof = np.diff(row_start)
     groups = rows[row_start[1:] - 1, GROUP].astype(int) + 1
     refused = options.gate_nis[np.minimum(dof // groups, GATE_SIZE - 1)]
@@ -85,7 +86,7 @@ def _undetected(
     x, P, motion = means[0].copy(), covs[0].copy(), motions[0].copy()
     scratch = level_scratch(x.size, np.diff(row_start).max())
     heard_ns, accepted = stamps_ns[0], np.ones(GATE_SIZE)
-    for k in range(1, stamps_ns.size):
+    for k in range(1, groups.size):
         heard_ns = stamps_ns[k - 1] if groups[k - 1] > 0 else heard_ns
         dt = (stamps_ns[k] - stamps_ns[k - 1]) * 1e-9
         unheard_s = (stamps_ns[k] - heard_ns) * 1e-9
