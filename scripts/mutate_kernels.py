@@ -67,6 +67,7 @@ TESTS_OF = {
     "tracking/output": "test_output.py",
     "tracking/phase_fix": "test_phase_fix.py",
     "protection": "test_protection.py",
+    "report": "test_report.py",
     "components": "test_components.py",
     "tracking/sectors": "test_sector_bank.py -kwhere_a_phase",
     "tracking/sector_bank": "test_sector_bank_rules.py test_sector_bank.py",

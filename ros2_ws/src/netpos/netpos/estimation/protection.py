@@ -29,6 +29,7 @@ _COS2 = np.cos(np.linspace(0.0, np.pi / 2, _ANGLES + 1)) ** 2
 _WEIGHT = np.append(np.append(0.5, np.ones(_ANGLES - 1)), 0.5) / _ANGLES
 _ITERATIONS = 20
 _NEGLIGIBLE = 40.0  # exponent of a term too small for the sum's digits
+_WINDOW, _CONFIDENCE = 50, 0.999  # of the NIS: epochs, and that the covariance stands
 RISK_MIN, RISK_MAX = 1e-15, 0.5
 
 
@@ -160,7 +161,7 @@ class NisWindow:
     or the factor sees nothing of what matters.
     """
 
-    def __init__(self, epochs: int = 50, confidence: float = 0.999) -> None:
+    def __init__(self, epochs: int = _WINDOW, confidence: float = _CONFIDENCE) -> None:
         if epochs < 1:
             raise ValueError(f"epochs must be >= 1, got {epochs}")
         if not 0.5 <= confidence < 1.0:
@@ -185,6 +186,22 @@ class NisWindow:
         if dof == 0 or nis <= chi_square_bound(dof, self._tail):
             return 1.0
         return math.sqrt(nis / dof)
+
+    @staticmethod
+    def of_run(nis: Array, dof: Array) -> Array:
+        """Factor on the sd (N,) after each of the epochs of a run, of their NIS (N,) and its
+        degrees of freedom (N,)."""
+        heard = dof > 0
+        sums = np.cumsum([nis[heard], dof[heard]], axis=1)
+        sums[:, _WINDOW:] = sums[:, _WINDOW:] - sums[:, :-_WINDOW]
+        total, rows = sums[0], np.rint(sums[1]).astype(int)
+        numbers, index = np.unique(rows, return_inverse=True)
+        tail = 1.0 - _CONFIDENCE
+        bounds = np.array([chi_square_bound(int(n), tail) for n in numbers])
+        factor = np.ones(total.size)
+        large = total > bounds[index]
+        factor[large] = np.sqrt(total[large] / rows[large])
+        return np.append(1.0, factor)[np.cumsum(heard)]
 
     def copy(self) -> NisWindow:
         """An independent copy: a track that goes back in time goes back to it."""

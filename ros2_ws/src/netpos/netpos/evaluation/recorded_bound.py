@@ -41,7 +41,7 @@ def recorded_bound_m(
     first_ns, last_ns = int(truth.stamp_ns[0]), int(truth.stamp_ns[-1])
     heard = (m for m in measurements if m.rsu_id in known and first_ns <= m.stamp_ns <= last_ns)
     for stamp, together in itertools.groupby(heard, key=lambda m: m.stamp_ns):
-        rows_by_stamp[stamp].append(epoch_rows_of(list(together), known, biases, -1).rows)
+        rows_by_stamp[stamp].append(epoch_rows_of(list(together), known, biases).rows)
     if len(rows_by_stamp) < 2:
         return None
     stamps = np.array(sorted(rows_by_stamp), dtype=np.int64)

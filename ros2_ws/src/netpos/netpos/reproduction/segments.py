@@ -11,10 +11,10 @@ from netpos.estimation import engine
 from netpos.estimation.components import Dynamics, run_epochs
 from netpos.estimation.engine import Run
 from netpos.estimation.measurement import BIAS
+from netpos.estimation.report import run_levels
 from netpos.estimation.state import N_CORE
 from netpos.evaluation.metrics import NS
 from netpos.messages.values import Array, ImuSample
-from netpos.reproduction.integrity import levels
 from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.imu_buffer import ImuBuffer
@@ -120,7 +120,7 @@ class Follower:
             else:
                 done = self._stepped(part, mean, cov, part_run, imu, part_motions)
             end = first + done
-            level[first:end] = levels(
+            level[first:end] = run_levels(
                 part.measured, _part(part_run, 0, done), part_motions, part.bias, self._options
             )
             lost = end < count

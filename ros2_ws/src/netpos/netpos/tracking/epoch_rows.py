@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +16,8 @@ from netpos.messages.values import Array, Field, GroundSpeed, RsuMeasurement, Ve
 from netpos.tracking.rsus import REFERENCED, BiasStates, Rsu
 
 Source = RsuMeasurement | Velocity | GroundSpeed
+Sites = tuple[bool, Array, Array | None]
+"""As ``rows.put_measurement`` takes them."""
 _TOA = int(Field.TOA)
 _VELOCITY_H = np.eye(2, N_CORE, k=X.VX)
 
@@ -41,6 +45,26 @@ class EpochRows:
         return variance
 
 
+class RowForm(NamedTuple):
+    """How the rows of an epoch are written for an estimator.
+
+    put : ``rows.put_measurement`` of it, called with the rows, the index of the first one to
+        write, the measurement, its ``Sites`` and its group; returns the index after the last one
+    speed : row (1, ROW_WIDTH) of a ground speed, its variance and its group
+    """
+
+    put: Callable[[Array, int, RsuMeasurement, Sites, int], int]
+    speed: Callable[[float, float, int], Array]
+
+
+def planar_form(heading: int = -1) -> RowForm:
+    """Rows of a planar estimator; ``heading``: state index of the device's heading, -1: none."""
+    return RowForm(partial(put_measurement, heading=heading), speed_row)
+
+
+_PLANAR = planar_form()
+
+
 def reference_place(m: RsuMeasurement, rsus: Mapping[str, Rsu]) -> Array | None:
     """``rsu_place`` of the RSU that a difference counts from; None where there is none."""
     return rsus[m.reference_rsu_id].place if int(m.fields) & REFERENCED else None
@@ -62,23 +86,23 @@ def epoch_rows_of(
     items: Sequence[Source],
     rsus: Mapping[str, Rsu],
     biases: BiasStates | None,
-    heading: int,
+    form: RowForm = _PLANAR,
     inflation: Mapping[str, float] | None = None,
 ) -> EpochRows:
     """Rows of the items, one group each; biases heard for the first time are added to ``biases``
     (None: rows without).
 
-    heading : state index of the device's heading, -1: none
+    form : of the estimator that takes them
     inflation : variance factor of velocities with correlated errors, by source
     """
-    rows, end = np.empty((ROWS_MAX * len(items), ROW_WIDTH)), 0
+    rows, end = np.empty(((ROWS_MAX + 1) * len(items), ROW_WIDTH)), 0
     shared = shared_references(items)
     for group, item in enumerate(items):
         first = end
         if isinstance(item, RsuMeasurement):
             rsu = rsus[item.rsu_id]
             sites = rsu.cone, rsu.place, reference_place(item, rsus)
-            end = put_measurement(rows, first, item, sites, group, heading)
+            end = form.put(rows, first, item, sites, group)
             if biases is None:
                 continue
             shares = item.reference_rsu_id in shared
@@ -96,7 +120,7 @@ def epoch_rows_of(
             if max(states) >= 0:
                 block[:, KIND], block[:, BIAS], block[:, COMMON] = Kind.STEP_VELOCITY, *states
         else:
-            block = speed_row(item.speed_mps, item.speed_var, group)
+            block = form.speed(item.speed_mps, item.speed_var, group)
         end += len(block)
         rows[first:end] = block
     return EpochRows(rows[:end], tuple(items))

@@ -18,6 +18,10 @@ class ImuBuffer:
     """
 
     def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all samples."""
         self._stamps: list[int] = []
         self._samples: list[tuple[float, float]] = []
         self._integrals: list[tuple[float, float, int]] = []  # yaw, speed, time in holes [ns]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import MutableMapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -118,11 +117,9 @@ def with_sectors(config: TrackerConfig, estimate: Estimate | None, rows: Array) 
     return PhaseAmbiguityBank.promote(config, estimate.stamp_ns, mean, cov, rows, at)
 
 
-def corrections(estimate: Estimate, rejected: MutableMapping[str, int]) -> int:
-    """How often a decision about the sector was replaced since last asked; counted as
-    ``sector_corrected``."""
+def corrections(estimate: Estimate) -> int:
+    """How often a decision about the sector was replaced since last asked."""
     if not isinstance(estimate, PhaseAmbiguityBank) or not estimate.corrected:
         return 0
     corrected, estimate.corrected = estimate.corrected, 0
-    rejected["sector_corrected"] += corrected
     return corrected

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from netpos.estimation.report import LEVEL_MAX_M
 from netpos.messages.values import (
     ClockState,
     NetworkTrack,
@@ -74,8 +75,6 @@ class EstimateStatus:
     steps: StepCalibration | None = None
 
 
-LEVEL_MAX_M = 1e6
-"""Protection level of a track whose error nothing bounds."""
 NO_ESTIMATE = EstimateStatus()
 
 

@@ -132,3 +132,36 @@ class FixedLag:
             done.append(self._smoother.first(list(self._window)))
             self._window.popleft()
         return done
+
+
+class PosteriorRecorder:
+    """Keeps the posteriors of one device, for smoothing online, afterwards, or both."""
+
+    def __init__(self, vue_id: str, config: TrackerConfig, *, keep: bool) -> None:
+        """``keep``: all, for ``smoothed``. Raises ``ValueError`` as ``check_smoothable``."""
+        self.posteriors: list[Posterior] = []
+        self._keep = keep
+        self._smoother = Smoother(vue_id, config)
+        self._fixed_lag = FixedLag(vue_id, config) if config.fixed_lag_s > 0.0 else None
+
+    @classmethod
+    def of(
+        cls, vue_id: str, config: TrackerConfig, *, keep: bool = False
+    ) -> PosteriorRecorder | None:
+        """The recorder that is wanted; None: none."""
+        return cls(vue_id, config, keep=keep) if keep or config.fixed_lag_s > 0.0 else None
+
+    def note(self, posterior: Posterior) -> tuple[Odometry, ...]:
+        """Take the posterior of an epoch; odometry of epochs that are now older than the lag."""
+        if self._keep:
+            self.posteriors.append(posterior)
+        return () if self._fixed_lag is None else tuple(self._fixed_lag.add(posterior))
+
+    def go_back(self, stamp_ns: int) -> None:
+        """Forget the posteriors from ``stamp_ns`` on; the fixed lag replaces its own."""
+        while self.posteriors and self.posteriors[-1].stamp_ns >= stamp_ns:
+            self.posteriors.pop()
+
+    def smoothed(self) -> list[Odometry]:
+        """Odometry of every posterior kept, given all measurements."""
+        return self._smoother.interval(self.posteriors)

@@ -37,6 +37,10 @@ class SampleBuffer:
     """The samples of the last minute, as the strapdown kernels take them."""
 
     def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all samples."""
         self._stamps: list[int] = []
         self._rates: list[tuple[float, ...]] = []
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from types import ModuleType
-from typing import TYPE_CHECKING
 
 from netpos.messages.topics import is_vue_id
 from netpos.messages.values import (
@@ -36,14 +34,11 @@ from netpos.tracking.rsus import REFERENCED
 from netpos.tracking.sequencer import IMU, Epoch, Item, Sequencer
 from netpos.tracking.shared_errors import SharedErrors
 from netpos.tracking.smoothing import check_smoothable
-from netpos.tracking.track import Track
+from netpos.tracking.track import Track, warm_up_strapdown
 
 _PHASE = int(Field.PHASE)  # a plain integer: arithmetic of flags costs ten times as much
 _OLD_POSE_NS = 1_000_000_000
 _TELL_EVERY = 10  # refused items of a device without an estimate
-
-if TYPE_CHECKING:
-    from netpos.tracking.strapdown_track import StrapdownTrack
 
 
 class Tracker:
@@ -68,8 +63,8 @@ class Tracker:
         if keep_posteriors:
             check_smoothable(self._config)
         if self._config.motion_model == "strapdown":
-            _strapdown().warm_up(self._config)
-        self._tracks: dict[str, Track | StrapdownTrack] = {}
+            warm_up_strapdown(self._config)
+        self._tracks: dict[str, Track] = {}
         self._sequencers: dict[str, Sequencer] = {}
         self._clocks: dict[str, Clocks] = {}  # of devices whose time was set back
         settle_s = max(2.0, self._config.history_s + 1.0)
@@ -98,7 +93,7 @@ class Tracker:
         """Raises ``ValueError`` where ``set_config`` would, and changes nothing."""
         changed = check_change(self._config, config)
         held = sorted(set(changed) & set(LIVE_OF_ONE_MODEL))
-        banks = [v for v, t in self._tracks.items() if isinstance(t, Track) and t.is_by_sectors]
+        banks = [v for v, t in self._tracks.items() if t.is_by_sectors]
         if held and banks:
             raise ValueError(
                 f"{', '.join(held)} cannot change while {', '.join(sorted(banks))} is tracked by"
@@ -340,7 +335,7 @@ class Tracker:
     def _step(
         self,
         sequencer: Sequencer,
-        track: Track | StrapdownTrack,
+        track: Track,
         take: Callable[[Sequencer], list[Epoch]],
     ) -> list[TrackOutput]:
         """Apply the epochs of one device that ``take`` takes, and what came late."""
@@ -403,25 +398,15 @@ class Tracker:
             )
         return self._sequencers[vue_id]
 
-    def track(self, vue_id: str) -> Track | StrapdownTrack:
+    def track(self, vue_id: str) -> Track:
         """Track of a device, new where there is none."""
-        if vue_id not in self._tracks and self._config.motion_model == "strapdown":
-            self._tracks[vue_id] = _strapdown().track_of(
-                vue_id, self._config, self._rsus, self._health, record=self._keep_posteriors
-            )
-        elif vue_id not in self._tracks:
+        if vue_id not in self._tracks:
             track = Track(vue_id, self._config, self._rsus, self._health, self._shared)
-            track.posteriors = [] if self._keep_posteriors else None
+            if self._keep_posteriors:
+                track.record()
             self._tracks[vue_id] = track
         return self._tracks[vue_id]
 
 
 def _admission_limits(config: TrackerConfig) -> tuple[int, str, int]:
     return config.max_devices, config.allowed_devices, round(1e9 * config.max_gap_s)
-
-
-def _strapdown() -> ModuleType:
-    """The strapdown track, which brings SciPy's rotations: a planar tracker does without."""
-    from netpos.tracking import strapdown_track  # noqa: PLC0415
-
-    return strapdown_track

@@ -297,8 +297,8 @@ def test_a_run_equals_the_tracker(metis: Any, name: str, rtol: float) -> None:
         ([o.odometry.pose_cov[:2, :2] for o in outputs], covs[:, POSITION, POSITION]),
         ([o.status.nis for o in outputs], nis),
         ([o.clock.offset_s for o in outputs], means[:, X.CLOCK] / c),
-        ([tracker._tracks[pose.vue_id]._state.estimate.mean], means[-1:]),
-        ([tracker._tracks[pose.vue_id]._state.estimate.cov], covs[-1:]),
+        ([tracker._tracks[pose.vue_id]._state.estimator.estimate.mean], means[-1:]),
+        ([tracker._tracks[pose.vue_id]._state.estimator.estimate.cov], covs[-1:]),
     ]
     for got, want in compared:
         if rtol == 0.0:

@@ -213,6 +213,21 @@ def test_window_finds_the_scale_and_is_quiet_where_the_filter_is_right() -> None
             assert np.median(factors) == pytest.approx(scale, rel=0.03)
 
 
+def test_window_over_a_run() -> None:
+    """Sums of the last fifty epochs with measurements, by slices, against SciPy's bound."""
+    rng = np.random.default_rng(3)
+    dof = rng.integers(0, 7, size=300)
+    nis = np.where(dof > 0, rng.chisquare(np.maximum(dof, 1)) * rng.uniform(0.5, 2.2, 300), 0.0)
+    expected = []
+    for k in range(dof.size):
+        heard = np.flatnonzero(dof[: k + 1])[-50:]
+        total, rows = nis[heard].sum(), dof[heard].sum()
+        inflated = rows > 0 and total > stats.chi2.isf(1e-3, rows)
+        expected.append(math.sqrt(total / rows) if inflated else 1.0)
+    assert 0 < np.count_nonzero(np.array(expected) > 1.0) < dof.size
+    np.testing.assert_allclose(NisWindow.of_run(nis, dof), expected, rtol=1e-12)
+
+
 @pytest.mark.parametrize("bad", [{"epochs": 0}, {"confidence": 1.0}, {"confidence": 0.1}])
 def test_window_refuses_unsound_settings(bad: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(bad))):

@@ -62,7 +62,7 @@ def test_every_filter_tracks_with_every_model(world: Any, name: str, model: str)
     """At the end position, velocity and clock are within 4 sd, and the sd is what it may be."""
     fields = Field.POSITION if name == "kf" else Field.AZIMUTH | Field.TOA
     tracker, outputs = track(world, 3, fields, filter=name, motion_model=model)
-    estimate = tracker._tracks["vue_1"]._state.estimate
+    estimate = tracker._tracks["vue_1"]._state.estimator.estimate
     size = {"constant_velocity": 6, "constant_turn": 7, "interacting": 7}.get(model, 8)
     assert estimate.mean.size == size
     true = truth((estimate.stamp_ns - T0) * 1e-9)

@@ -120,11 +120,12 @@ def report(output: TrackOutput) -> list[Any]:
 def state(tracker: Tracker) -> list[Any]:
     """All that a later epoch depends on, bit by bit."""
     s = tracker._tracks["vue_1"]._state
-    estimate = [s.estimate.stamp_ns, s.estimate.mean.tobytes(), s.estimate.cov.tobytes()]
-    biases = [s.biases.sd, s.biases.tau_s, s.biases._slots, s.biases._last_ns, s.bias.tobytes()]
+    e, b = s.estimator, s.estimator.biases
+    estimate = [e.estimate.stamp_ns, e.estimate.mean.tobytes(), e.estimate.cov.tobytes()]
+    biases = [b.sd, b.tau_s, b._slots, b._last_ns, e.bias.tobytes()]
     counts = [s.accepted, dict(s.rejected), s.rejected_in_row, s.last_accepted_ns, s.has_clock]
     window = [list(s.nis_window._nis), list(s.nis_window._dofs)]
-    return [estimate, biases, counts, s.yaw, window]
+    return [estimate, biases, counts, e._yaw, window]
 
 
 def config_of(name: str, **change: Any) -> dict[str, Any]:
@@ -353,8 +354,8 @@ def test_without_history_nothing_goes_back(world: Any) -> None:
     (output,) = fed(partial, batches[9][2:])
     assert (output.status.used, output.revised) == (1, False)
     np.testing.assert_allclose(
-        partial._tracks["vue_1"]._state.estimate.mean[:4],
-        tracker._tracks["vue_1"]._state.estimate.mean[:4],
+        partial._tracks["vue_1"]._state.estimator.estimate.mean[:4],
+        tracker._tracks["vue_1"]._state.estimator.estimate.mean[:4],
         atol=1e-3,
     )
 

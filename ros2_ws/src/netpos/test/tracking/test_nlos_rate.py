@@ -119,5 +119,5 @@ def test_late_measurements_end_in_the_same_estimate(world: Any, feed: Any) -> No
         if k == 45:
             feed(late, epochs[40][:1])
     first, second = (t._tracks["vue_1"]._state for t in (in_order, late))
-    np.testing.assert_array_equal(first.estimate.mean, second.estimate.mean)
+    np.testing.assert_array_equal(first.estimator.estimate.mean, second.estimator.estimate.mean)
     assert [first.nlos_rate.share(n) for n in RSUS] == [second.nlos_rate.share(n) for n in RSUS]

@@ -46,14 +46,14 @@ def run(world: Any, epochs: list[list[RsuMeasurement]], **change: Any) -> tuple[
     """Outputs and posteriors of a tracker."""
     tracker: Tracker = world.tracker(**config(**change))
     track = tracker.track("vue_1")
-    track.posteriors = []
+    track.record()
     outputs = []
     for epoch in epochs:
         for m in epoch:
             tracker.add(m)
         outputs += tracker.process()
     outputs += tracker.flush()
-    return outputs, track.posteriors
+    return outputs, track._state.estimator.recorder.posteriors
 
 
 def squared_errors(odometry: list[Odometry], truth: dict[int, Array]) -> Array:

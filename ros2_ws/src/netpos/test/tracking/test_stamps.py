@@ -27,7 +27,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
 def state(tracker: Tracker) -> list[Any]:
     """Estimate and counts, bit by bit."""
     s = tracker._tracks["vue_1"]._state
-    estimate = [s.estimate.stamp_ns, s.estimate.mean.tobytes(), s.estimate.cov.tobytes()]
+    estimate = [
+        s.estimator.estimate.stamp_ns,
+        s.estimator.estimate.mean.tobytes(),
+        s.estimator.estimate.cov.tobytes(),
+    ]
     return [*estimate, s.accepted, dict(s.rejected), s.last_accepted_ns]
 
 
@@ -129,9 +133,9 @@ def test_a_gap_inflates_the_covariance_and_no_more(world: Any, name: str) -> Non
         tracker = ran(world, epochs(world, 20), **config, max_future_s=1e5)
         tracker.flush()
         track = tracker._tracks["vue_1"]
-        before = track._state.estimate.cov
-        ahead = track._state.estimate.copy()
-        ahead.predict(T0 + round((1.9 + gap_s) * 1e9), track._state.bias)
+        before = track._state.estimator.estimate.cov
+        ahead = track._state.estimator.estimate.copy()
+        ahead.predict(T0 + round((1.9 + gap_s) * 1e9), track._state.estimator.bias)
         np.linalg.cholesky(ahead.cov)
         assert np.isfinite(ahead.mean).all()
         assert ahead.cov[X.PX, X.PX] > before[0, 0]

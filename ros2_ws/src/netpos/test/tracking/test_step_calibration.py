@@ -143,7 +143,7 @@ def test_nothing_is_estimated_unless_asked_for(world: Any, feed: Any) -> None:
         (output,) = feed(tracker, world.measure(t, true_state(t)))
     assert output.status.steps == StepCalibration()
     states = BiasStates()
-    epoch_rows = epoch_rows_of([step(1.0, 1.0, 0.0, np.zeros(2))], {}, states, -1)
+    epoch_rows = epoch_rows_of([step(1.0, 1.0, 0.0, np.zeros(2))], {}, states)
     assert (epoch_rows.rows[:, KIND] == Kind.LINEAR).all()
     assert states.sd == []
 
@@ -151,7 +151,7 @@ def test_nothing_is_estimated_unless_asked_for(world: Any, feed: Any) -> None:
 def test_every_source_of_velocities_has_states_of_its_own() -> None:
     states = BiasStates(8, StepErrors(length_sd=0.1, heading_sd_rad=0.2, tau_s=50.0))
     items = [step(1.0, 1.0, 0.0, np.zeros(2), source=name) for name in ("a", "b", "a")]
-    rows = epoch_rows_of(items, {}, states, -1).rows
+    rows = epoch_rows_of(items, {}, states).rows
     assert (rows[:, KIND] == Kind.STEP_VELOCITY).all()
     np.testing.assert_array_equal(rows[::2, [BIAS, COMMON]], [[8, 9], [10, 11], [8, 9]])
     np.testing.assert_array_equal(states.arrays(), [[0.1, 0.2, 0.1, 0.2], [50.0] * 4])
@@ -172,7 +172,7 @@ def test_before_the_first_fix_they_widen_the_velocity() -> None:
     """0.1 of 2 m/s along, 0.05 rad of it across; sd of the velocity 0.5 m/s."""
     states = BiasStates(6, StepErrors(length_sd=0.1, heading_sd_rad=0.05, tau_s=1.0))
     item = Velocity(stamp_ns=1, vue_id="v", velocity=np.array([2.0, 0.0]), cov=0.25 * np.eye(2))
-    epoch_rows = epoch_rows_of([item], {}, states, -1)
+    epoch_rows = epoch_rows_of([item], {}, states)
     np.testing.assert_allclose(epoch_rows.slow_variance(states), [0.2**2 / 0.25, 0.1**2 / 0.25])
 
 

@@ -14,9 +14,10 @@ from netpos.messages.values import Array, Beacon, ClockState, ImuSample, RsuMeas
 from netpos.radio.noise import generator
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking import Tracker, TrackerConfig, TrackOutput
+from netpos.tracking.epoch_rows import epoch_rows_of
 from netpos.tracking.health import RsuState
 from netpos.tracking.rsus import Rsu
-from netpos.tracking.strapdown_rows import epoch_rows_3d
+from netpos.tracking.spatial import ROWS_3D
 from netpos.tracking.strapdown_start import sound_fix
 
 NS = 1_000_000_000
@@ -249,7 +250,7 @@ def test_without_a_single_culprit_the_fix_says_less() -> None:
 
     def fix(lies: dict[int, float]) -> tuple[Array, Array]:
         bent = [replace(m, range_m=m.range_m + lies.get(i, 0.0)) for i, m in enumerate(measured)]
-        found = sound_fix(epoch_rows_3d(bent, known, None).rows, 1.5)
+        found = sound_fix(epoch_rows_of(bent, known, None, ROWS_3D).rows, 1.5)
         assert found is not None
         return found
 

@@ -243,6 +243,51 @@ def test_a_required_pose_is_waited_for(simulation: Simulation, items: list[Item]
     assert outputs[-1].odometry is not None
 
 
+def with_pose(
+    simulation: Simulation, items: list[Item], stamp_ns: int, aside_m: float
+) -> list[Item | InitialPose]:
+    """The items and a pose ``aside_m`` east of the device, said to be right to a millimetre."""
+    position = simulation.truth(VUE, np.array([stamp_ns])).position[0] + [aside_m, 0.0, 0.0]
+    pose = InitialPose(stamp_ns=stamp_ns, vue_id=VUE, position=position, cov=1e-6 * np.eye(3))
+    return sorted([*items, pose], key=lambda item: item.stamp_ns)
+
+
+@pytest.mark.parametrize("at_s", [2, 25])
+@pytest.mark.parametrize("aside_m", [30.0, 1e5])
+def test_a_pose_that_the_measurements_exclude_is_refused(
+    simulation: Simulation, items: list[Item], at_s: int, aside_m: float
+) -> None:
+    """Before the first fix and after it; the track goes on as if there had been no pose: it is
+    predicted in two steps once, which moves it by less than a millimetre."""
+    stamp_ns = simulation.scenario.start_ns + at_s * NS + 1
+    outputs = run(tracker_of(simulation), with_pose(simulation, items, stamp_ns, aside_m))
+    assert outputs[-1].status.rejected["initialpose"] == 1
+    untouched = run(tracker_of(simulation), items)
+    moved = outputs[-1].odometry.position - untouched[-1].odometry.position
+    assert np.abs(moved).max() < 1e-3
+    assert len(estimates(outputs)) >= len(estimates(untouched))
+
+
+def test_a_pose_that_the_measurements_permit_starts_anew(
+    simulation: Simulation, items: list[Item]
+) -> None:
+    stamp_ns = simulation.scenario.start_ns + 25 * NS + 1
+    outputs = run(tracker_of(simulation), with_pose(simulation, items, stamp_ns, 0.5))
+    assert "initialpose" not in outputs[-1].status.rejected
+    (first, *_) = [o for o in outputs if o.status.stamp_ns > stamp_ns]
+    assert first.odometry is None
+    assert np.abs(errors(simulation, outputs)[-1]).max() < 4.0
+
+
+def test_a_track_of_a_network_names_it(simulation: Simulation, items: list[Item]) -> None:
+    tracker = tracker_of(simulation, network="one", trust="any")
+    for rsu in simulation.rsus:
+        tracker.add_rsu(replace(rsu, network="one"))
+    outputs = run(tracker, items)
+    assert len(estimates(outputs)) > 20
+    assert {o.network for o in outputs} == {"one"}
+
+
 def test_reset_forgets(simulation: Simulation, items: list[Item]) -> None:
     tracker = tracker_of(simulation)
     accepted = run(tracker, items)[-1].status.accepted

@@ -122,7 +122,7 @@ def test_covariance_is_consistent_when_truth_follows_the_model(
         feed(tracker, [pose(0.0, 30.0, 0.0, 4.0)])
         for k, state in enumerate(states):
             feed(tracker, world.measure(0.2 * (k + 1), state))
-        estimate = tracker._tracks["vue_1"]._state.estimate
+        estimate = tracker._tracks["vue_1"]._state.estimator.estimate
         e = estimate.mean - states[-1]
         nees.append(e @ np.linalg.solve(estimate.cov, e))
     low, high = chi2.ppf([0.0005, 0.9995], 6 * runs) / runs
@@ -180,7 +180,7 @@ def test_initial_pose_starts_the_track_as_the_paper_does(world: Any, feed: Any) 
     (output,) = feed(tracker, [p])
     assert output.status.stamp_ns == T0
     assert (output.status.used, output.status.accepted) == (0, 0)
-    estimate = tracker._tracks["vue_1"]._state.estimate
+    estimate = tracker._tracks["vue_1"]._state.estimator.estimate
     c = speed_of_light
     np.testing.assert_allclose(estimate.mean, [3.0, 4.0, 0, 0, 0, 25e-6 * c])
     expected = np.diag([4.0, 9.0, 25.0, 25.0, (1e-4 * c) ** 2, (30e-6 * c) ** 2])

@@ -155,7 +155,7 @@ def test_opening_the_velocity_is_a_step_since_the_last_accepted(
     tracker = settled(
         world, feed, Field.POSITION, filter="ekf", initial_speed_sd_mps=3.0, isolate_rsus=False
     )
-    start = tracker._tracks["vue_1"]._state.estimate.copy()  # last accepted at 1.9 s
+    start = tracker._tracks["vue_1"]._state.estimator.estimate.copy()  # last accepted at 1.9 s
     for k in range(2):
         far = world.measure(2.0 + 0.1 * k, standing(40.0, 900.0), Field.POSITION)
         (output,) = feed(tracker, far)
@@ -171,7 +171,7 @@ def test_opening_the_velocity_is_a_step_since_the_last_accepted(
         cov[block] += 9.0 * np.array([[silent_s**2, silent_s], [silent_s, 1.0]])
     H = np.tile(np.eye(2, 6), (3, 1))
     K = cov @ H.T @ np.linalg.inv(H @ cov @ H.T + world.range_sd**2 * np.eye(6))
-    estimate = tracker._tracks["vue_1"]._state.estimate
+    estimate = tracker._tracks["vue_1"]._state.estimator.estimate
     np.testing.assert_allclose(
         estimate.mean[:4], (mean + K @ (np.tile(moved[:2], 3) - H @ mean))[:4], rtol=1e-9
     )
@@ -219,10 +219,10 @@ def test_a_gap_forgets_the_biases_too(world: Any, feed: Any) -> None:
     feed(tracker, world.measure(0.0, standing(), Field.RANGE))
     feed(tracker, world.measure(9.0, standing(), Field.RANGE | Field.AZIMUTH))
     track = tracker._tracks["vue_1"]
-    assert track._state.biases.sd == [0.5] * 3
+    assert track._state.estimator.biases.sd == [0.5] * 3
     (output,) = feed(tracker, world.measure(9.1, standing(), Field.RANGE))
     assert output.status.used == 3
-    assert track._state.estimate.mean.size == 9
+    assert track._state.estimator.estimate.mean.size == 9
 
 
 @pytest.mark.parametrize(

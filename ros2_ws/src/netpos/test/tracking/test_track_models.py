@@ -52,8 +52,8 @@ def settled(world: Any, feed: Any, fields: Field = ALL, **config: Any) -> Any:
 
 def predicted(track: Any, stamp_ns: int) -> Any:
     """The estimate of a track at a later stamp; the track stays where it is."""
-    ahead = track._state.estimate.copy()
-    ahead.predict(stamp_ns, track._state.bias)
+    ahead = track._state.estimator.estimate.copy()
+    ahead.predict(stamp_ns, track._state.estimator.bias)
     return ahead
 
 
@@ -62,7 +62,7 @@ def test_prediction_between_measurements_is_the_model(
 ) -> None:
     tracker = settled(world, feed, accel_density_mps2_sqrthz=0.7, clock_walk_density=2.5e-7)
     track = tracker._tracks["vue_1"]
-    now = track._state.estimate
+    now = track._state.estimator.estimate
     ahead = predicted(track, T0 + 2_400_000_000)
     c = speed_of_light
     F, Q = matrices("continuous", 0.5, 0.7, 1e9, 1e-10 * c, 2.5e-7 * c, 1e9)
@@ -94,7 +94,7 @@ def test_each_process_noise_takes_its_own_parameters(
     track = tracker._tracks["vue_1"]
     F, Q = matrices(kind, 0.5, *args)
     ahead = predicted(track, T0 + 500_000_000)
-    before = track._state.estimate.cov
+    before = track._state.estimator.estimate.cov
     np.testing.assert_allclose(ahead.cov - F @ before @ F.T, Q, rtol=1e-5, atol=1e-5)
 
 
@@ -107,7 +107,7 @@ def test_step_velocity_is_fused_as_the_equations_say(world: Any, feed: Any) -> N
     P = np.eye(2) * 25.0
     K = P @ np.linalg.inv(P + cov)
     np.testing.assert_allclose(map_velocity(output), K @ [1.0, -2.0], rtol=1e-9)
-    estimate = tracker._tracks["vue_1"]._state.estimate
+    estimate = tracker._tracks["vue_1"]._state.estimator.estimate
     np.testing.assert_allclose(estimate.cov[VELOCITY, VELOCITY], P - K @ P, rtol=1e-8, atol=1e-10)
     assert output.status.sources == ("step_velocity",)
     assert output.status.nis_dof == 2
@@ -116,7 +116,7 @@ def test_step_velocity_is_fused_as_the_equations_say(world: Any, feed: Any) -> N
 def test_ground_speed_is_fused_along_the_motion(world: Any, feed: Any) -> None:
     tracker = world.tracker(filter="ekf", **STILL)
     feed(tracker, [pose(0.0, 0.0, 0.0), velocity(0.0, (3.0, 4.0), 0.25)])
-    before = tracker._tracks["vue_1"]._state.estimate.copy()
+    before = tracker._tracks["vue_1"]._state.estimator.estimate.copy()
     v = before.mean[VELOCITY]
     u = v / np.linalg.norm(v)
     # 1 ns later: in the same epoch it would be linearised at rest
@@ -160,7 +160,7 @@ def test_bias_states_find_simulated_biases(world: Any, feed: Any) -> None:
     tracker = world.tracker()
     for k in range(100):
         (output,) = feed(tracker, world.measure(0.1 * k, straight(0.1 * k), Field.RANGE))
-    estimate = tracker._tracks["vue_1"]._state.estimate
+    estimate = tracker._tracks["vue_1"]._state.estimator.estimate
     assert estimate.mean.size == 10
     names = ["a", "b", "c", "d"]
     by_name = dict(zip(names, estimate.mean[6:], strict=True))
@@ -183,12 +183,12 @@ def test_a_bias_state_starts_at_its_stationary_variance_and_stays_there(
     tracker = world.tracker(**KNOWN_CLOCK)
     feed(tracker, [pose(0.0, 40.0, 2.0, 0.01)])
     track = tracker._tracks["vue_1"]
-    state = track._state
-    state.biases.coupling(track._rsus["a"], world.measure(0.0, standing(), Field.RANGE)[0])
-    state.bias = state.biases.arrays()
+    estimator = track._state.estimator
+    estimator.biases.coupling(track._rsus["a"], world.measure(0.0, standing(), Field.RANGE)[0])
+    estimator.bias = estimator.biases.arrays()
     for t_ns in (T0, T0 + 10**9, T0 + 50 * 10**9):
-        estimate = track._prepare(t_ns)
-        estimate.predict(t_ns, state.bias)
+        estimate = estimator._prepared(t_ns)
+        estimate.predict(t_ns, estimator.bias)
         assert estimate.mean.size == 7
         assert estimate.cov[6, 6] == pytest.approx(0.49)
         np.testing.assert_array_equal(estimate.cov[:6, 6], 0.0)
@@ -212,7 +212,7 @@ def test_common_network_bias_only_widens_the_covariance(world: Any, feed: Any) -
     assert wide.clock.cov[0, 0] * speed_of_light**2 == pytest.approx(
         plain.clock.cov[0, 0] * speed_of_light**2 + 4.0, rel=0.02
     )
-    assert len(tracker._tracks["vue_1"]._state.biases.sd) == 1
+    assert len(tracker._tracks["vue_1"]._state.estimator.biases.sd) == 1
 
 
 def test_coloured_noise_is_inflated_and_keeps_the_covariance_honest(world: Any, feed: Any) -> None:
@@ -236,7 +236,7 @@ def test_coloured_noise_is_inflated_and_keeps_the_covariance_honest(world: Any, 
                 ]
                 feed(tracker, items)
                 e = keep * e + math.sqrt(1 - keep**2) * rng.normal(size=3)
-            estimate = tracker._tracks["vue_1"]._state.estimate
+            estimate = tracker._tracks["vue_1"]._state.estimator.estimate
             d = estimate.mean[POSITION] - standing()[:2]
             nees.append(d @ np.linalg.solve(estimate.cov[POSITION, POSITION], d))
         means[spectral] = float(np.mean(nees))
@@ -263,7 +263,7 @@ def test_heading_is_held_at_rest(world: Any, feed: Any) -> None:
     feed(tracker, [pose(0.0, 0.0, 0.0), velocity(0.0, (0.0, 3.0), 1e-4)])
     (output,) = feed(tracker, [velocity(0.1, (0.0, 3.0), 1e-4)])
     assert 2 * math.atan2(*output.odometry.quaternion[2:]) == pytest.approx(math.pi / 2, abs=0.01)
-    tracker._tracks["vue_1"]._state.estimate.mean[2:4] = 0.0
+    tracker._tracks["vue_1"]._state.estimator.estimate.mean[2:4] = 0.0
     (output,) = feed(tracker, [velocity(0.1 + 1e-9, (0.0, 0.0), 1e-4)])
     assert 2 * math.atan2(*output.odometry.quaternion[2:]) == pytest.approx(math.pi / 2, abs=0.01)
     assert output.odometry.pose_cov[5, 5] == pytest.approx(math.pi**2 / 3)

@@ -88,7 +88,7 @@ def position_rows(fixes: Array, sd_m: Array) -> Array:
         position=np.ones(3),
         position_cov=np.eye(3),
     )
-    template = epoch_rows_of([probe], {"fix": info}, None, -1).rows
+    template = epoch_rows_of([probe], {"fix": info}, None).rows
     rows = np.tile(template, (len(fixes), 1)).reshape(len(fixes), 2, ROW_WIDTH)
     rows[:, :, VALUE] *= fixes
     for column in (VARIANCE, GATE_VARIANCE):

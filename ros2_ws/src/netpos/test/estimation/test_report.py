@@ -1,12 +1,28 @@
-"""The estimates and levels of a compiled run are those its tracker reports."""
+"""The level of one epoch by hand; the levels of a compiled run are those its tracker reports."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from netpos.estimation.report import LEVEL_MAX_M, level_of
 from netpos.estimation.state import POSITION
 from netpos.reproduction.experiment import Experiment, Setup
 from setup_tracker import tracker_outputs
+
+
+@pytest.mark.parametrize(
+    ("radius_m", "inflation", "undetected_m", "unheard_s", "level_m"),
+    [
+        (2.0, 1.5, 0.0, 0.0, 3.0),  # an optimistic filter
+        (2.0, 1.0, 2.5, 0.0, 2.5),  # a manoeuvre that would not show
+        (2.0, 1.0, 2.5, 0.5, 5.0),  # which has gone on at 5 m/s since
+        (2.0, 1.0, np.inf, 0.0, LEVEL_MAX_M),  # that nothing bounds
+    ],
+)
+def test_level_of_one_epoch(
+    radius_m: float, inflation: float, undetected_m: float, unheard_s: float, level_m: float
+) -> None:
+    assert level_of(radius_m, inflation, undetected_m, 5.0, unheard_s) == level_m
 
 
 @pytest.mark.parametrize(

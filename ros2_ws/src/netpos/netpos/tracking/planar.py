@@ -1,0 +1,314 @@
+"""The planar estimator: position, velocity and clock by the filters of ``estimates``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import count
+from typing import Self
+
+import numpy as np
+
+from netpos.estimation.measurement import VARIANCE
+from netpos.estimation.protection import FusedEpoch
+from netpos.estimation.state import N_CORE, POSITION, VELOCITY
+from netpos.messages.values import (
+    Array,
+    InitialPose,
+    NetworkTrack,
+    Odometry,
+    RsuErrors,
+    StepCalibration,
+    TrackMode,
+    Velocity,
+)
+from netpos.tracking import estimates, output
+from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.epoch_rows import EpochRows, Source, planar_form
+from netpos.tracking.estimates import Estimate, KalmanEstimate
+from netpos.tracking.estimator import Description, Estimator, FirstFix, Recent, UpdateResult
+from netpos.tracking.fit import innovations_and_level, innovations_with_sd
+from netpos.tracking.imu_buffer import ImuBuffer
+from netpos.tracking.initialise import Initialiser, with_heading
+from netpos.tracking.learning import LearnedErrors
+from netpos.tracking.models import heading_index, initial_extra_sd, options_of, pose_state
+from netpos.tracking.networks.secondary import OwnNoise, Secondary
+from netpos.tracking.phase_start import PhaseStart, corrections, with_sectors
+from netpos.tracking.rsus import BiasStates, Rsu
+from netpos.tracking.shared_errors import SharedErrors
+from netpos.tracking.smoothing import Posterior, PosteriorRecorder
+from netpos.tracking.unnoticed import level_of_epochs
+
+_IMU_HOLE_S = 0.05
+_BLIND_GYRO = 1.0  # rad/s/sqrt(Hz): what the heading does while the IMU is silent
+_OPEN_HEADING = (
+    "the heading of the body is open: measure two of its antennas, apart by their lever arms"
+)
+
+
+class PlanarEstimator(Estimator):
+    """Estimator of a device that moves at a known height."""
+
+    estimate: Estimate | None
+    imu: ImuBuffer
+    recorder: PosteriorRecorder | None
+
+    def __init__(
+        self,
+        vue_id: str,
+        config: TrackerConfig,
+        rsus: Mapping[str, Rsu],
+        shared: SharedErrors | None = None,
+    ) -> None:
+        self._heading = heading_index(config)
+        super().__init__(vue_id, config, rsus, planar_form(self._heading))
+        self.imu = ImuBuffer()
+        self._shared, self._lives = shared, count(1)
+        self._options, self._extra_sd = options_of(config), initial_extra_sd(config)
+        self._use_imu, self._calibrates_steps = config.use_imu, config.calibrates_steps
+        self._steady = config.steady_accel_density_mps2_sqrthz > 0.0
+        self._secondary = Secondary(vue_id, config) if config.network else None
+        self.recorder = PosteriorRecorder.of(vue_id, config)
+        self._forget()
+
+    def _forget(self) -> None:
+        config = self._config
+        learned = (
+            LearnedErrors(self._shared, (self._vue_id, next(self._lives)))
+            if config.learn_errors
+            else None
+        )
+        self.estimate = None
+        self.biases = BiasStates(N_CORE + self._extra_sd.size, config.step_errors, learned)
+        self.bias = np.zeros((2, 0))
+        self._initialiser = Initialiser(config)
+        self._phase_start = PhaseStart(config)
+        self._process_noise = AdaptiveProcessNoise(config)
+        self._own: OwnNoise | None = None
+        self._pose: tuple[int, Array, Array] | None = None  # waits for its heading
+        self._yaw = 0.0
+
+    def set_config(self, config: TrackerConfig) -> None:
+        super().set_config(config)
+        self._options = options_of(config)
+        self._phase_start.config = config
+        self._process_noise.set_config(config)
+        if isinstance(self.estimate, KalmanEstimate):
+            self.estimate.set_config(config)
+
+    @property
+    def is_by_sectors(self) -> bool:
+        return self.estimate is not None and not isinstance(self.estimate, KalmanEstimate)
+
+    def copy(self) -> Self:
+        twin = super().copy()
+        twin._process_noise = self._process_noise.copy()
+        if self.estimate is None:
+            twin._initialiser = self._initialiser.copy()
+            twin._phase_start = self._phase_start.copy()
+        else:
+            twin.estimate = self.estimate.copy()
+        return twin
+
+    @property
+    def missing(self) -> str:
+        return self._initialiser.missing
+
+    def innovations(self, rows: Array) -> Array:
+        estimate, height_m = self._there(), self._config.device_height_m
+        found: Array = innovations_with_sd(estimate.mean, estimate.cov, rows, height_m)
+        return found
+
+    def _there(self) -> Estimate:
+        assert self.estimate is not None
+        return self.estimate
+
+    # first fix
+
+    def pose_cost(self, stamp_ns: int, pose: InitialPose, recent: Recent | None) -> float:
+        window = self._initialiser if recent is None else Initialiser(self._config)
+        for then_ns, rows in recent or ():
+            window.add(then_ns, rows.rows, rows.slow_variance(self.biases), self.heard(rows))
+        return self._excess_cost(window, stamp_ns, pose)
+
+    def start_from_pose(self, stamp_ns: int, pose: InitialPose) -> bool:
+        mean, cov = pose_state(self._config, pose.position[:2], pose.cov[:2, :2])
+        if self._heading >= 0:
+            self._pose = stamp_ns, mean, cov  # the first antennas tell the heading
+            return False
+        self.estimate = estimates.start(self._config, stamp_ns, mean, cov)
+        return True
+
+    def first_fix(self, stamp_ns: int, epoch_rows: EpochRows) -> FirstFix:
+        bias_var = epoch_rows.slow_variance(self.biases)
+        if self._phase_start.heard(epoch_rows):
+            self.estimate = self._phase_start.add(stamp_ns, epoch_rows.rows, bias_var)
+            return FirstFix(self.estimate is not None)
+        solution = self._pose_at(stamp_ns)
+        if solution is None:
+            heard = self.heard(epoch_rows)
+            self._initialiser.add(stamp_ns, epoch_rows.rows, bias_var, heard)
+            solution = self._initialiser.solve()
+        if solution is None:
+            return FirstFix(False)
+        if self._heading >= 0:
+            rows = epoch_rows.rows.copy()
+            rows[:, VARIANCE] += bias_var
+            solution = with_heading(*solution, rows, self._config.device_height_m)
+            if solution is None:
+                self._initialiser.missing = _OPEN_HEADING
+                return FirstFix(False, refused="heading_open")
+        self.estimate = estimates.start(self._config, stamp_ns, *solution)
+        return FirstFix(True, epoch_rows.has_time)
+
+    def _pose_at(self, stamp_ns: int) -> tuple[Array, Array] | None:
+        """The initial pose that waits for its heading, for a device that has moved since; None
+        where it is older than the longest gap."""
+        if self._pose is None:
+            return None
+        given_ns, mean, cov = self._pose
+        age_s = (stamp_ns - given_ns) * 1e-9
+        if age_s > self._config.max_gap_s:
+            return None
+        moved = cov.copy()
+        moved[POSITION, POSITION] += age_s**2 * cov[VELOCITY, VELOCITY]
+        return mean, moved
+
+    # estimate
+
+    def predict(self, stamp_ns: int) -> None:
+        estimate = self.estimate
+        if estimate is not None and stamp_ns > estimate.stamp_ns:
+            self._prepared(stamp_ns).predict(stamp_ns, self.bias)
+
+    def _prepared(self, stamp_ns: int, items: tuple[Source, ...] = ()) -> Estimate:
+        """The estimate with the biases heard of, the IMU up to ``stamp_ns`` and what velocities
+        say of its motion, not yet moved."""
+        estimate = self._there()
+        if estimate.mean.size < self.biases.first + len(self.biases.sd):
+            estimate.augment(np.append(self._extra_sd, self.bias[0]))
+        if self._use_imu:
+            yaw, speed, uncovered_s = self.imu.increments(estimate.stamp_ns, stamp_ns)
+            blind = uncovered_s > _IMU_HOLE_S
+            gyro = _BLIND_GYRO if blind else self._config.gyro_noise_density
+            estimate.set_imu_increment(yaw, speed, gyro)
+        if self._steady:
+            velocities = (item for item in items if isinstance(item, Velocity))
+            density = self._process_noise.density(stamp_ns, velocities)
+            if density is not None:
+                estimate.set_process_noise(density)
+        return estimate
+
+    def update(
+        self,
+        stamp_ns: int,
+        epoch_rows: EpochRows,
+        unheard_s: float,
+        rejected_in_row: int,
+        recent: Recent,
+    ) -> UpdateResult:
+        rows = epoch_rows.rows
+        self.estimate = with_sectors(self._config, self.estimate, rows)
+        estimate = self._prepared(stamp_ns, epoch_rows.items)
+        was_ambiguous = bool(estimate.modes)
+        nis, dof, flags = estimate.step(stamp_ns, unheard_s, rejected_in_row, rows, self.bias)
+        if self._secondary is not None:
+            self._own = self._secondary.after(self._own, stamp_ns, estimate, rows, self.bias)
+        corrected = corrections(estimate)
+        # a smoother does not reach across: what it keeps is one Gaussian
+        breaks = corrected + (bool(estimate.modes) != was_ambiguous)
+        innovations = np.empty((len(rows), 2))
+        fused = FusedEpoch(*estimate.prior, rows, flags, unheard_s, estimate.mean)
+        undetected_m = self._undetected_m(fused, innovations, stamp_ns, recent)
+        return UpdateResult(
+            nis,
+            dof,
+            flags.tolist(),
+            innovations,
+            undetected_m,
+            not math.isnan(undetected_m),
+            breaks,
+            corrected,
+        )
+
+    def _undetected_m(
+        self, fused: FusedEpoch, innovations: Array, stamp_ns: int, recent: Recent
+    ) -> float:
+        """Level of a manoeuvre that this epoch, or the recent ones with it, would not show; fills
+        ``innovations``. Not a number where the posterior is not sound."""
+        cov = self._there().cov
+        level_m: float = innovations_and_level(fused, cov, self._options, innovations)
+        if math.isinf(level_m):
+            epochs = [*((then_ns, rows.rows) for then_ns, rows in recent), (stamp_ns, fused.rows)]
+            prior = fused.prior_mean, fused.prior_cov
+            return level_of_epochs(epochs, stamp_ns, prior, cov, self._options)
+        return level_m
+
+    def learn(
+        self, stamp_ns: int, rows: Array, accepted: Sequence[float]
+    ) -> tuple[RsuErrors, ...]:
+        estimate, biases = self.estimate, self.biases
+        if biases.learned is None or estimate is None or estimate.modes:
+            return ()
+        posterior = (estimate.mean, estimate.cov)
+        fitted = (rows, np.array(accepted))
+        height_m = self._config.device_height_m
+        concluded, changes = biases.learn(stamp_ns, fitted, posterior, height_m)
+        for change in changes:
+            estimate.change_prior(*change)
+        self.bias = biases.arrays()
+        if not concluded:
+            return ()
+        return biases.errors(concluded, estimate.mean, estimate.cov, stamp_ns, self._vue_id)
+
+    @property
+    def modes(self) -> tuple[TrackMode, ...]:
+        return self._there().modes
+
+    def radius(self, level_m: float) -> float:
+        return self._there().radius(level_m)
+
+    # output
+
+    def describe(self, stamp_ns: int) -> Description:
+        estimate, config = self._there(), self._config
+        odometry, clock, self._yaw, sd_m, radius_m = output.describe(
+            stamp_ns,
+            self._vue_id,
+            estimate.mean,
+            estimate.cov,
+            config.device_height_m,
+            self._yaw,
+            self._heading,
+            config.integrity_risk,
+        )
+        return Description(odometry, clock, sd_m, radius_m)
+
+    def step_calibration(self) -> StepCalibration | None:
+        if not self._calibrates_steps:
+            return None
+        return self.biases.step_calibration(self._there().mean, self._there().cov)
+
+    def network_track(self, segment: int) -> NetworkTrack | None:
+        if self._secondary is None:
+            return None
+        return self._secondary.track(self._own, segment, self._there(), self.bias)
+
+    # smoothing
+
+    def keep_posteriors(self) -> None:
+        self.recorder = PosteriorRecorder.of(self._vue_id, self._config, keep=True)
+
+    def record(self, segment: int) -> tuple[Odometry, ...]:
+        estimate = self.estimate
+        if self.recorder is None or estimate is None or estimate.modes:
+            return ()
+        return self.recorder.note(Posterior.of(estimate, segment, self.bias))
+
+    def go_back(self, stamp_ns: int) -> None:
+        if self.recorder is not None:
+            self.recorder.go_back(stamp_ns)
+
+    def smoothed(self) -> list[Odometry]:
+        return self.recorder.smoothed() if self.recorder is not None else []
