@@ -21,7 +21,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "world": {"messages"},
     "radio": {"messages", "world"},
     "inertial": {"messages", "common", "world", "radio"},
-    "estimation": {"messages", "inertial"},
+    "estimation": {"messages", "common", "inertial"},
     "tracking": {"messages", "common", "estimation", "inertial"},
     "bags": {"messages", "common", "world", "inertial"},
     # The sensors say what a simulator sends; a replay sends a recording through the tracker.

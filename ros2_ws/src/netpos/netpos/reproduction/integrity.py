@@ -7,9 +7,9 @@ import math
 import numpy as np
 from scipy.special import chdtri
 
-from netpos.estimation import ekf
 from netpos.estimation.compile import kernel
 from netpos.estimation.engine import GATE_SIZE, Epochs, FilterOptions, Run
+from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.motion import Parameter
 from netpos.estimation.protection import (

@@ -11,9 +11,10 @@ from typing import Protocol
 
 import numpy as np
 
-from netpos.estimation import components, ekf, engine, filterpy_backend, imm
+from netpos.estimation import components, engine, filterpy_backend, fusion, imm
 from netpos.estimation.components import Dynamics, moments
 from netpos.estimation.engine import EpochInput, FilterOptions
+from netpos.estimation.forms.table import form_of
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.mixture import Mixture, mode_of
 from netpos.estimation.motion import Parameter
@@ -116,7 +117,7 @@ class KalmanEstimate(OneModel):
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
         self.stamp_ns = self._turn_ns = stamp_ns
         self._options = options_of(config)
-        self._factored = config.filter == "srukf"
+        self._factored = not form_of(config.filter).carries_cov
         self._motion: Array = motions_of(config)[0].copy()
         self._components: Mixture | None = None  # replaced, never changed; None: one component
         self._prior: tuple[Array, Array] | None = None  # of a mixture
@@ -393,7 +394,7 @@ class ImmEstimate(GatedEstimate):
             self._options.gate_nis,
             self._options.iterations,
             accepted,
-            ekf.workspace(self.mean.size, len(rows)),
+            fusion.workspace(self.mean.size, len(rows)),
         )
         self._set_state(self._models)
         return result
@@ -461,6 +462,6 @@ def start(config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> Esti
     """Estimate of the configured kind from mean (6,) and covariance (6, 6) at ``stamp_ns``."""
     if config.backend == "filterpy":
         return FilterpyEstimate(config, stamp_ns, mean, cov)
-    if config.motion_model == "interacting":
+    if config.interacts:
         return ImmEstimate(config, stamp_ns, mean, cov)
     return KalmanEstimate(config, stamp_ns, mean, cov)

@@ -66,7 +66,7 @@ class Tracker:
         self._keep_posteriors = keep_posteriors
         if keep_posteriors:
             check_smoothable(self._config)
-        if self._config.motion_model == "strapdown":
+        if self._config.is_strapdown:
             _strapdown().warm_up(self._config)
         self._tracks: dict[str, Track | StrapdownTrack] = {}
         self._sequencers: dict[str, Sequencer] = {}
@@ -367,7 +367,7 @@ class Tracker:
     def _sequencer(self, vue_id: str) -> Sequencer:
         if vue_id not in self._sequencers:
             self.track(vue_id)
-            strapdown = self._config.motion_model == "strapdown"
+            strapdown = self._config.is_strapdown
             rate_hz = self._config.odometry_rate_hz if strapdown else 0.0
             self._sequencers[vue_id] = Sequencer(
                 int(self._config.hold_s * 1e9),
@@ -381,7 +381,7 @@ class Tracker:
 
     def track(self, vue_id: str) -> Track | StrapdownTrack:
         """Track of a device, new where there is none."""
-        if vue_id not in self._tracks and self._config.motion_model == "strapdown":
+        if vue_id not in self._tracks and self._config.is_strapdown:
             self._tracks[vue_id] = _strapdown().track_of(
                 vue_id, self._config, self._rsus, self._health, record=self._keep_posteriors
             )

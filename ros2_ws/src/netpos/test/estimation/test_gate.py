@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from netpos.estimation import ekf, filterpy_backend, gate, kf, srukf, ukf
+from netpos.estimation import filterpy_backend, gate
+from netpos.estimation.forms import ekf, kf, srukf, ukf
 from netpos.estimation.measurement import GROUP, Kind
 from netpos.estimation.state import X
 from netpos.messages.values import Array
