@@ -16,7 +16,6 @@ cached on disk.
 ``engine``       one epoch of one component; ``components`` of a mixture (``mixture``)
 ``protection``   the radius that holds the error
 ``smooth``       Rauch-Tung-Striebel smoothing
-``filterpy_backend``  the reference
 """
 
 from netpos.estimation.first_compilation import tell_first_compilation

@@ -16,7 +16,6 @@ from netpos.estimation.motion.model import MotionModel
 from netpos.tracking.rsus import StepErrors
 
 FILTERS = tuple(forms.words())
-BACKENDS = ("compiled", "filterpy")
 STRAPDOWN = "strapdown"
 """The motion of a track in three dimensions, which is no model of the table."""
 _MOTIONS = {**motion.words(), STRAPDOWN: "three dimensions, driven by the device's IMU"}
@@ -33,8 +32,8 @@ def _described(words: Mapping[str, str]) -> str:
 def _of_the_tables() -> Any:
     """Dataclass of the parameters that the tables of motion models and filter forms give."""
     entries = {
-        "filter": choice("iekf", FILTERS, _described(forms.words())),
-        "motion_model": choice("constant_velocity", MOTION_MODELS, _described(_MOTIONS)),
+        "filter": choice(forms.DEFAULT, FILTERS, _described(forms.words())),
+        "motion_model": choice(motion.DEFAULT, MOTION_MODELS, _described(_MOTIONS)),
         **motion.parameters(),
         **forms.parameters(),
     }
@@ -53,9 +52,6 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
     Raises ``ValueError`` naming the parameter, its value and the accepted range.
     """
 
-    backend: str = choice(
-        "compiled", BACKENDS, "compiled | filterpy (reference for ekf and ukf, slow)"
-    )
     process_noise: str = choice(
         "continuous",
         tuple(noise.name.lower() for noise in ProcessNoise),
@@ -211,7 +207,7 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
         0.0,
         1e3,
         "velocity step that a measurement which fails the gate may reveal; 0: none. Not with an"
-        " IMU, interacting models, filter kf or backend filterpy",
+        " IMU, interacting models or filter kf",
     )
     inflate_after_epochs: int = count(
         2, "epochs rejected in a row before the velocity opens to its initial sd"
@@ -276,31 +272,24 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
             raise ValueError("require_initial_pose needs accept_initialpose; set it to true")
         if self.is_strapdown:
             self._check_strapdown()
-        if self.backend == "filterpy" and self.filter not in ("ekf", "ukf"):
-            raise ValueError(f"backend filterpy has filter ekf or ukf, not {self.filter!r}")
-        if self.backend == "filterpy" and self.interacts:
-            raise ValueError(
-                f"backend filterpy has no motion_model {self.motion_model}; use compiled"
-            )
         if self.interacts and self.fixed_lag_s > 0.0:
             raise ValueError(f"fixed_lag_s must be 0 with motion_model {self.motion_model}")
         if self.steady_accel_density_mps2_sqrthz > 0.0:
             self._check_steady()
         plain = self.robust == "none" and self.nlos_probability == 0.0
-        if not plain and (self.backend == "filterpy" or self.interacts):
+        if not plain and self.interacts:
             raise ValueError(
-                "robust and nlos_probability need backend compiled and a single motion model;"
-                " leave them at none and 0"
+                "robust and nlos_probability need a single motion model; leave them at none and 0"
             )
-        several = self.backend == "filterpy" or self.interacts
-        if self.learn_errors and (several or self.is_strapdown):
+        if self.learn_errors and (self.interacts or self.is_strapdown):
             raise ValueError(
-                "learn_errors needs backend compiled and a planar motion model other than"
-                f" interacting, got {self.backend!r} and {self.motion_model!r}; set it to false"
+                "learn_errors needs a single planar motion model,"
+                f" got {self.motion_model!r}; set it to false"
             )
-        if self.interacts and self.filter not in ("ekf", "iekf"):
+        if self.interacts and not forms.form_of(self.filter).is_extended:
+            extended = " or ".join(form.name for form in forms.FORMS if form.is_extended)
             raise ValueError(
-                f"motion_model interacting takes filter ekf or iekf, not {self.filter!r}"
+                f"motion_model {self.motion_model} takes filter {extended}, not {self.filter!r}"
             )
         if self.is_linear and self.calibrates_steps:
             raise ValueError(
@@ -319,10 +308,10 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
             )
 
     def _check_strapdown(self) -> None:
-        if self.filter not in ("ekf", "iekf") or self.backend != "compiled":
+        if not forms.form_of(self.filter).is_extended:
             raise ValueError(
-                "motion_model strapdown has its own error-state filter; leave filter at iekf and"
-                f" backend at compiled, got {self.filter!r} and {self.backend!r}"
+                f"motion_model strapdown has its own error-state filter; leave filter at"
+                f" {forms.DEFAULT}, got {self.filter!r}"
             )
         if self.fixed_lag_s > 0.0:
             raise ValueError(
@@ -364,10 +353,9 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
     def manoeuvre_sd_mps(self) -> float:
         """Velocity step per axis that a refused measurement may reveal to this estimate; 0: none.
 
-        Interacting models and the gain floor follow manoeuvres by themselves, and the reference
-        has none.
+        Interacting models and the gain floor follow manoeuvres by themselves.
         """
-        one_gaussian = self.backend == "filterpy" or self.interacts or self.is_strapdown
+        one_gaussian = self.interacts or self.is_strapdown
         if one_gaussian or forms.form_of(self.filter).follows_manoeuvres:
             return 0.0
         return float(getattr(self, self.motion_models[0].manoeuvre_speed))

@@ -90,7 +90,7 @@ def heading_index(config: TrackerConfig) -> int:
 def by_sectors(config: TrackerConfig) -> bool:
     """Whether phase differences are resolved by a bank of filters."""
     single = len(config.motion_models) == 1 and heading_index(config) < 0
-    return config.ambiguity == "hypotheses" and config.backend == "compiled" and single
+    return config.ambiguity == "hypotheses" and single
 
 
 def initial_extra_sd(config: TrackerConfig) -> Array:

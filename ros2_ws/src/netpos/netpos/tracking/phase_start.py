@@ -50,7 +50,7 @@ class PhaseStart:
 
     @property
     def _by_heading(self) -> bool:
-        plain = self.config.backend == "compiled" and heading_index(self.config) < 0
+        plain = heading_index(self.config) < 0
         return self.config.ambiguity == "step_heading" and plain
 
     def hear(self, velocity: Velocity) -> None:

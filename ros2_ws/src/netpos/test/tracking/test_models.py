@@ -237,7 +237,6 @@ def test_growing_appends_independent_states() -> None:
         ({"inertial_manoeuvre_speed_sd_mps": 0.3, "motion_model": "inertial"}, 0.3),
         ({"inertial_manoeuvre_speed_sd_mps": 0.3, "manoeuvre_speed_sd_mps": 0.0}, 0.0),
         ({"manoeuvre_speed_sd_mps": 3.0, "motion_model": "interacting"}, 0.0),
-        ({"manoeuvre_speed_sd_mps": 3.0, "backend": "filterpy", "filter": "ekf"}, 0.0),
     ],
 )
 def test_a_manoeuvre_is_allowed_where_nothing_else_shows_it(

@@ -359,11 +359,12 @@ def _update_form(
     return nis, used
 
 
-EKF = FilterForm(name="ekf", predict=predict, update=_update_form)
+EKF = FilterForm(name="ekf", predict=predict, update=_update_form, is_extended=True)
 IEKF = FilterForm(
     name="iekf",
     predict=predict,
     update=_update_form,
     summary="linearised again at its own result",
     iterations=8,
+    is_extended=True,
 )

@@ -51,6 +51,8 @@ class FilterForm:
     parameters: Mapping[str, Any] = field(default_factory=dict)
     """Tracker parameters that this module declares: name and ``common.parameters`` field. Their
     values are ``FilterOptions.of_form``, in this order."""
+    is_extended: bool = False
+    """It is an extended Kalman filter, as the error-state filter of a strapdown track is."""
     follows_manoeuvres: bool = False
     """It needs no component for a manoeuvre that nobody has noticed."""
 

@@ -16,6 +16,8 @@ FORMS: tuple[FilterForm, ...] = (
     srukf.FORM,
     kf.FORM,
 )
+DEFAULT = ekf.IEKF.name
+"""The form of a tracker that is told nothing."""
 
 
 def words() -> dict[str, str]:

@@ -26,6 +26,8 @@ MODELS: tuple[MotionModel, ...] = (
     inertial.MODEL,
     rigid_body.MODEL,
 )
+DEFAULT = constant_velocity.MODEL.name.lower()
+"""The motion of a tracker that is told nothing."""
 
 SETS: Mapping[str, tuple[MotionModel, ...]] = {
     "interacting": (stationary.MODEL, constant_velocity.MODEL, constant_turn.MODEL),

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import filterpy_reference as reference
 import numpy as np
 import pytest
-from netpos.estimation import filterpy_backend as reference
 from netpos.estimation import sigma
 from netpos.estimation.forms import ekf, ukf
 from netpos.estimation.measurement import Kind
