@@ -31,8 +31,9 @@ TESTS = ROOT / "ros2_ws/src/netpos/test"
 TESTS_OF = {
     "bearing": "test_bearing.py",
     "conditioning": "test_conditioning.py",
-    "ekf": "test_motion.py test_ekf.py test_ekf_gate.py test_ekf_contradiction.py "
-    "test_ekf_iteration.py test_ekf_bending.py test_bearing.py test_ekf_wide_prior.py",
+    "estimation/forms/ekf": "../test_motion.py ../test_ekf.py ../test_ekf_gate.py "
+    "../test_ekf_contradiction.py ../test_ekf_iteration.py ../test_ekf_bending.py "
+    "../test_bearing.py ../test_ekf_wide_prior.py",
     "error_state": "test_error_state_rules.py test_error_state_chunks.py test_error_state.py",
     "factor": "test_factor.py",
     "fit": "test_fit.py test_gate.py test_imm.py::test_likelihood_of_what_says_the_same_twice",
@@ -40,11 +41,17 @@ TESTS_OF = {
     "gate": "test_gate.py test_kf.py",
     "imm": "test_imm.py -knot+stop_straight_turn",
     "iteration": "test_ekf_iteration.py test_ekf_bending.py test_ekf_wide_prior.py",
-    "kf": "test_kf.py test_gate.py",
+    "estimation/forms/kf": "../test_kf.py ../test_gate.py",
     "manoeuvre": "test_manoeuvre.py",
     "measurement": "test_measurement.py test_measurement_curvature.py test_measurement_phase.py "
     "test_measurement_rows.py test_step_velocity.py sensors/test_models.py",
-    "motion": "test_motion.py test_motion_models.py",
+    **{
+        f"estimation/motion/{name}": "../test_motion.py ../test_motion_models.py"
+        for name in (
+            *("constant_velocity", "constant_turn", "constant_acceleration", "stationary"),
+            *("inertial", "rigid_body", "process", "process_noise"),
+        )
+    },
     "position_fix": "test_position_fix.py",
     "robust": "test_robust.py",
     "rows": "test_measurement_rows.py test_measurement_phase.py",
@@ -52,7 +59,7 @@ TESTS_OF = {
     "smooth": "test_smooth.py",
     "space": "test_space.py sensors/test_models.py",
     "space_conditioning": "test_space_conditioning.py",
-    "srukf": "test_srukf.py -knot+ten_thousand",
+    "estimation/forms/srukf": "../test_srukf.py ../test_engine_parts.py -knot+ten_thousand",
     **{
         f"estimation/sensors/{name}": "test_models.py ../test_measurement.py ../test_space.py "
         "../test_measurement_curvature.py ../test_measurement_phase.py ../test_step_velocity.py"
@@ -71,7 +78,7 @@ TESTS_OF = {
     "components": "test_components.py",
     "tracking/sectors": "test_sector_bank.py -kwhere_a_phase",
     "tracking/sector_bank": "test_sector_bank_rules.py test_sector_bank.py",
-    "ukf": "test_ukf.py test_gate.py",
+    "estimation/forms/ukf": "../test_ukf.py ../test_gate.py",
 }
 # Newton's method gets there from anywhere.
 _START = (
@@ -92,10 +99,10 @@ EQUIVALENT = {
         ("estimation/sensors/range", "exact", f"operator swapped: {sum_}")
         for sum_ in ("Pd += cov[i, j] * d[j]", "along += d[i] * Pd")
     ),
-    ("srukf", "_eliminate", "left out: continue"),
+    ("estimation/forms/srukf", "_eliminate", "left out: continue"),
     ("sigma", "_regress", "left out: E[i, n] *= _SHIFT_WEIGHT"),  # is 1
     ("sigma", "_regress", "operator swapped: E[i, n] *= _SHIFT_WEIGHT"),
-    ("ekf", "_passes", "operator swapped: stop - start"),
+    ("estimation/forms/ekf", "_passes", "operator swapped: stop - start"),
     # its mirror
     ("manoeuvre", "detection_delay_s", "operator swapped: xy += h[X.PX] * h[X.PY] / variance"),
     ("error_state", "correct", "left out: posterior = cov"),  # set anew by the first iteration

@@ -8,6 +8,8 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
+from netpos.estimation.forms import table as forms
+from netpos.estimation.motion import table as motion
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "ros2_ws" / "src"
@@ -21,7 +23,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "world": {"messages"},
     "radio": {"messages", "world"},
     "inertial": {"messages", "common", "world", "radio"},
-    "estimation": {"messages", "inertial"},
+    "estimation": {"messages", "common", "inertial"},
     "tracking": {"messages", "common", "world", "estimation", "inertial"},
     "bags": {"messages", "common", "world", "inertial"},
     # The sensors say what a simulator sends; a replay sends a recording through the tracker.
@@ -143,3 +145,26 @@ def test_nodes_do_not_import_one_another(package: str) -> None:
     others = {"netpos_bag", *NODE_PACKAGES} - {package}
     for path in (SOURCE / package / package).glob("*.py"):
         assert not others & {name.split(".")[0] for name in imports(path)}, path.name
+
+
+CORE = ("estimation/engine", "estimation/components", "tracking/estimates", "tracking/models")
+CORE += ("tracking/config", "tracking/smoothing", "tracking/sector_bank")
+
+
+@pytest.mark.parametrize("name", CORE)
+def test_the_core_names_no_motion_model_and_no_filter_form(name: str) -> None:
+    """Neither imports the module of one nor compares with its name."""
+    names = (
+        {m.name.lower() for m in motion.MODELS} | {*motion.SETS} | {f.name for f in forms.FORMS}
+    )
+    tree = ast.parse((LIBRARY / f"{name}.py").read_text(encoding="utf-8"))
+    told: set[str] = set()
+    for node in ast.walk(tree):
+        match node:
+            case ast.Constant(value=str(text)):
+                told.add(text)
+            case ast.Name(id=text) | ast.Attribute(attr=text) | ast.alias(name=text):
+                told.add(text)
+            case _:
+                pass
+    assert {text.lower() for text in told} & names == set()

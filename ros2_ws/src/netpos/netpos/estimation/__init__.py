@@ -2,21 +2,20 @@
 cached on disk.
 
 ``state``        which entry of a state is what
-``motion``       f, F and Q of the process models
+``motion``       one module per motion model and the table of all: f, F, Q, parameters
+``forms``        one module per form of the filter and the table of all: EKF and IEKF, UKF, its
+                 square root, linear KF
 ``sensors``      one module per sensor and the table of all: h, H, second-order term, refusals
 ``measurement``  rows of measurements in a planar filter, ``space`` in a spatial one; ``rows``
                  makes them of messages
-``ekf``          extended and iterated extended Kalman filter: predict, gate, update
 ``fusion``, ``iteration``  rows into the estimate; again where the model bends (``fit``)
-``ukf``, ``srukf``  unscented filters on ``sigma`` points, the second on the square root of P
-``kf``           linear filter with an optional floor under its gain
+``sigma``        what unscented forms take from sigma points; ``dispatch``: the compiled choice
 ``imm``          interacting multiple models
 ``gate``         acceptance by group; ``conditioning``, ``robust``: what fits badly counts less
 ``intersection``  two estimates of one state into one, whatever they have in common
 ``engine``       one epoch of one component; ``components`` of a mixture (``mixture``)
 ``protection``   the radius that holds the error
 ``smooth``       Rauch-Tung-Striebel smoothing
-``filterpy_backend``  the reference
 """
 
 from netpos.estimation.first_compilation import tell_first_compilation

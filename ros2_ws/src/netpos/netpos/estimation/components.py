@@ -19,18 +19,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netpos.estimation import ekf, imm, mixture, srukf
+from netpos.estimation import fusion, imm, mixture
 from netpos.estimation.compile import kernel
 from netpos.estimation.conditioning import Robust, reweight
 from netpos.estimation.engine import (
     GATE_SIZE,
     EpochInput,
     Epochs,
-    Filter,
     FilterOptions,
     Run,
     Scratch,
     StepResult,
+    cov_of,
+    cov_or_sqrt_of,
     is_sound,
     manoeuvre_s,
     predict,
@@ -38,8 +39,10 @@ from netpos.estimation.engine import (
     set_velocity_step_noise,
     step,
     update,
+    update_with_gate,
 )
 from netpos.estimation.fit import neg2_log_likelihood
+from netpos.estimation.forms.choice import write_cov, write_cov_or_sqrt
 from netpos.estimation.gate import accepted_rows
 from netpos.estimation.manoeuvre import add_manoeuvre, measures_velocity
 from netpos.estimation.measurement import (
@@ -106,12 +109,9 @@ def move(components: Mixture, dt_s: float, dynamics: Dynamics, options: FilterOp
     """The components moved by ``dt_s`` seconds."""
     means, covs = components.means.copy(), components.covs.copy()
     for k in range(means.shape[0]):
-        if options.filter == Filter.SRUKF:
-            factor = srukf.factor(covs[k])
-            predict(means[k], factor, dt_s, dynamics.motion, dynamics.bias, options)
-            covs[k] = srukf.covariance(factor)
-        else:
-            predict(means[k], covs[k], dt_s, dynamics.motion, dynamics.bias, options)
+        cov_or_sqrt = cov_or_sqrt_of(covs[k], options)
+        predict(means[k], cov_or_sqrt, dt_s, dynamics.motion, dynamics.bias, options)
+        covs[k] = cov_of(cov_or_sqrt, options)
     return Mixture(means, covs, components.log_weights)
 
 
@@ -125,7 +125,7 @@ def moved_to_epoch(
     rows, robust = epoch.rows, options.robust
     if rows.shape[0] > 0 and (robust.kind != Robust.NONE or robust.nlos_probability > 0.0):
         best, height_m = int(np.argmax(moved.log_weights)), options.height_m
-        work = ekf.workspace(moved.means.shape[1], rows.shape[0])
+        work = fusion.workspace(moved.means.shape[1], rows.shape[0])
         reweight(moved.means[best], moved.covs[best], rows, height_m, robust, work[0])
     return moved
 
@@ -157,15 +157,13 @@ def _apply(
     Nothing accepted leaves the prediction."""
     mean, cov, accepted = found.means[k], found.covs[k], found.accepted[k]
     prior_mean, prior_cov = mean.copy(), cov.copy()
-    work = ekf.workspace(mean.size, rows.shape[0])
-    if options.filter == Filter.SRUKF:
-        factor = srukf.factor(cov)
-        nis, used = update(mean, factor, rows, options, accepted, work)
-        cov[:] = srukf.covariance(factor)
+    work = fusion.workspace(mean.size, rows.shape[0])
+    cov_or_sqrt = cov_or_sqrt_of(cov, options)
+    nis, used = update(mean, cov_or_sqrt, rows, options, accepted, work)
+    if used > 0:
+        cov[:] = cov_of(cov_or_sqrt, options)
     else:
-        nis, used = update(mean, cov, rows, options, accepted, work)
-    if used == 0:
-        mean[:], cov[:] = prior_mean, prior_cov
+        mean[:] = prior_mean
     found.nis[k], found.used[k], found.within_s[k] = nis, used, 0.0
     _weigh(k, log_weight, prior_mean, prior_cov, rows, options, found)
 
@@ -177,11 +175,13 @@ def _apply_all(
     """As ``_apply`` without a gate: ``rows`` come from the tail of their errors."""
     mean, cov, accepted = found.means[k], found.covs[k], found.accepted[k]
     prior_mean, prior_cov = mean.copy(), cov.copy()
-    work = ekf.workspace(mean.size, rows.shape[0])
+    work = fusion.workspace(mean.size, rows.shape[0])
     no_gate = np.full(GATE_SIZE, np.inf)
-    found.nis[k], found.used[k] = ekf.update(
-        mean, cov, rows, options.height_m, no_gate, options.iterations, accepted, work
+    cov_or_sqrt = cov_or_sqrt_of(cov, options)
+    found.nis[k], found.used[k] = update_with_gate(
+        mean, cov_or_sqrt, rows, options, no_gate, accepted, work
     )
+    cov[:] = cov_of(cov_or_sqrt, options)
     found.within_s[k] = 0.0
     _weigh(k, log_weight, prior_mean, prior_cov, rows, options, found)
 
@@ -460,10 +460,10 @@ def _advance(
 ) -> Update:
     """One epoch of a track: of its one component ``x`` (n,), ``S`` (n, n), in place, or of several
     ``components``."""
-    square_root, rows = options.filter == Filter.SRUKF, epoch.rows
+    rows = epoch.rows
     several, moved = components.log_weights.size > 1, False
     if not several and epoch.dt_s > options.coast_after_s:
-        P = srukf.covariance(S) if square_root else S
+        P = cov_of(S, options)
         several = is_too_wide(x, P, epoch, dynamics, options)
         if several:
             components = one_component(x, P)
@@ -474,7 +474,7 @@ def _advance(
         result = step(x, S, epoch, dynamics.motion, dynamics.bias, options, memory)
         if not is_not_enough(result, x, epoch, since_turn_s, options):
             return Update(components, result.nis, result.used, 0.0, 0.0, False)
-        P = srukf.covariance(memory.prior_cov_or_sqrt) if square_root else memory.prior_cov_or_sqrt
+        P = cov_of(memory.prior_cov_or_sqrt, options)
         components, moved = one_component(memory.prior_mean, P), True
     if not moved:
         components = moved_to_epoch(components, epoch, dynamics, options)
@@ -483,7 +483,7 @@ def _advance(
         found = apply_epoch(components, epoch, options, since_turn_s, memory.accepted)
     mean, cov = moments(found.components)
     x[:] = mean
-    S[:] = srukf.factor(cov) if square_root else cov
+    write_cov_or_sqrt(options.filter, cov, S)
     return found
 
 
@@ -504,8 +504,7 @@ def run_epochs(
     """
     stamps_ns, row_start = epochs.stamps_ns, epochs.row_start
     memory = scratch(mean.size, max(np.diff(row_start).max(), 1))
-    square_root = options.filter == Filter.SRUKF
-    x, S = mean.copy(), srukf.factor(cov) if square_root else cov.copy()
+    x, S = mean.copy(), cov_or_sqrt_of(cov, options)
     components, rejected_in_row = one_component(x, cov), 0
     last_ns = heard_ns = turn_ns = stamps_ns[0]
     for k in range(stamps_ns.size):
@@ -527,7 +526,7 @@ def run_epochs(
         if components.log_weights.size > 1:
             run.radius[k] = mixture_radius(components, x, options.integrity_risk)
         run.means[k] = x
-        run.covs[k] = srukf.covariance(S) if square_root else S
+        write_cov(options.filter, S, run.covs[k])
         if rejected_in_row >= options.lost_after:
             return k + 1
     return int(stamps_ns.size)

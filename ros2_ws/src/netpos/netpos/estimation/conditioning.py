@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netpos.estimation.compile import kernel, leaf
-from netpos.estimation.ekf import group_nis
+from netpos.estimation.fusion import group_nis
 from netpos.estimation.measurement import (
     BLOCKED,
     GATE_VARIANCE,

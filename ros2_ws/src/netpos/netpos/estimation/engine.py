@@ -4,18 +4,19 @@ live track, the replay and Monte Carlo runs of thousands of routes."""
 from __future__ import annotations
 
 import math
-from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from netpos.estimation import conditioning, ekf, kf, srukf, ukf
-from netpos.estimation.compile import kernel, leaf
+from netpos.estimation import conditioning, fusion
+from netpos.estimation.compile import inlined, kernel, leaf
 from netpos.estimation.conditioning import Robust, RobustOptions
-from netpos.estimation.manoeuvre import add_manoeuvre, detection_delay_s
+from netpos.estimation.forms import choice
+from netpos.estimation.forms.table import FORMS
+from netpos.estimation.manoeuvre import detection_delay_s, manoeuvre_moments
 from netpos.estimation.measurement import GROUP
-from netpos.estimation.motion import SPEED_OF_LIGHT_MPS, Parameter, add_velocity_step
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS, Parameter
 from netpos.estimation.state import X
 from netpos.messages.values import Array
 
@@ -26,20 +27,10 @@ _FARTHEST_M = 1e9  # no measurement may say more
 _ROUNDING = 1e-15  # of turned axes
 
 
-class Filter(IntEnum):
-    """``FilterOptions.filter``, in the order of ``config.FILTERS``."""
-
-    EKF = 0
-    IEKF = 1
-    UKF = 2
-    SRUKF = 3
-    KF = 4
-
-
 class FilterOptions(NamedTuple):
     """What a filter is told once; ``models.options_of`` makes it from the parameters."""
 
-    filter: int  # Filter
+    filter: int  # place in ``forms.table.FORMS``
     iterations: int
     height_m: float  # of the device
     inflate_after: int  # epochs rejected in a row
@@ -49,7 +40,7 @@ class FilterOptions(NamedTuple):
     coast_after_s: float  # a longer silence may leave the device anywhere
     integrity_risk: float  # share of errors that may exceed the protection level
     robust: RobustOptions
-    gain_floor: Array  # (3,) as for ``kf.update``
+    of_form: Array  # what the form has of its own (``FilterForm.parameters``)
     gate_nis: Array  # (GATE_SIZE,) largest accepted NIS for 0, 1, ... degrees of freedom
 
 
@@ -72,8 +63,8 @@ class StepResult(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of ``step``: of ``ekf.workspace``, groups accepted (groups,) and the prediction (n,),
-    (n, n)."""
+    """Memory of ``step``: of ``fusion.workspace``, groups accepted (groups,) and the prediction
+    (n,), (n, n)."""
 
     work: Array
     accepted: Array
@@ -106,23 +97,40 @@ class Run(NamedTuple):
 @kernel
 def scratch(n: int, m: int) -> Scratch:
     """Memory for ``step`` with ``n`` states and up to ``m`` rows."""
-    return Scratch(ekf.workspace(n, m), np.zeros(m), np.zeros(n), np.zeros((n, n)))
+    return Scratch(fusion.workspace(n, m), np.zeros(m), np.zeros(n), np.zeros((n, n)))
 
 
 def to_cov_or_sqrt(cov: Array, options: FilterOptions) -> Array:
-    """What the filter carries instead of the covariance: its lower Cholesky factor where it is a
-    square-root filter, a copy otherwise."""
-    if options.filter == Filter.SRUKF:
-        factor: Array = srukf.factor(cov)
-        return factor
-    return cov.copy()
+    """What the filter carries instead of the covariance, as a new array."""
+    write, cov_or_sqrt = FORMS[options.filter].write_cov_or_sqrt, cov.copy()
+    if write is not None:
+        write(cov, cov_or_sqrt)
+    return cov_or_sqrt
 
 
 def to_cov(cov_or_sqrt: Array, options: FilterOptions) -> Array:
-    """Covariance (n, n) of what the filter carries."""
-    if options.filter == Filter.SRUKF:
-        cov: Array = srukf.covariance(cov_or_sqrt)
-        return cov
+    """Covariance (n, n) of what the filter carries; the same array where that is a covariance."""
+    write = FORMS[options.filter].write_cov
+    if write is None:
+        return cov_or_sqrt
+    cov = np.empty_like(cov_or_sqrt)
+    write(cov_or_sqrt, cov)
+    return cov
+
+
+@kernel
+def cov_of(cov_or_sqrt: Array, options: FilterOptions) -> Array:
+    """Covariance (n, n) of what the filter carries, as a new array."""
+    cov = np.empty_like(cov_or_sqrt)
+    choice.write_cov(options.filter, cov_or_sqrt, cov)
+    return cov
+
+
+@kernel
+def cov_or_sqrt_of(cov: Array, options: FilterOptions) -> Array:
+    """``to_cov_or_sqrt``, compiled."""
+    cov_or_sqrt = np.empty_like(cov)
+    choice.write_cov_or_sqrt(options.filter, cov, cov_or_sqrt)
     return cov_or_sqrt
 
 
@@ -133,13 +141,24 @@ def predict(
     """Move mean (n,) and cov_or_sqrt (n, n) by ``dt`` seconds in place; nothing happens for dt <=
     0. A velocity step noted in ``motion`` is over."""
     motion[Parameter.VELOCITY_STEP_SD] = 0.0
-    kind = options.filter
-    if kind == Filter.UKF:
-        ukf.predict(mean, cov_or_sqrt, dt, motion, bias)
-    elif kind == Filter.SRUKF:
-        srukf.predict(mean, cov_or_sqrt, dt, motion, bias)
-    else:
-        ekf.predict(mean, cov_or_sqrt, dt, motion, bias)
+    choice.predict(options.filter, mean, cov_or_sqrt, dt, motion, bias)
+
+
+@inlined
+def update_with_gate(
+    mean: Array,
+    cov_or_sqrt: Array,
+    rows: Array,
+    options: FilterOptions,
+    gate_nis: Array,
+    accepted: Array,
+    work: Array,
+) -> tuple[float, int]:
+    """``update`` with another gate than that of the options."""
+    nis, used = choice.update(
+        options.filter, mean, cov_or_sqrt, rows, options, gate_nis, accepted, work
+    )
+    return nis, used
 
 
 @leaf
@@ -153,18 +172,8 @@ def update(
 ) -> tuple[float, int]:
     """Gate and apply one epoch, in place: NIS of the accepted rows and their number; ``accepted``
     (groups,) is filled."""
-    kind, height_m, gate = options.filter, options.height_m, options.gate_nis
-    if kind == Filter.UKF:
-        nis, used = ukf.update(mean, cov_or_sqrt, rows, height_m, gate, accepted)
-    elif kind == Filter.SRUKF:
-        nis, used = srukf.update(mean, cov_or_sqrt, rows, height_m, gate, accepted)
-    elif kind == Filter.KF:
-        nis, used = kf.update(
-            mean, cov_or_sqrt, rows, height_m, gate, accepted, options.gain_floor
-        )
-    else:
-        iterations = options.iterations
-        nis, used = ekf.update(mean, cov_or_sqrt, rows, height_m, gate, iterations, accepted, work)
+    gate_nis = options.gate_nis
+    nis, used = update_with_gate(mean, cov_or_sqrt, rows, options, gate_nis, accepted, work)
     return nis, used
 
 
@@ -172,18 +181,7 @@ def update(
 def open_velocity(cov_or_sqrt: Array, sd: float, unheard_s: float, options: FilterOptions) -> None:
     """Add, in place, a velocity step of ``sd`` [m/s] per axis at some time in the last
     ``unheard_s`` seconds, and the position it leads to."""
-    if options.filter == Filter.SRUKF:
-        _open_factor(cov_or_sqrt, sd, unheard_s)
-        return
-    add_velocity_step(sd, unheard_s, 0.0, cov_or_sqrt)
-
-
-@kernel
-def _open_factor(cov_or_sqrt: Array, sd: float, unheard_s: float) -> None:
-    for p in range(2):
-        x = np.zeros(cov_or_sqrt.shape[0])
-        x[X.PX + p], x[X.VX + p] = sd * unheard_s, sd
-        srukf.cholesky_update(cov_or_sqrt, x, 1.0)
+    choice.add_velocity_step(options.filter, sd, unheard_s, 0.0, cov_or_sqrt)
 
 
 @kernel
@@ -206,14 +204,8 @@ def inflate_for_manoeuvre(cov_or_sqrt: Array, within_s: float, options: FilterOp
     """Add, in place, a velocity step of the manoeuvre speed at any time of the last ``within_s``
     seconds."""
     speed = options.manoeuvre_speed_sd
-    if options.filter != Filter.SRUKF:
-        add_manoeuvre(speed, within_s, cov_or_sqrt)
-        return
-    _open_factor(cov_or_sqrt, speed, within_s / 2.0)
-    for p in range(2):
-        x = np.zeros(cov_or_sqrt.shape[0])
-        x[X.PX + p] = speed * within_s / math.sqrt(12.0)
-        srukf.cholesky_update(cov_or_sqrt, x, 1.0)
+    time_s, position_sd = manoeuvre_moments(speed, within_s)
+    choice.add_velocity_step(options.filter, speed, time_s, position_sd, cov_or_sqrt)
 
 
 @leaf
@@ -307,7 +299,5 @@ def reweight(
     mean: Array, cov_or_sqrt: Array, rows: Array, options: FilterOptions, work: Array
 ) -> None:
     """Re-weight the rows in place as the robust options say."""
-    cov = cov_or_sqrt
-    if options.filter == Filter.SRUKF:
-        cov = srukf.covariance(cov_or_sqrt)
+    cov = cov_of(cov_or_sqrt, options)
     conditioning.reweight(mean, cov, rows, options.height_m, options.robust, work[0])

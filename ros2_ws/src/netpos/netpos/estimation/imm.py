@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netpos.estimation import ekf
 from netpos.estimation.compile import kernel
 from netpos.estimation.fit import neg2_log_likelihood
+from netpos.estimation.forms import ekf
 from netpos.estimation.gate import accepted_rows
 from netpos.messages.values import Array
 

@@ -74,7 +74,15 @@ def measures_velocity(mean: Array, rows: Array, height_m: float) -> bool:
 
 
 @leaf
+def manoeuvre_moments(speed: float, within_s: float) -> tuple[float, float]:
+    """Mean age [s] of a velocity step of sd ``speed`` [m/s] at any time of the last ``within_s``
+    seconds, and the sd [m] of the position it led to at a known age."""
+    return within_s / 2.0, speed * within_s / math.sqrt(12.0)
+
+
+@leaf
 def add_manoeuvre(speed: float, within_s: float, cov: Array) -> None:
     """Add, in place, a velocity step of sd ``speed`` [m/s] per axis at any time of the last
     ``within_s`` seconds, and the position it led to."""
-    add_velocity_step(speed, within_s / 2.0, speed * within_s / math.sqrt(12.0), cov)
+    time_s, position_sd = manoeuvre_moments(speed, within_s)
+    add_velocity_step(speed, time_s, position_sd, cov)

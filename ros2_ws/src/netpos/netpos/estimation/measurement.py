@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from netpos.estimation.compile import inlined, kernel, leaf
-from netpos.estimation.sensors.dispatch import choose, is_one_of
+from netpos.estimation.dispatch import choose, is_one_of
 from netpos.estimation.sensors.geometry import turned_lever
 from netpos.estimation.sensors.model import Wraps
 from netpos.estimation.sensors.row import (

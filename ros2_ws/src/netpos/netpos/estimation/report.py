@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from netpos.estimation import ekf
 from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.engine import GATE_SIZE, Epochs, FilterOptions, Run
+from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.motion import Parameter
 from netpos.estimation.protection import (

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from netpos.estimation.compile import inlined, leaf, link
+from netpos.estimation.dispatch import Kernel, choose
 from netpos.estimation.measurement import (
     AXES,
     BIAS,
@@ -29,8 +30,7 @@ from netpos.estimation.measurement import (
     VARIANCE,
     Kind,
 )
-from netpos.estimation.sensors.dispatch import choose
-from netpos.estimation.sensors.model import Kernel, Reading
+from netpos.estimation.sensors.model import Reading
 from netpos.estimation.sensors.table import readings
 from netpos.estimation.state import N_CORE
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement

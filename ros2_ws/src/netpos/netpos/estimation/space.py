@@ -16,6 +16,7 @@ import math
 import numpy as np
 
 from netpos.estimation.compile import inlined, kernel, leaf
+from netpos.estimation.dispatch import choose, is_one_of
 from netpos.estimation.measurement import (
     BIAS,
     COMMON,
@@ -35,7 +36,6 @@ from netpos.estimation.measurement import (
     second_order_of_offset,
     wrap,
 )
-from netpos.estimation.sensors.dispatch import choose, is_one_of
 from netpos.estimation.sensors.table import SENSORS
 from netpos.estimation.state import Err, Nav
 from netpos.inertial.navigation_state import ACCEL_BIAS, QUATERNION

@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from netpos.estimation import ekf
 from netpos.estimation.compile import kernel
+from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import VARIANCE, predict_row
 from netpos.estimation.motion import NO_BIAS
 from netpos.messages.values import Array

@@ -103,7 +103,7 @@ def _learning(bag: Path) -> bool | None:
     """Whether the tracker of a bag learns the errors of RSUs; None: its motion model cannot."""
     with BagReader(bag) as source:
         config = TrackerConfig.from_mapping(bag_settings(source).parameters)
-    return None if config.motion_model == "strapdown" else config.learn_errors
+    return None if config.is_strapdown else config.learn_errors
 
 
 def default_parameters(bag: Path) -> Json:

@@ -115,7 +115,7 @@ class Follower:
             first, mean, cov = start
             part, part_run = epochs.since(first, fixed=losses > 0), _part(run, first)
             part_motions = motions[first:] if imu is not None else motions
-            if imu is None and self._config.motion_model != "interacting":
+            if imu is None and not self._config.interacts:
                 done = self._compiled(part, mean, cov, part_run)
             else:
                 done = self._stepped(part, mean, cov, part_run, imu, part_motions)
@@ -138,7 +138,7 @@ class Follower:
         that interact, bound and level know one: straight on."""
         if driven:
             return np.tile(self._motions[0], (count, 1))
-        return self._motions[1:2] if self._config.motion_model == "interacting" else self._motions
+        return self._motions[1:2] if self._config.interacts else self._motions
 
     def _compiled(self, epochs: Epochs, mean: Array, cov: Array, run: Run) -> int:
         """Epochs done: all in one kernel."""

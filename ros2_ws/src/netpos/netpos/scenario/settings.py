@@ -30,6 +30,10 @@ SCENARIO_FACT = "scenario"
 FUSION_FACT = "fusion"
 
 
+# Parameters of earlier versions, and the value at which a tracker did what it does now.
+_REMOVED = {"backend": "compiled"}
+
+
 @dataclass(frozen=True, slots=True)
 class TrackerSettings:
     """Parameters by name, and the devices to expect.
@@ -69,12 +73,19 @@ def bag_settings(bag: BagReader) -> TrackerSettings:
     if fusion is None and TRACKER_FACT not in bag.facts:
         raise BagError(f"{bag.path} does not say with which parameters to track it")
     networks = tuple(map(str, (fusion or {}).pop("networks", ())))
-    parameters = _mapping(bag, TRACKER_FACT) or {}
+    parameters = known_parameters(_mapping(bag, TRACKER_FACT) or {})
     lists = bag.facts.get(RSUS_FACT, ())
     if len(lists) > 1:
         raise BagError(f"{bag.path} was tracked with {len(lists)} different lists of RSUs")
     rsus = lists[0] if lists else ""
     return TrackerSettings(parameters, networks=networks, fusion=fusion or {}, rsus=rsus)
+
+
+def known_parameters(recorded: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters that a bag tells, without those of an earlier version that say what every
+    tracker does now."""
+    gone = {name for name, value in _REMOVED.items() if recorded.get(name) == value}
+    return {name: value for name, value in recorded.items() if name not in gone}
 
 
 def tracker_fact(config: TrackerConfig, rsus: str = "") -> dict[str, str]:

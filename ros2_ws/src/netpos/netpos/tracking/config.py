@@ -5,55 +5,55 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, make_dataclass
 from typing import Any
 
 from netpos.common.parameters import check_fields, choice, count, described, from_mapping, real
+from netpos.estimation.forms import table as forms
 from netpos.estimation.motion import ProcessNoise
+from netpos.estimation.motion import table as motion
+from netpos.estimation.motion.model import MotionModel
 from netpos.messages.fields import Frames
 from netpos.tracking.rsus import StepErrors
 from netpos.world.geodesy import datum_of_text
 
-FILTERS = ("ekf", "iekf", "ukf", "srukf", "kf")
-BACKENDS = ("compiled", "filterpy")
-MOTION_MODELS = (
-    "constant_velocity",
-    "constant_turn",
-    "constant_acceleration",
-    "interacting",
-    "inertial",
-    "rigid_body",
-    "strapdown",
-)
+FILTERS = tuple(forms.words())
+STRAPDOWN = "strapdown"
+"""The motion of a track in three dimensions, which is no model of the table."""
+_MOTIONS = {**motion.words(), STRAPDOWN: "three dimensions, driven by the device's IMU"}
+MOTION_MODELS = tuple(_MOTIONS)
 ROBUST = ("none", "huber", "student_t")
 TRUST = ("listed", "first", "any")
 AMBIGUITY = ("hypotheses", "step_heading")
 
 
+def _described(words: Mapping[str, str]) -> str:
+    return " | ".join(f"{word} ({text})" if text else word for word, text in words.items())
+
+
+def _of_the_tables() -> Any:
+    """Dataclass of the parameters that the tables of motion models and filter forms give."""
+    entries = {
+        "filter": choice(forms.DEFAULT, FILTERS, _described(forms.words())),
+        "motion_model": choice(motion.DEFAULT, MOTION_MODELS, _described(_MOTIONS)),
+        **motion.parameters(),
+        **forms.parameters(),
+    }
+    kinds = [(name, type(entry.default), entry) for name, entry in entries.items()]
+    return make_dataclass("_OfTheTables", kinds, frozen=True, slots=True, kw_only=True)
+
+
+_OfTheTables: Any = _of_the_tables()
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrackerConfig:
+class TrackerConfig(_OfTheTables):  # type: ignore[misc]
     """Every parameter has its unit in its name, a range and a sentence
     (``dataclasses.fields(...).metadata``).
 
     Raises ``ValueError`` naming the parameter, its value and the accepted range.
     """
 
-    filter: str = choice(
-        "iekf",
-        FILTERS,
-        "ekf | iekf (linearised again at its own result) | ukf | srukf (square root) | kf (linear:"
-        " position fixes and velocities only)",
-    )
-    backend: str = choice(
-        "compiled", BACKENDS, "compiled | filterpy (reference for ekf and ukf, slow)"
-    )
-    motion_model: str = choice(
-        "constant_velocity",
-        MOTION_MODELS,
-        "constant_velocity | constant_turn | constant_acceleration | interacting (stop, straight,"
-        " turn) | inertial (driven by the device's IMU) | rigid_body (several antennas give a"
-        " heading of its own) | strapdown (three dimensions, driven by the device's IMU)",
-    )
     process_noise: str = choice(
         "continuous",
         tuple(noise.name.lower() for noise in ProcessNoise),
@@ -77,16 +77,6 @@ class TrackerConfig:
     drift_step_sd: float = real(
         1e-4, 0.0, 1.0, "werner, white_acceleration: clock drift sd per step [s/s]"
     )
-    turn_rate_density: float = real(
-        0.3, 1e-9, 1e3, "not constant_velocity: walk of the turn rate [rad/s/sqrt(s)]"
-    )
-    jerk_density: float = real(
-        1.0, 0.0, 1e4, "constant_acceleration: density of the white jerk [m/s^3/sqrt(Hz)]"
-    )
-    accel_state_sd_mps2: float = real(
-        2.0, 1e-6, 1e3, "constant_acceleration: initial acceleration sd per axis"
-    )
-    rest_speed_sd_mps: float = real(0.05, 1e-6, 1e3, "interacting: speed sd of a device at rest")
     sojourn_s: float = real(
         5.0, 1e-3, 1e6, "interacting: mean time a device keeps to one of the models"
     )
@@ -95,12 +85,6 @@ class TrackerConfig:
         1e-6,
         1e3,
         "inertial: noise of the forward acceleration and side slip; strapdown: of each axis",
-    )
-    inertial_manoeuvre_speed_sd_mps: float = real(
-        0.0,
-        0.0,
-        1e3,
-        "inertial, in place of manoeuvre_speed_sd_mps: velocity step that the IMU does not show",
     )
     gyro_noise_density: float = real(
         5e-3, 1e-9, 10.0, "inertial, strapdown: noise of the gyros [rad/s/sqrt(Hz)]"
@@ -111,17 +95,11 @@ class TrackerConfig:
         10.0,
         "inertial: initial sd of the yaw-rate bias; strapdown: sd of each gyro bias",
     )
-    gyro_bias_walk: float = real(
-        1e-4, 0.0, 1.0, "inertial: walk of the yaw-rate bias [rad/s/sqrt(s)]"
-    )
     accel_bias_sd_mps2: float = real(
         0.2,
         1e-9,
         100.0,
         "inertial: initial sd of the forward acceleration's bias; strapdown: of each axis",
-    )
-    accel_bias_walk: float = real(
-        1e-2, 0.0, 10.0, "inertial: walk of the forward acceleration's bias [m/s^2/sqrt(s)]"
     )
     bias_correlation_time_s: float = real(
         100.0, 1.0, 1e6, "strapdown: correlation time of the IMU's biases (first-order Markov)"
@@ -142,15 +120,6 @@ class TrackerConfig:
     gravity_mps2: float = real(9.80665, 9.0, 11.0, "strapdown: gravity of the place")
     earth_rate: bool = described(False, "strapdown: the earth turns, as at latitude_deg")
     latitude_deg: float = real(0.0, -90.0, 90.0, "strapdown: of the place, with earth_rate")
-    position_gain_min: float = real(
-        0.0, 0.0, 1.0, "kf: floor of the position gain (dvornikov2017: 0.0926)"
-    )
-    velocity_gain_min: float = real(
-        0.0, 0.0, 10.0, "kf: floor of the velocity gain [1/s] (dvornikov2017: 0.008)"
-    )
-    accel_gain_min: float = real(
-        0.0, 0.0, 10.0, "kf: floor of the acceleration gain [1/s^2] (dvornikov2017: 0.0003)"
-    )
     clock_white_density: float = real(
         1e-10, 0.0, 1.0, "continuous: clock white frequency noise [s/sqrt(s)]"
     )
@@ -240,7 +209,7 @@ class TrackerConfig:
         0.0,
         1e3,
         "velocity step that a measurement which fails the gate may reveal; 0: none. Not with an"
-        " IMU, interacting models, filter kf or backend filterpy",
+        " IMU, interacting models or filter kf",
     )
     inflate_after_epochs: int = count(
         2, "epochs rejected in a row before the velocity opens to its initial sd"
@@ -322,36 +291,31 @@ class TrackerConfig:
             datum_of_text(self.datum)
         if self.require_initial_pose and not self.accept_initialpose:
             raise ValueError("require_initial_pose needs accept_initialpose; set it to true")
-        if self.motion_model == "strapdown":
+        if self.is_strapdown:
             self._check_strapdown()
-        if self.backend == "filterpy" and self.filter not in ("ekf", "ukf"):
-            raise ValueError(f"backend filterpy has filter ekf or ukf, not {self.filter!r}")
-        if self.backend == "filterpy" and self.motion_model == "interacting":
-            raise ValueError("backend filterpy has no motion_model interacting; use compiled")
-        if self.motion_model == "interacting" and self.fixed_lag_s > 0.0:
-            raise ValueError("fixed_lag_s must be 0 with motion_model interacting")
+        if self.interacts and self.fixed_lag_s > 0.0:
+            raise ValueError(f"fixed_lag_s must be 0 with motion_model {self.motion_model}")
         if self.steady_accel_density_mps2_sqrthz > 0.0:
             self._check_steady()
         plain = self.robust == "none" and self.nlos_probability == 0.0
-        if not plain and (self.backend == "filterpy" or self.motion_model == "interacting"):
+        if not plain and self.interacts:
             raise ValueError(
-                "robust and nlos_probability need backend compiled and a single motion model;"
-                " leave them at none and 0"
+                "robust and nlos_probability need a single motion model; leave them at none and 0"
             )
-        several = self.backend == "filterpy" or self.motion_model == "interacting"
-        if self.learn_errors and (several or self.motion_model == "strapdown"):
+        if self.learn_errors and (self.interacts or self.is_strapdown):
             raise ValueError(
-                "learn_errors needs backend compiled and a planar motion model other than"
-                f" interacting, got {self.backend!r} and {self.motion_model!r}; set it to false"
+                "learn_errors needs a single planar motion model,"
+                f" got {self.motion_model!r}; set it to false"
             )
-        if self.motion_model == "interacting" and self.filter not in ("ekf", "iekf"):
+        if self.interacts and not forms.form_of(self.filter).is_extended:
+            extended = " or ".join(form.name for form in forms.FORMS if form.is_extended)
             raise ValueError(
-                f"motion_model interacting takes filter ekf or iekf, not {self.filter!r}"
+                f"motion_model {self.motion_model} takes filter {extended}, not {self.filter!r}"
             )
-        if self.filter == "kf" and self.calibrates_steps:
+        if self.is_linear and self.calibrates_steps:
             raise ValueError(
-                "filter kf is linear; leave step_length_factor_sd and step_heading_offset_sd_rad"
-                " at 0 or take another filter"
+                f"filter {self.filter} is linear; leave step_length_factor_sd and"
+                " step_heading_offset_sd_rad at 0 or take another filter"
             )
 
     @property
@@ -365,8 +329,9 @@ class TrackerConfig:
         return datum_of_text(self.datum) if self.datum else None
 
     def _check_steady(self) -> None:
-        several = self.motion_model in ("interacting", "constant_acceleration")
-        if self.process_noise != "continuous" or several:
+        models = self.motion_models
+        driven = all(model.is_driven_by_white_acceleration for model in models)
+        if self.process_noise != "continuous" or self.interacts or not driven:
             raise ValueError(
                 "steady_accel_density_mps2_sqrthz needs process_noise continuous and one motion"
                 f" model moved by white acceleration, got {self.process_noise!r} and"
@@ -374,10 +339,10 @@ class TrackerConfig:
             )
 
     def _check_strapdown(self) -> None:
-        if self.filter not in ("ekf", "iekf") or self.backend != "compiled":
+        if not forms.form_of(self.filter).is_extended:
             raise ValueError(
-                "motion_model strapdown has its own error-state filter; leave filter at iekf and"
-                f" backend at compiled, got {self.filter!r} and {self.backend!r}"
+                f"motion_model strapdown has its own error-state filter; leave filter at"
+                f" {forms.DEFAULT}, got {self.filter!r}"
             )
         if self.fixed_lag_s > 0.0:
             raise ValueError(
@@ -393,21 +358,38 @@ class TrackerConfig:
     @property
     def use_imu(self) -> bool:
         """Whether the device's IMU is an input."""
-        return self.motion_model in ("inertial", "strapdown")
+        return self.is_strapdown or any(model.uses_imu for model in self.motion_models)
+
+    @property
+    def is_strapdown(self) -> bool:
+        """Whether tracks are in three dimensions and follow the device's IMU."""
+        return bool(self.motion_model == STRAPDOWN)
+
+    @property
+    def motion_models(self) -> tuple[MotionModel, ...]:
+        """Motion models of a planar track: one, or several that interact; none of strapdown."""
+        return motion.models_of(self.motion_model)
+
+    @property
+    def interacts(self) -> bool:
+        """Whether the device changes between several motion models."""
+        return len(self.motion_models) > 1
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether the filter takes positions and velocities only."""
+        return forms.form_of(self.filter).update_shared is not None
 
     @property
     def manoeuvre_sd_mps(self) -> float:
         """Velocity step per axis that a refused measurement may reveal to this estimate; 0: none.
 
-        Interacting models and the gain floor follow manoeuvres by themselves, and the reference
-        has none.
+        Interacting models and the gain floor follow manoeuvres by themselves.
         """
-        one_gaussian = self.filter == "kf" or self.backend == "filterpy"
-        if one_gaussian or self.motion_model in ("interacting", "strapdown"):
+        one_gaussian = self.interacts or self.is_strapdown
+        if one_gaussian or forms.form_of(self.filter).follows_manoeuvres:
             return 0.0
-        if self.use_imu:
-            return float(self.inertial_manoeuvre_speed_sd_mps)
-        return float(self.manoeuvre_speed_sd_mps)
+        return float(getattr(self, self.motion_models[0].manoeuvre_speed))
 
     @property
     def step_errors(self) -> StepErrors:

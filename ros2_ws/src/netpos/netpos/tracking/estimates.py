@@ -1,7 +1,6 @@
 """Mean and covariance of one device, carried from epoch to epoch by the chosen filter.
 
-``KalmanEstimate`` runs one motion model in the compiled engine, ``ImmEstimate`` several at once,
-and ``FilterpyEstimate`` one on FilterPy.
+``KalmanEstimate`` runs one motion model in the compiled engine, ``ImmEstimate`` several at once.
 """
 
 from __future__ import annotations
@@ -11,9 +10,10 @@ from typing import Protocol
 
 import numpy as np
 
-from netpos.estimation import components, ekf, engine, filterpy_backend, imm
+from netpos.estimation import components, engine, fusion, imm
 from netpos.estimation.components import Dynamics, moments
 from netpos.estimation.engine import EpochInput, FilterOptions
+from netpos.estimation.forms.table import form_of
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.mixture import Mixture, mode_of
 from netpos.estimation.motion import Parameter
@@ -116,7 +116,7 @@ class KalmanEstimate(OneModel):
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
         self.stamp_ns = self._turn_ns = stamp_ns
         self._options = options_of(config)
-        self._factored = config.filter == "srukf"
+        self._factored = not form_of(config.filter).carries_cov
         self._motion: Array = motions_of(config)[0].copy()
         self._components: Mixture | None = None  # replaced, never changed; None: one component
         self._prior: tuple[Array, Array] | None = None  # of a mixture
@@ -290,7 +290,7 @@ class GatedEstimate(UnimodalEstimate):
     _prior: tuple[Array, Array]
 
     def change_prior(self, index: int, before: float, after: float) -> None:
-        raise NotImplementedError("errors are learned with backend compiled only")
+        raise NotImplementedError("errors are learned with one motion model only")
 
     def _move(self, stamp_ns: int, bias: Array) -> None:
         raise NotImplementedError
@@ -399,7 +399,7 @@ class ImmEstimate(GatedEstimate):
             self._options.gate_nis,
             self._options.iterations,
             accepted,
-            ekf.workspace(self.mean.size, len(rows)),
+            fusion.workspace(self.mean.size, len(rows)),
         )
         self._set_state(self._models)
         return result
@@ -414,59 +414,8 @@ class ImmEstimate(GatedEstimate):
         return twin
 
 
-class FilterpyEstimate(OneModel, GatedEstimate):
-    """One motion model on FilterPy: slow, for comparison."""
-
-    def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
-        self.stamp_ns = stamp_ns
-        self._options = options_of(config)
-        self._motion: Array = motions_of(config)[0].copy()
-        unscented = config.filter == "ukf"
-        self._predict_with = (
-            filterpy_backend.ukf_predict if unscented else filterpy_backend.ekf_predict
-        )
-        self._update_with = (
-            filterpy_backend.ukf_update if unscented else filterpy_backend.ekf_update
-        )
-        self._set_state(augmented(mean, cov, initial_extra_sd(config)))
-        self._prior = (self.mean, self.cov)
-
-    def _state(self) -> tuple[Array, ...]:
-        return self.mean, self.cov
-
-    def _set_state(self, state: tuple[Array, ...]) -> None:
-        self.mean, self.cov = state
-
-    def augment(self, sd: Array) -> None:
-        self.mean, self.cov = augmented(self.mean, self.cov, sd)
-
-    def _set_velocity_step_noise(self, opened_sd: float, unheard_s: float) -> None:
-        engine.set_velocity_step_noise(self._motion, opened_sd, unheard_s, 0.0, 0.0)
-
-    def _move(self, stamp_ns: int, bias: Array) -> None:
-        dt = (stamp_ns - self.stamp_ns) * 1e-9
-        self._motion[Parameter.VELOCITY_STEP_SD] = 0.0
-        self._predict_with(self.mean, self.cov, dt, self._motion, bias)
-        self.stamp_ns = stamp_ns
-
-    def _update(self, rows: Array, accepted: Array) -> tuple[float, int]:
-        gate, height_m = self._options.gate_nis, self._options.height_m
-        return self._update_with(self.mean, self.cov, rows, height_m, gate, accepted)
-
-    def _open(self, sd: float, unheard_s: float) -> None:
-        engine.open_velocity(self.cov, sd, unheard_s, self._options)
-
-    def copy(self) -> FilterpyEstimate:
-        twin = copy.copy(self)
-        twin._motion = self._motion.copy()
-        twin._restore(self._state())
-        return twin
-
-
 def start(config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> Estimate:
     """Estimate of the configured kind from mean (6,) and covariance (6, 6) at ``stamp_ns``."""
-    if config.backend == "filterpy":
-        return FilterpyEstimate(config, stamp_ns, mean, cov)
-    if config.motion_model == "interacting":
+    if config.interacts:
         return ImmEstimate(config, stamp_ns, mean, cov)
     return KalmanEstimate(config, stamp_ns, mean, cov)

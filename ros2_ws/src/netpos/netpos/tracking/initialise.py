@@ -16,10 +16,11 @@ from collections import deque
 import numpy as np
 
 from netpos.common.least_squares import minimise
-from netpos.estimation import ekf
 from netpos.estimation.chi_square import chi_square_bound
 from netpos.estimation.compile import kernel
 from netpos.estimation.fit import map_cost
+from netpos.estimation.fusion import workspace
+from netpos.estimation.iteration import iterate_from
 from netpos.estimation.measurement import (
     AXES,
     BIAS,
@@ -285,11 +286,11 @@ def with_heading(
     prior = np.zeros((7, 7))
     prior[:6, :6] = cov + reach**2 * np.diag([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
     prior[6, 6] = math.pi**2
-    variance, work = rows[:, VARIANCE].copy(), ekf.workspace(7, len(rows))
+    variance, work = rows[:, VARIANCE].copy(), workspace(7, len(rows))
     candidates = []
     for k in range(_HEADINGS):
         start = np.append(mean, 2.0 * math.pi * k / _HEADINGS)
-        x, P = ekf.iterate_from(start, start, prior, rows, variance, height_m, 30, work)
+        x, P = iterate_from(start, start, prior, rows, variance, height_m, 30, work)
         candidates.append((map_cost(x, P, rows, variance, height_m, x), k, x, P))
     candidates.sort(key=lambda c: c[:2])
     cost, _, x, P = candidates[0]

@@ -22,8 +22,7 @@ LIVE_OF_ONE_MODEL = ("gate_probability", "accel_density_mps2_sqrthz", "coast_aft
 
 def live_names(config: TrackerConfig) -> tuple[str, ...]:
     """The parameters that may change while a tracker runs with ``config``."""
-    several = config.motion_model in ("interacting", "strapdown")
-    if several or config.backend != "compiled":
+    if config.interacts or config.is_strapdown:
         return LIVE
     return LIVE + LIVE_OF_ONE_MODEL
 

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from netpos.estimation.chi_square import chi_square_bound
 from netpos.estimation.conditioning import RobustOptions
 from netpos.estimation.engine import GATE_SIZE, FilterOptions
-from netpos.estimation.motion import (
-    SPEED_OF_LIGHT_MPS,
-    Model,
-    ProcessNoise,
-    extra_states,
-    motion_parameters,
-)
+from netpos.estimation.forms.table import form_of, number_of
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS, Model, ProcessNoise, motion_parameters
+from netpos.estimation.motion.model import MotionModel
 from netpos.estimation.state import N_CORE, POSITION, X
 from netpos.messages.values import Array
-from netpos.tracking.config import FILTERS, ROBUST, TrackerConfig
-
-FILTER_ITERATIONS = {"ekf": 1, "iekf": 8}
+from netpos.tracking.config import ROBUST, TrackerConfig
 
 
 def gate_thresholds(probability: float) -> Array:
@@ -32,9 +24,10 @@ def gate_thresholds(probability: float) -> Array:
 
 def options_of(config: TrackerConfig) -> FilterOptions:
     """What the kernels of a planar track take of the parameters."""
+    form = form_of(config.filter)
     return FilterOptions(
-        filter=FILTERS.index(config.filter),
-        iterations=FILTER_ITERATIONS.get(config.filter, 1),
+        filter=number_of(form),
+        iterations=form.iterations,
         height_m=float(config.device_height_m),
         inflate_after=int(config.inflate_after_epochs),
         lost_after=int(config.max_rejected_epochs),
@@ -43,9 +36,7 @@ def options_of(config: TrackerConfig) -> FilterOptions:
         coast_after_s=float(config.coast_after_s),
         integrity_risk=float(config.integrity_risk),
         robust=robust_options_of(config),
-        gain_floor=np.array(
-            [config.position_gain_min, config.velocity_gain_min, config.accel_gain_min]
-        ),
+        of_form=np.array([float(getattr(config, name)) for name in form.parameters]),
         gate_nis=gate_thresholds(config.gate_probability),
     )
 
@@ -61,65 +52,51 @@ def robust_options_of(config: TrackerConfig) -> RobustOptions:
 
 
 def motions_of(config: TrackerConfig) -> Array:
-    """Vectors of ``motion.Parameter``, one per motion model (k, Parameter); k > 1 when they
-    interact."""
-    names = [config.motion_model]
-    if config.motion_model == "interacting":
-        names = ["stationary", "constant_velocity", "constant_turn"]
-    models = [Model[name.upper()] for name in names]
-    extras = max(extra_states(model) for model in models)
+    """Vectors ``motion``, one per motion model (k, size); k > 1 when they interact."""
+    models = config.motion_models
+    extras = max(len(model.states) for model in models)
+    idle = max(initial_extra_sd(config), default=0.0) if len(models) > 1 else 0.0
+    return np.array([_motion_of(config, model, extras, idle) for model in models])
+
+
+def _motion_of(config: TrackerConfig, model: MotionModel, extras: int, idle: float) -> Array:
     c = SPEED_OF_LIGHT_MPS
     accel = config.accel_density_mps2_sqrthz
-    if config.use_imu:
-        accel = config.inertial_accel_density_mps2_sqrthz
+    if model.accel_density is not None:
+        accel = getattr(config, model.accel_density)
     elif config.process_noise == "white_acceleration":
         accel = config.accel_sd_mps2
-    return np.array(
-        [
-            motion_parameters(
-                model,
-                ProcessNoise[config.process_noise.upper()],
-                extras,
-                accel=accel,
-                velocity_step=config.velocity_step_sd_mps,
-                offset_density=c * config.clock_white_density,
-                drift_density=c * config.clock_walk_density,
-                drift_step=c * config.drift_step_sd,
-                turn_rate=config.turn_rate_density,
-                jerk=config.jerk_density,
-                rest_speed=config.rest_speed_sd_mps,
-                gyro=config.gyro_noise_density,
-                gyro_bias=config.gyro_bias_walk,
-                accel_bias=config.accel_bias_walk,
-            )
-            for model in models
-        ]
+    return motion_parameters(
+        Model[model.name],
+        ProcessNoise[config.process_noise.upper()],
+        extras,
+        accel=accel,
+        velocity_step=config.velocity_step_sd_mps,
+        offset_density=c * config.clock_white_density,
+        drift_density=c * config.clock_walk_density,
+        drift_step=c * config.drift_step_sd,
+        idle=idle,
+        gyro=config.gyro_noise_density,
+        **{name: getattr(config, parameter) for name, parameter in model.own.items()},
     )
 
 
 def heading_index(config: TrackerConfig) -> int:
     """State index of the heading; -1 where the motion model has none of its own."""
-    return int(X.YAW) if config.motion_model == "rigid_body" else -1
+    models = config.motion_models
+    return models[0].heading if len(models) == 1 else -1
 
 
 def by_sectors(config: TrackerConfig) -> bool:
     """Whether phase differences are resolved by a bank of filters."""
-    single = config.motion_model not in ("interacting", "rigid_body", "strapdown")
-    return config.ambiguity == "hypotheses" and config.backend == "compiled" and single
+    single = len(config.motion_models) == 1 and heading_index(config) < 0
+    return config.ambiguity == "hypotheses" and single
 
 
 def initial_extra_sd(config: TrackerConfig) -> Array:
-    """Standard deviations of the motion model's own states at the first fix; their means are 0."""
-    match config.motion_model:
-        case "constant_turn" | "interacting":
-            return np.array([config.turn_rate_density])
-        case "rigid_body":
-            return np.array([math.pi / math.sqrt(3.0), config.turn_rate_density])
-        case "constant_acceleration":
-            return np.full(2, config.accel_state_sd_mps2)
-        case "inertial":
-            return np.array([config.gyro_bias_sd_radps, config.accel_bias_sd_mps2])
-    return np.zeros(0)
+    """Standard deviations of the motion models' own states at the first fix; their means are 0."""
+    sds = [model.initial_sd(config) for model in config.motion_models]
+    return np.array(max(sds, key=len, default=()), dtype=float)
 
 
 def pose_state(config: TrackerConfig, position: Array, position_cov: Array) -> tuple[Array, Array]:

@@ -14,7 +14,7 @@ from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import EpochRows
 from netpos.tracking.estimates import Estimate
-from netpos.tracking.models import by_sectors, pose_state
+from netpos.tracking.models import by_sectors, heading_index, pose_state
 from netpos.tracking.phase_fix import TWO_PI, init_hypothesis, phase_scale
 from netpos.tracking.sectors import PhaseAmbiguityBank, phase_place
 from netpos.tracking.step_heading import choose_sector
@@ -49,7 +49,7 @@ class PhaseStart:
 
     @property
     def _by_heading(self) -> bool:
-        plain = self.config.backend == "compiled" and self.config.motion_model != "rigid_body"
+        plain = heading_index(self.config) < 0
         return self.config.ambiguity == "step_heading" and plain
 
     def hear(self, velocity: Velocity) -> None:

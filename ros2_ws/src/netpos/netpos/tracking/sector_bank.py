@@ -16,10 +16,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from netpos.estimation import engine, srukf
+from netpos.estimation import engine
 from netpos.estimation.compile import kernel, leaf
-from netpos.estimation.engine import Filter, FilterOptions
+from netpos.estimation.engine import FilterOptions, cov_of
 from netpos.estimation.factor import factor
+from netpos.estimation.forms.choice import write_cov_or_sqrt, write_sqrt
 from netpos.estimation.gate import accepted_rows, gate_groups
 from netpos.estimation.measurement import GROUP, KIND, VALUE, VARIANCE, Kind
 from netpos.estimation.sensors.row import group_end
@@ -103,16 +104,10 @@ def advance(
                 engine.open_velocity(covs_or_sqrts[s], velocity_step_sd, unheard_s, options)
 
 
-@leaf
-def _square_root(options: FilterOptions) -> bool:
-    return bool(options.filter == Filter.SRUKF)
-
-
 @kernel
 def _factor_of(cov_or_sqrt: Array, options: FilterOptions) -> Array:
-    if _square_root(options):
-        return cov_or_sqrt.copy()
-    L: Array = factor(cov_or_sqrt)
+    L = np.empty_like(cov_or_sqrt)
+    write_sqrt(options.filter, cov_or_sqrt, L)
     return L
 
 
@@ -305,14 +300,11 @@ def _inherit(gains: Array, weights: Array, phase: Array, floor: float, parent_in
 @kernel
 def _put(mean: Array, cov_or_sqrt: Array, own: Array, at: int, options: FilterOptions) -> bool:
     """Place a filter anew where range and phase ``own[at - 1]``, ``own[at]`` say."""
-    cov = srukf.covariance(cov_or_sqrt) if _square_root(options) else cov_or_sqrt.copy()
+    cov = cov_of(cov_or_sqrt, options)
     speed, height = options.initial_speed_sd, options.height_m
     if init_hypothesis(mean, cov, own[at - 1], own[at], 0, speed, height) == -math.inf:
         return False
-    if _square_root(options):
-        cov_or_sqrt[:] = factor(cov)
-    else:
-        cov_or_sqrt[:] = cov
+    write_cov_or_sqrt(options.filter, cov, cov_or_sqrt)
     return True
 
 
@@ -347,11 +339,7 @@ def combine(bank: Bank, options: FilterOptions) -> tuple[Array, Array]:
             mean += math.exp(weights[s]) * means[s]
     for s in range(weights.size):
         if weights[s] > -math.inf:
-            P = (
-                srukf.covariance(covs_or_sqrts[s])
-                if _square_root(options)
-                else covs_or_sqrts[s].copy()
-            )
+            P = cov_of(covs_or_sqrts[s], options)
             w = math.exp(weights[s])
             for a in range(n):
                 for b in range(n):

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from netpos.estimation import ekf, engine
+from netpos.estimation import engine, fusion
 from netpos.estimation.compile import leaf
 from netpos.estimation.measurement import BIAS, COMMON, GROUP, KIND, Kind
 from netpos.estimation.protection import protection_level
@@ -231,7 +231,7 @@ class PhaseAmbiguityBank(OneModel):
         self._advance(stamp_ns, speed, unheard_s, bias)
         before = _copy_of(self._bank)
         if self._config.robust != "none" or self._config.nlos_probability > 0.0:
-            best, work = self._best, ekf.workspace(before.means.shape[1], len(rows))
+            best, work = self._best, fusion.workspace(before.means.shape[1], len(rows))
             engine.reweight(
                 before.means[best], before.covs_or_sqrts[best], rows, self._options, work
             )
@@ -276,7 +276,7 @@ class PhaseAmbiguityBank(OneModel):
     def _filled(self, rows: Array) -> tuple[BankResult, Array]:
         """A result to be filled, and scratch memory."""
         slots, groups = self._bank.weights.size, int(rows[-1, GROUP]) + 1
-        work = ekf.workspace(self._bank.means.shape[1], len(rows))
+        work = fusion.workspace(self._bank.means.shape[1], len(rows))
         return BankResult(np.zeros((slots, groups)), np.zeros(slots), np.zeros(slots)), work
 
     def _update(self, rows: Array) -> tuple[Array, Array, Array]:

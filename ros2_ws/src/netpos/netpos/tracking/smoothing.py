@@ -41,7 +41,7 @@ class Posterior:
 
 def check_smoothable(config: TrackerConfig) -> None:
     """Raises ``ValueError`` for a tracker whose estimates cannot be smoothed."""
-    if config.motion_model == "interacting":
+    if config.interacts:
         raise ValueError(
             f"motion_model {config.motion_model} cannot be smoothed; use another motion model"
         )

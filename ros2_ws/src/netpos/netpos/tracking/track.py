@@ -399,7 +399,7 @@ def _estimator_of(
 ) -> Estimator:
     """The estimator of the motion model. The spatial one brings SciPy's rotations: a planar
     tracker does without."""
-    if config.motion_model != "strapdown":
+    if not config.is_strapdown:
         return PlanarEstimator(vue_id, config, rsus, shared)
     from netpos.tracking.spatial import SpatialEstimator  # noqa: PLC0415
 

@@ -62,7 +62,7 @@ class Tracker:
         self._keep_posteriors = keep_posteriors
         if keep_posteriors:
             check_smoothable(self._config)
-        if self._config.motion_model == "strapdown":
+        if self._config.is_strapdown:
             warm_up_strapdown(self._config)
         self._tracks: dict[str, Track] = {}
         self._sequencers: dict[str, Sequencer] = {}
@@ -386,7 +386,7 @@ class Tracker:
     def _sequencer(self, vue_id: str) -> Sequencer:
         if vue_id not in self._sequencers:
             self.track(vue_id)
-            strapdown = self._config.motion_model == "strapdown"
+            strapdown = self._config.is_strapdown
             rate_hz = self._config.odometry_rate_hz if strapdown else 0.0
             self._sequencers[vue_id] = Sequencer(
                 int(self._config.hold_s * 1e9),

@@ -7,8 +7,8 @@ import math
 import filter_rows
 import numpy as np
 import pytest
-from netpos.estimation import ekf
 from netpos.estimation.bearing import fuse_around, fuse_bearing, is_plain_bearing, on_top
+from netpos.estimation.forms import ekf
 from netpos.estimation.fusion import W_COV, W_PRIOR, W_USE
 from netpos.estimation.measurement import (
     BIAS,

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from filter_rows import make_cov, row
-from netpos.estimation import components, ekf, mixture
+from netpos.estimation import components, mixture
 from netpos.estimation.components import moments, one_component
 from netpos.estimation.engine import EpochInput
+from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import GROUP, VARIANCE, Kind
 from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.rows import linear_rows

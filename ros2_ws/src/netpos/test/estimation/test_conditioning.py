@@ -9,8 +9,9 @@ import filter_rows
 import numpy as np
 import pytest
 from filter_rows import NO_GATE, random_spd
-from netpos.estimation import ekf, robust
+from netpos.estimation import robust
 from netpos.estimation.conditioning import Robust, RobustOptions, reweight
+from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import (
     AXES,
     BLOCKED,

@@ -9,7 +9,8 @@ import pytest
 from curved_rows import log_posterior_cost, range_problem, two_variances
 from ekf_update import exact_fuse, fused, iterated, scratch, updated
 from filter_rows import NO_GATE, linear_row, row
-from netpos.estimation import ekf, fit, fusion
+from netpos.estimation import fit, fusion
+from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import (
     GATE_VARIANCE,
     GROUP,

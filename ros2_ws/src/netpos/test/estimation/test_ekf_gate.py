@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from ekf_update import fused, updated
 from filter_rows import NO_GATE, linear_row, random_spd
-from netpos.estimation import ekf
+from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import (
     GATE_VARIANCE,
     GROUP,

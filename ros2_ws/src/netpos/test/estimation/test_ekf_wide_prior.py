@@ -10,7 +10,8 @@ import pytest
 from curved_rows import log_posterior_cost, two_variances
 from ekf_update import fused, iterated, scratch, updated
 from filter_rows import NO_GATE, row
-from netpos.estimation import ekf, fusion
+from netpos.estimation import fusion
+from netpos.estimation.forms import ekf
 from netpos.estimation.iteration import is_wide
 from netpos.estimation.measurement import (
     GROUP,

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from engine_cases import opened, start
-from netpos.estimation import conditioning, ekf, engine
+from netpos.estimation import conditioning, engine
 from netpos.estimation.components import Dynamics, run_epochs
 from netpos.estimation.engine import EpochInput, Epochs, FilterOptions, Run
+from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import (
     GROUP,
     ROW_WIDTH,

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from engine_cases import opened, start
-from netpos.estimation import ekf, engine, srukf
+from netpos.estimation import engine
+from netpos.estimation.forms import ekf, srukf
 from netpos.estimation.measurement import GATE_VARIANCE, VARIANCE
 from netpos.estimation.motion import NO_BIAS, noise
 from netpos.estimation.rows import linear_rows

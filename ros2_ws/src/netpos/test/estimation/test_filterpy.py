@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from filterpy.kalman import ExtendedKalmanFilter
-from netpos.estimation import ekf
+from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import VALUE, VARIANCE, linearise
 from netpos.estimation.motion import (
     NO_BIAS,

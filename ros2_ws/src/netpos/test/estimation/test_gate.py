@@ -5,9 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import filterpy_reference
 import numpy as np
 import pytest
-from netpos.estimation import ekf, filterpy_backend, gate, kf, srukf, ukf
+from netpos.estimation import gate
+from netpos.estimation.forms import ekf, kf, srukf, ukf
 from netpos.estimation.measurement import GROUP, Kind
 from netpos.estimation.state import X
 from netpos.messages.values import Array
@@ -41,7 +43,7 @@ def by_kf(mean: Array, cov: Array, rows: Array, limits: Array, ok: Array) -> tup
 def by_filterpy(
     mean: Array, cov: Array, rows: Array, limits: Array, ok: Array
 ) -> tuple[float, int]:
-    return filterpy_backend.ekf_update(mean, cov, rows, 0.0, limits, ok)
+    return filterpy_reference.ekf_update(mean, cov, rows, 0.0, limits, ok)
 
 
 FILTERS: dict[str, Filter] = {

@@ -8,7 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from filterpy.kalman import IMMEstimator, KalmanFilter
-from netpos.estimation import ekf, imm
+from netpos.estimation import imm
+from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import Kind
 from netpos.estimation.motion import (
     NO_BIAS,
@@ -216,12 +217,12 @@ def ride() -> Array:
 
 
 def interacting_set() -> Array:
-    common = {"offset_density": 0.01, "drift_density": 0.01, "turn_rate": 0.1}
+    common = {"offset_density": 0.01, "drift_density": 0.01, "idle": 0.1}
     return np.array(
         [
             motion_parameters(Model.STATIONARY, extras=1, rest_speed=0.05, **common),
             motion_parameters(Model.CONSTANT_VELOCITY, extras=1, accel=1.0, **common),
-            motion_parameters(Model.CONSTANT_TURN, accel=1.0, **common),
+            motion_parameters(Model.CONSTANT_TURN, accel=1.0, turn_rate=0.1, **common),
         ]
     )
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from netpos.estimation import ekf, kf
+from netpos.estimation.forms import ekf, kf
 from netpos.estimation.measurement import Kind
 from netpos.estimation.motion import NO_BIAS, Model, motion_parameters
 from netpos.estimation.state import X

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from netpos.estimation import ekf, srukf
+from netpos.estimation.forms import ekf, srukf
 from netpos.estimation.measurement import (
     AXES,
     KIND,

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from measurement_rows import random_info, random_state
-from netpos.estimation import ekf
+from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import (
     AXES,
     BIAS,

@@ -13,13 +13,14 @@ from netpos.estimation.motion import (
     Model,
     Parameter,
     ProcessNoise,
-    _turn,
     extra_states,
     motion_parameters,
     noise,
+    own_index,
     propagate,
     transition,
 )
+from netpos.estimation.motion.constant_turn import arc
 from netpos.estimation.state import POSITION, VELOCITY, X
 from netpos.messages.values import Array
 from scipy.integrate import solve_ivp
@@ -65,7 +66,7 @@ def test_jacobian_by_differences(model: Model, seed: int) -> None:
 @pytest.mark.parametrize("model", [Model.CONSTANT_VELOCITY, Model.STATIONARY])
 def test_shared_states_of_other_models_are_zeroed(model: Model) -> None:
     """In an interacting set the turn rate is no business of these: zero, of known variance."""
-    motion = motion_parameters(model, extras=1, turn_rate=0.3)
+    motion = motion_parameters(model, extras=1, idle=0.3, turn_rate=7.0)
     mean = np.arange(1.0, 10.0)
     x, F = moved(mean, 0.5, motion, BIAS), matrix(transition, mean, 0.5, motion, BIAS)
     Q = matrix(noise, mean, 0.5, motion, BIAS)
@@ -124,7 +125,7 @@ def test_a_hardly_turning_device_follows_the_power_series(angle: float) -> None:
     expected = [dt * float(turn[0]), dt * float(turn[1])]
     expected += [dt**2 * float(turn[2]), dt**2 * float(turn[3])]
     share = np.array([0.0, angle**2 / 9.0, angle**2 / 9.0, 0.0]) + 1e-14  # what is left out
-    assert (np.abs(np.subtract(_turn(angle / dt, dt), expected)) <= share * np.abs(expected)).all()
+    assert (np.abs(np.subtract(arc(angle / dt, dt), expected)) <= share * np.abs(expected)).all()
 
 
 def test_stationary_stands_still() -> None:
@@ -271,8 +272,8 @@ def test_parameters_by_name() -> None:
     assert motion[Parameter.MODEL] == Model.CONSTANT_TURN
     assert motion[Parameter.NOISE] == ProcessNoise.WERNER
     assert motion[Parameter.EXTRAS] == 1
-    assert motion[Parameter.TURN_RATE] == 0.1
-    with pytest.raises(KeyError, match="SPEED"):
+    assert motion[own_index(Model.CONSTANT_TURN, "turn_rate")] == 0.1
+    with pytest.raises(KeyError, match="speed"):
         motion_parameters(speed=1.0)
 
 

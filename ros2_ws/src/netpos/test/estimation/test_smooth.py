@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
-from netpos.estimation import ekf, smooth
+from netpos.estimation import smooth
+from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import Kind
 from netpos.estimation.motion import (
     NO_BIAS,

@@ -8,7 +8,8 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from netpos.estimation import sigma, srukf, ukf
+from netpos.estimation import sigma
+from netpos.estimation.forms import srukf, ukf
 from netpos.estimation.measurement import Kind
 from netpos.estimation.motion import NO_BIAS, Model, Parameter, ProcessNoise, motion_parameters
 from netpos.estimation.state import POSITION

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.estimation import ekf, srukf
 from netpos.estimation.engine import scratch
+from netpos.estimation.forms import ekf, srukf
 from netpos.estimation.measurement import BIAS, COMMON, KIND, Kind, curvature_variance
 from netpos.estimation.measurement import predict_row as predict
 from netpos.estimation.rows import linear_rows

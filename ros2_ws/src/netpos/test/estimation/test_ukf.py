@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from netpos.estimation import sigma, ukf
+from netpos.estimation import sigma
+from netpos.estimation.forms import ukf
 from netpos.estimation.measurement import BIAS, KIND, ORIGIN, VALUE, Kind
 from netpos.estimation.motion import NO_BIAS, Model, motion_parameters, noise, propagate
 from netpos.estimation.state import X

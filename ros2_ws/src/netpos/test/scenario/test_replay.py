@@ -24,6 +24,7 @@ from netpos.messages.values import (
     Velocity,
 )
 from netpos.scenario.replay import reading_of, replay_bag, write_output
+from netpos.scenario.settings import bag_settings
 from netpos.tracking import TrackerConfig, TrackOutput
 
 NS = 10**9
@@ -78,6 +79,23 @@ def test_every_kind_of_input_is_read(bag: Path) -> None:
     assert list(map(repr, read(bag, TrackerConfig()))) == list(map(repr, expected))
     # the topic names the device, whatever the frame of the sensor is called
     assert list(map(repr, read(bag, WithImu))) == list(map(repr, [*expected, SHAKEN]))
+
+
+@pytest.mark.parametrize(("backend", "is_read"), [("compiled", True), ("filterpy", False)])
+def test_a_bag_of_a_tracker_with_a_removed_parameter(
+    backend: str, is_read: bool, tmp_path: Path
+) -> None:
+    """Read where every tracker now does what the parameter said."""
+    told = {"tracker": f"backend: {backend}\nhold_s: 0.5\n"}
+    with BagWriter(tmp_path / "bag", metadata=told) as out:
+        out.write("/rsu/measurements", codec().measurement_to_msg(MEASURED), 1)
+    with BagReader(tmp_path / "bag") as bag:
+        parameters = bag_settings(bag).parameters
+    if is_read:
+        assert TrackerConfig.from_mapping(parameters) == TrackerConfig(hold_s=0.5)
+    else:
+        with pytest.raises(ValueError, match="unknown tracker parameter 'backend'"):
+            TrackerConfig.from_mapping(parameters)
 
 
 def test_the_other_byte_order_is_read_too(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fractions import Fraction
 
 import numpy as np
-from netpos.estimation import ekf
+from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import GROUP
 from netpos.messages.values import Array
 

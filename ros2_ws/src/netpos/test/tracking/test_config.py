@@ -7,8 +7,8 @@ from dataclasses import fields
 from typing import Any
 
 import pytest
+from netpos.estimation.forms.table import form_of
 from netpos.tracking.config import FILTERS, TrackerConfig
-from netpos.tracking.models import FILTER_ITERATIONS
 
 RANGED = [entry for entry in fields(TrackerConfig) if "low" in entry.metadata]
 
@@ -38,8 +38,8 @@ def test_choices(name: str) -> None:
 
 
 def test_ekf_linearises_once() -> None:
-    assert FILTER_ITERATIONS["ekf"] == 1
-    assert FILTER_ITERATIONS["iekf"] > 1
+    assert form_of("ekf").iterations == 1
+    assert form_of("iekf").iterations > 1
 
 
 def test_mapping_takes_what_yaml_writes() -> None:

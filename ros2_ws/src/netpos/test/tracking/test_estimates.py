@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from filterpy_estimate import FilterpyEstimate
 from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.rows import linear_rows
 from netpos.estimation.state import POSITION, X
@@ -82,17 +83,20 @@ def test_every_filter_tracks_with_every_model(world: Any, name: str, model: str)
 @pytest.mark.parametrize(
     "model", ["constant_velocity", "constant_turn", "constant_acceleration", "inertial"]
 )
-def test_filterpy_says_the_same(world: Any, name: str, model: str) -> None:
-    """Every epoch of a track with biases, outliers and a ground speed."""
+def test_filterpy_says_the_same(
+    world: Any, name: str, model: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every epoch of a track with biases, outliers and a ground speed, and one component."""
     slow = {"range_bias_sd_m": 0.3, "bias_correlation_time_s": 30.0}
     world.rsus = {n: replace(info, **slow) for n, info in world.rsus.items()}
     found = {}
-    for backend in ("compiled", "filterpy"):
+    for algebra, start in (("ours", estimates.start), ("filterpy", FilterpyEstimate)):
+        monkeypatch.setattr(estimates, "start", start)
         world.rng = np.random.default_rng(8)
         tracker = world.tracker(
             filter=name,
             motion_model=model,
-            backend=backend,
+            manoeuvre_speed_sd_mps=0.0,
             clock_offset_sd_s=3e-8,
             clock_drift_sd=1e-8,
         )
@@ -121,8 +125,8 @@ def test_filterpy_says_the_same(world: Any, name: str, model: str) -> None:
                 parts += [cov[POSITION, POSITION].ravel() for cov in covs]
                 parts += [[o.clock.offset_s * 3e8], o.clock.cov.ravel() * 9e16]
                 rows.append(np.concatenate([*parts, [o.status.nis, o.status.nis_dof]]))
-        found[backend] = np.array(rows), outputs[-1].status
-    ours, reference = found["compiled"], found["filterpy"]
+        found[algebra] = np.array(rows), outputs[-1].status
+    ours, reference = found["ours"], found["filterpy"]
     assert len(ours[0]) > 55
     assert ours[1].rejected == reference[1].rejected
     assert ours[1].rejected["gate"] >= 5
@@ -135,7 +139,6 @@ KINDS: dict[str, dict[str, Any]] = {
     "srukf": {"filter": "srukf"},
     "inertial": {"motion_model": "inertial"},
     "interacting": {"motion_model": "interacting"},
-    "filterpy": {"filter": "ukf", "backend": "filterpy"},
 }
 
 
@@ -236,20 +239,12 @@ def test_many_rows_need_no_warning() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"backend": "filterpy"}, "backend filterpy has filter ekf or ukf, not 'iekf'"),
-        ({"backend": "filterpy", "filter": "srukf"}, "ekf or ukf, not 'srukf'"),
-        ({"backend": "filterpy", "filter": "kf"}, "ekf or ukf, not 'kf'"),
-        (
-            {"backend": "filterpy", "filter": "ekf", "motion_model": "interacting"},
-            "backend filterpy has no motion_model interacting; use compiled",
-        ),
         (
             {"filter": "ukf", "motion_model": "interacting"},
             "motion_model interacting takes filter ekf or iekf, not 'ukf'",
         ),
         ({"filter": "kf", "motion_model": "interacting"}, "takes filter ekf or iekf, not 'kf'"),
         ({"filter": "best"}, "filter must be one of ekf, iekf, ukf, srukf, kf, got 'best'"),
-        ({"backend": "matlab"}, "backend must be one of compiled, filterpy, got 'matlab'"),
         ({"motion_model": "flying"}, "motion_model must be one of constant_velocity, .*'flying'"),
         ({"robust": "l1"}, "robust must be one of none, huber, student_t, got 'l1'"),
     ],
@@ -262,7 +257,6 @@ def test_bad_combinations(values: dict[str, Any], message: str) -> None:
 @pytest.mark.parametrize(
     "values",
     [
-        {"robust": "huber", "backend": "filterpy", "filter": "ekf"},
         {"nlos_probability": 0.1, "motion_model": "interacting"},
         {"robust": "student_t", "motion_model": "interacting"},
     ],

@@ -35,7 +35,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "srukf": {"filter": "srukf"},
     "interacting": {"motion_model": "interacting"},
     "inertial": {"motion_model": "inertial"},
-    "filterpy": {"backend": "filterpy", "filter": "ekf"},
 }
 
 

@@ -292,7 +292,7 @@ def test_a_track_that_is_lost_keeps_what_it_has_learned() -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("motion_model", "strapdown"), ("motion_model", "interacting"), ("backend", "filterpy")],
+    [("motion_model", "strapdown"), ("motion_model", "interacting")],
 )
 def test_learning_is_refused_where_there_is_none(name: str, value: str) -> None:
     with pytest.raises(ValueError, match=r"learn_errors.*set it to false"):

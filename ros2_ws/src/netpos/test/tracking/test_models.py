@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 from netpos.estimation.conditioning import RobustOptions
-from netpos.estimation.engine import GATE_SIZE, Filter, FilterOptions
-from netpos.estimation.motion import Model, Parameter, ProcessNoise
+from netpos.estimation.engine import GATE_SIZE, FilterOptions
+from netpos.estimation.forms.table import FORMS
+from netpos.estimation.motion import Model, Parameter, ProcessNoise, own_index
 from netpos.estimation.state import POSITION
-from netpos.tracking.config import FILTERS, ROBUST, TrackerConfig
+from netpos.tracking.config import ROBUST, TrackerConfig
 from netpos.tracking.models import (
-    FILTER_ITERATIONS,
     augmented,
     gate_thresholds,
     initial_extra_sd,
@@ -25,11 +25,12 @@ from scipy.stats import chi2
 
 
 def test_every_filter_has_its_place_in_the_engine() -> None:
-    assert [f.name.lower() for f in Filter] == list(FILTERS)
-    for place, name in enumerate(FILTERS):
-        options = options_of(TrackerConfig(filter=name))
+    assert [form.name for form in FORMS] == ["ekf", "iekf", "ukf", "srukf", "kf"]
+    for place, form in enumerate(FORMS):
+        options = options_of(TrackerConfig(filter=form.name))
         assert options.filter == place
-        assert options.iterations == FILTER_ITERATIONS.get(name, 1)
+        assert options.iterations == (8 if form.name == "iekf" else 1)
+        assert options.of_form.size == (3 if form.name == "kf" else 0)
 
 
 def test_options_hold_what_the_parameters_say() -> None:
@@ -44,9 +45,6 @@ def test_options_hold_what_the_parameters_say() -> None:
         robust_parameter=5.5,
         nlos_probability=0.1,
         nlos_mean_excess_m=33.0,
-        position_gain_min=0.2,
-        velocity_gain_min=0.3,
-        accel_gain_min=0.4,
         gate_probability=0.99,
         integrity_risk=1e-5,
         coast_after_s=0.7,
@@ -63,13 +61,19 @@ def test_options_hold_what_the_parameters_say() -> None:
         integrity_risk=1e-5,
         coast_after_s=0.7,
         robust=RobustOptions(ROBUST.index("student_t"), 5.5, 0.1, 33.0),
-        gain_floor=options.gain_floor,
+        of_form=options.of_form,
         gate_nis=options.gate_nis,
     )
     assert options == expected
-    assert options.gain_floor.tolist() == [0.2, 0.3, 0.4]
     np.testing.assert_array_equal(options.gate_nis, gate_thresholds(0.99))
     assert len(options.gate_nis) == GATE_SIZE
+
+
+def test_options_hold_what_the_form_has_of_its_own() -> None:
+    config = TrackerConfig(
+        filter="kf", position_gain_min=0.2, velocity_gain_min=0.3, accel_gain_min=0.4
+    )
+    assert options_of(config).of_form.tolist() == [0.2, 0.3, 0.4]
 
 
 def test_options_have_one_signature_whatever_the_user_writes() -> None:
@@ -115,12 +119,7 @@ def test_motion_is_in_metres() -> None:
         clock_walk_density=2e-7,
         drift_step_sd=3e-6,
         velocity_step_sd_mps=0.4,
-        turn_rate_density=0.5,
-        jerk_density=0.6,
-        rest_speed_sd_mps=0.07,
         gyro_noise_density=0.008,
-        gyro_bias_walk=0.0009,
-        accel_bias_walk=0.011,
     )
     ((motion),) = motions_of(config)
     c = speed_of_light
@@ -132,17 +131,48 @@ def test_motion_is_in_metres() -> None:
         Parameter.OFFSET_DENSITY: c * 1e-9,
         Parameter.DRIFT_DENSITY: c * 2e-7,
         Parameter.DRIFT_STEP: c * 3e-6,
-        Parameter.TURN_RATE: 0.5,
-        Parameter.JERK: 0.6,
-        Parameter.REST_SPEED: 0.07,
+        Parameter.IDLE: 0.0,
         Parameter.GYRO: 0.008,
-        Parameter.GYRO_BIAS: 0.0009,
-        Parameter.ACCEL_BIAS: 0.011,
         Parameter.YAW_INCREMENT: 0.0,
         Parameter.SPEED_INCREMENT: 0.0,
     }
     for entry, value in expected.items():
         assert motion[entry] == pytest.approx(value, rel=1e-12), entry.name
+
+
+@pytest.mark.parametrize(
+    ("name", "own"),
+    [
+        ("constant_velocity", {}),
+        ("constant_turn", {"turn_rate": 0.5}),
+        ("constant_acceleration", {"jerk": 0.6}),
+        ("inertial", {"gyro_bias": 0.0009, "accel_bias": 0.011}),
+        ("rigid_body", {"turn_rate": 0.5}),
+    ],
+)
+def test_motion_has_what_its_model_has_of_its_own(name: str, own: dict[str, float]) -> None:
+    config = TrackerConfig(
+        motion_model=name,
+        turn_rate_density=0.5,
+        jerk_density=0.6,
+        gyro_bias_walk=0.0009,
+        accel_bias_walk=0.011,
+    )
+    ((motion),) = motions_of(config)
+    found = {entry: motion[own_index(Model[name.upper()], entry)] for entry in own}
+    assert found == own
+    assert not motion[int(Parameter.OWN) + len(own) :].any()
+
+
+def test_interacting_models_keep_the_states_of_others_alive() -> None:
+    config = TrackerConfig(
+        motion_model="interacting", turn_rate_density=0.5, rest_speed_sd_mps=0.07
+    )
+    stop, straight, turn = motions_of(config)
+    assert stop[Parameter.IDLE] == straight[Parameter.IDLE] == 0.5
+    assert stop[own_index(Model.STATIONARY, "rest_speed")] == 0.07
+    assert turn[own_index(Model.CONSTANT_TURN, "turn_rate")] == 0.5
+    assert [m[Parameter.STATES] for m in (stop, straight, turn)] == [0, 0, 1]
 
 
 @pytest.mark.parametrize(
@@ -207,7 +237,6 @@ def test_growing_appends_independent_states() -> None:
         ({"inertial_manoeuvre_speed_sd_mps": 0.3, "motion_model": "inertial"}, 0.3),
         ({"inertial_manoeuvre_speed_sd_mps": 0.3, "manoeuvre_speed_sd_mps": 0.0}, 0.0),
         ({"manoeuvre_speed_sd_mps": 3.0, "motion_model": "interacting"}, 0.0),
-        ({"manoeuvre_speed_sd_mps": 3.0, "backend": "filterpy", "filter": "ekf"}, 0.0),
     ],
 )
 def test_a_manoeuvre_is_allowed_where_nothing_else_shows_it(

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from anchor_walk import Walk, rows_at
 from engine_cases import opened
-from netpos.estimation import ekf, engine
+from netpos.estimation import engine
 from netpos.estimation.engine import GATE_SIZE
+from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import KIND, VALUE, VARIANCE, Kind, predict_row
 from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.rows import linear_rows

@@ -321,7 +321,6 @@ def test_the_twist_is_that_of_the_body() -> None:
     ("changes", "text"),
     [
         ({"filter": "ukf"}, "error-state filter"),
-        ({"backend": "filterpy", "filter": "ekf"}, "error-state filter"),
         ({"fixed_lag_s": 1.0}, "replay --smooth"),
     ],
 )

@@ -3,7 +3,6 @@
 ``row``       the columns of a measurement row
 ``model``     ``Sensor``, the record that a sensor fills in
 ``table``     ``SENSORS``, one line per sensor; ``Kind``, their numbers by name
-``dispatch``  the compiled choice of a sensor by its number
 ``geometry``  what several sensors share
 
 The others are sensors. docs/adding_a_sensor.md adds one.

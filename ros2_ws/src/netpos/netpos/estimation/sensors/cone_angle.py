@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 
 from netpos.estimation.compile import inlined, leaf
+from netpos.estimation.dispatch import Kernel
 from netpos.estimation.sensors.elevation import bound
 from netpos.estimation.sensors.geometry import in_map_axes, in_rsu_axes
-from netpos.estimation.sensors.model import Kernel, Sensor, angle_reading
+from netpos.estimation.sensors.model import Sensor, angle_reading
 from netpos.messages.values import AngleConvention, Array
 
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
 
+from netpos.estimation.dispatch import Kernel
 from netpos.messages.values import AngleConvention, Field
-
-Kernel = Callable[..., Any]
 
 
 class Wraps(IntEnum):

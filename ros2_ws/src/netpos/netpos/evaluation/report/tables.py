@@ -19,7 +19,7 @@ from netpos.evaluation.summary import (
     verdict_rows,
 )
 from netpos.evaluation.survey import Survey, VueSurvey
-from netpos.scenario.settings import SCENARIO_FACT, TRACKER_FACT, not_usual
+from netpos.scenario.settings import SCENARIO_FACT, TRACKER_FACT, known_parameters, not_usual
 from netpos.tracking.config import TrackerConfig
 
 Table = dict[str, Any]
@@ -101,7 +101,7 @@ def _run(name: str, facts: Mapping[str, tuple[str, ...]]) -> list[str]:
     scenario = _first(facts, SCENARIO_FACT)
     parameters = "not said"
     if TRACKER_FACT in facts:
-        config = TrackerConfig.from_mapping(_first(facts, TRACKER_FACT))
+        config = TrackerConfig.from_mapping(known_parameters(_first(facts, TRACKER_FACT)))
         changed = [f"{key} {value}" for key, value in not_usual(config).items()]
         parameters = ", ".join(changed) or "none"
         if len(facts[TRACKER_FACT]) > 1:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netpos.estimation.kf import DVORNIKOV_FLOOR
+from netpos.estimation.forms.kf import DVORNIKOV_FLOOR
 from netpos.messages.values import Array
 from netpos.reproduction.dvornikov2017.pictures import gains_of
 from netpos.reproduction.dvornikov2017.stages import FixNetwork, Ints, stages_of

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from netpos.estimation.forms.kf import DVORNIKOV_FLOOR
 from netpos.estimation.intersection import METHODS
-from netpos.estimation.kf import DVORNIKOV_FLOOR
 from netpos.evaluation.work import Work
 from netpos.reproduction.dvornikov2017 import pictures as network_pictures
 from netpos.reproduction.dvornikov2017.claims import (
@@ -61,7 +61,7 @@ DEAF = TrackerConfig(
 """dvornikov2017:eq.6 with Q = 0: the gain goes to 0."""
 FLOORED = replace(DEAF, **_FLOOR)  # type: ignore[arg-type]
 JERK = 0.3  # m/s^3/sqrt(Hz)
-JERKY = replace(DEAF, jerk_density=JERK)
+JERKY = replace(DEAF, jerk_density=JERK)  # type: ignore[call-arg]
 
 PAPER = Setting(
     name="paper's motion, gain floor",

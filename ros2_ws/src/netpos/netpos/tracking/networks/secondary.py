@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netpos.estimation import kf
+from netpos.estimation.forms.table import form_of
 from netpos.estimation.motion import Parameter, add_velocity_step, transition
 from netpos.messages.values import Array, NetworkTrack
 from netpos.tracking.config import TrackerConfig
@@ -50,7 +50,7 @@ class Secondary:
         self._vue_id = vue_id
         self._config = config
         self._options = options_of(config)
-        self._accelerates = config.motion_model == "constant_acceleration"
+        self._accelerates = any(model.states == ("AX", "AY") for model in config.motion_models)
 
     def after(
         self,
@@ -65,7 +65,8 @@ class Secondary:
 
         The update is done once more, from the prediction the estimate keeps.
         """
-        if self._config.filter != "kf":
+        update_shared = form_of(self._config.filter).update_shared
+        if update_shared is None:
             return None
         mean, cov = estimate.prior[0].copy(), estimate.prior[1].copy()
         share = np.zeros_like(cov) if own is None else own.at(estimate, bias)
@@ -77,8 +78,8 @@ class Secondary:
             cov,
         )
         options, accepted = self._options, np.zeros(len(rows))
-        floor, gate, height_m = options.gain_floor, options.gate_nis, options.height_m
-        kf.update_shared(mean, cov, rows, height_m, gate, accepted, floor, share)
+        floor, gate, height_m = options.of_form, options.gate_nis, options.height_m
+        update_shared(mean, cov, rows, height_m, gate, accepted, floor, share)
         return OwnNoise(stamp_ns, share)
 
     def track(

@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
-import re
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
-import netpos
 import pytest
+from library_copy import add_entry, code_of, copy_of_library, run, run_tests
 from scipy import stats
 
-PAGE = Path(__file__).resolve().parents[6] / "docs/adding_a_sensor.md"
 EPOCHS = 81
 
 _RUN = """
@@ -88,38 +82,9 @@ print(json.dumps({
 def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Copy of the library with the sensor of the page."""
     root = tmp_path_factory.mktemp("with_a_toy")
-    package = root / "netpos"
-    here = Path(netpos.__file__).parent
-    shutil.copytree(here, package, ignore=shutil.ignore_patterns("__pycache__"))
-    module, line = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    sensors = package / "estimation/sensors"
-    (sensors / "log_range.py").write_text(module, encoding="utf-8")
-    table = sensors / "table.py"
-    before = table.read_text(encoding="utf-8")
-    importing, entry = (text.strip() for text in line.split("\n\n"))
-    after = before.replace(
-        "from netpos.estimation.sensors import (",
-        f"{importing}\nfrom netpos.estimation.sensors import (",
-    )
-    after = after.replace(
-        "    *body_motion.SENSORS,\n", f"    *body_motion.SENSORS,\n    {entry}\n"
-    )
-    assert len(after.splitlines()) == len(before.splitlines()) + 2
-    table.write_text(after, encoding="utf-8")
+    sensors = copy_of_library(root) / "estimation/sensors"
+    add_entry(sensors, "log_range", *code_of("adding_a_sensor.md"))
     return root
-
-
-def run(library: Path, *arguments: str) -> str:
-    """Output of Python on the copy, without the compiler."""
-    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
-    paths = [str(library), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    environment["PYTHONPATH"] = os.pathsep.join(paths)
-    command = [sys.executable, "-W", "ignore", *arguments]
-    result = subprocess.run(
-        command, capture_output=True, text=True, env=environment, check=False, cwd=library
-    )
-    assert result.returncode == 0, result.stdout + result.stderr
-    return result.stdout
 
 
 @pytest.fixture(scope="module")
@@ -156,16 +121,4 @@ def test_its_innovations_are_as_large_as_they_should_be(drive: dict[str, Any]) -
 def test_it_passes_the_tests_of_all_sensors(library: Path) -> None:
     """Gradient and second-order term against finite differences."""
     tests = Path(__file__).with_name("test_models.py")
-    root = PAGE.parents[1]
-    output = run(
-        library,
-        "-m",
-        "pytest",
-        "-q",
-        f"--rootdir={root}",
-        f"-c={root}/pyproject.toml",
-        "-k",
-        "LOG_RANGE or 15",
-        str(tests),
-    )
-    assert int(re.findall(r"(\d+) passed", output)[0]) >= 10
+    assert run_tests(library, tests, "LOG_RANGE or 15") >= 10

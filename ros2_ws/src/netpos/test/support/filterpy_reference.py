@@ -1,5 +1,5 @@
-"""The same filters on FilterPy's objects, as a reference for the compiled ones: same models, same
-gate, FilterPy's algebra. FilterPy is imported on first use only."""
+"""The oracle of the filters: FilterPy's objects with our models and our gate, FilterPy's
+algebra."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-
+from filterpy import kalman
 from netpos.estimation.measurement import (
     GATE_VARIANCE,
     GROUP,
@@ -25,12 +25,6 @@ from netpos.messages.values import Array
 
 # A FilterPy filter holding mean, cov after fusing rows with given variances.
 _Update = Callable[[Array, Array, Array, Array, float], Any]
-
-
-def _library() -> Any:
-    from filterpy import kalman  # noqa: PLC0415
-
-    return kalman
 
 
 def _noise(mean: Array, dt: float, motion: Array, bias: Array) -> Array:
@@ -66,7 +60,7 @@ def ekf_predict(mean: Array, cov: Array, dt: float, motion: Array, bias: Array) 
     if dt <= 0.0:
         return
 
-    reference = _library().ExtendedKalmanFilter(dim_x=mean.size, dim_z=1)
+    reference = kalman.ExtendedKalmanFilter(dim_x=mean.size, dim_z=1)
     reference.P = cov.copy()
     transition(mean, dt, motion, bias, reference.F)
     moved = _moved(mean, dt, motion, bias)
@@ -76,7 +70,7 @@ def ekf_predict(mean: Array, cov: Array, dt: float, motion: Array, bias: Array) 
 
 
 def _ekf(mean: Array, cov: Array, rows: Array, variance: Array, height_m: float) -> Any:
-    reference = _library().ExtendedKalmanFilter(dim_x=mean.size, dim_z=len(rows))
+    reference = kalman.ExtendedKalmanFilter(dim_x=mean.size, dim_z=len(rows))
     reference.x, reference.P = mean.copy(), cov.copy()
     curvature = [curvature_variance(row, mean, cov, height_m) for row in rows]
     reference.update(
@@ -97,7 +91,7 @@ def ekf_update(
 
 
 def _points(n: int) -> Any:
-    return _library().MerweScaledSigmaPoints(n, ALPHA, BETA, kappa(n))
+    return kalman.MerweScaledSigmaPoints(n, ALPHA, BETA, kappa(n))
 
 
 def ukf_predict(mean: Array, cov: Array, dt: float, motion: Array, bias: Array) -> None:
@@ -105,7 +99,7 @@ def ukf_predict(mean: Array, cov: Array, dt: float, motion: Array, bias: Array) 
     definite, else ``LinAlgError``."""
     if dt <= 0.0:
         return
-    reference = _library().UnscentedKalmanFilter(
+    reference = kalman.UnscentedKalmanFilter(
         mean.size, 1, dt, None, lambda x, dt: _moved(x, dt, motion, bias), _points(mean.size)
     )
     reference.x, reference.P = mean.copy(), cov.copy()
@@ -123,7 +117,7 @@ def _ukf(mean: Array, cov: Array, rows: Array, variance: Array, height_m: float)
             result += weight * difference(value, values[0])
         return result
 
-    reference = _library().UnscentedKalmanFilter(
+    reference = kalman.UnscentedKalmanFilter(
         mean.size,
         len(rows),
         0.0,

@@ -3,15 +3,21 @@ works in place."""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from netpos.estimation.compile import kernel
+from netpos.estimation.compile import inlined, kernel
 from netpos.estimation.factor import factor, solve_factored
+from netpos.estimation.forms.form import FilterForm
 from netpos.estimation.gate import gate_groups, select_rows
 from netpos.estimation.measurement import GATE_VARIANCE, VARIANCE
 from netpos.estimation.motion import add_noise
 from netpos.estimation.sigma import innovation_cov, move, regress
 from netpos.messages.values import Array
+
+if TYPE_CHECKING:
+    from netpos.estimation.engine import FilterOptions
 
 
 @kernel
@@ -19,7 +25,8 @@ def predict(mean: Array, cov: Array, dt: float, motion: Array, bias: Array) -> N
     """Move mean (n,) and covariance (n, n) by ``dt`` seconds through the sigma points: petukhov:
     eq.19-22. Nothing happens for dt <= 0.
 
-    motion : (Parameter,); bias : (2, k) stationary sd and time constant of each bias state
+    motion : of ``motion_parameters``
+    bias : (2, k) stationary sd and time constant of each bias state
     """
     if dt <= 0.0:
         return
@@ -81,3 +88,20 @@ def fuse(
             for i in range(m):
                 total += Kt[i, a] * variance[i] * Kt[i, b]
             cov[a, b] = cov[b, a] = total
+
+
+@inlined
+def _update_form(
+    mean: Array,
+    cov: Array,
+    rows: Array,
+    options: FilterOptions,
+    gate_nis: Array,
+    accepted: Array,
+    _work: Array,
+) -> tuple[float, int]:
+    nis, used = update(mean, cov, rows, options.height_m, gate_nis, accepted)
+    return nis, used
+
+
+FORM = FilterForm(name="ukf", predict=predict, update=_update_form)

@@ -15,16 +15,22 @@ each diagonal entry of L is multiplied by a cosine that is positive while R is.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from netpos.estimation.compile import inlined, kernel, leaf
 from netpos.estimation.factor import factor
+from netpos.estimation.forms.form import FilterForm
 from netpos.estimation.gate import gate_groups, select_rows
 from netpos.estimation.measurement import GATE_VARIANCE, VARIANCE
 from netpos.estimation.motion import noise
 from netpos.estimation.sigma import innovation_cov, move, regress
+from netpos.estimation.state import X
 from netpos.messages.values import Array
+
+if TYPE_CHECKING:
+    from netpos.estimation.engine import FilterOptions
 
 __all__ = ["cholesky_update", "covariance", "factor", "predict", "update"]
 
@@ -160,3 +166,59 @@ def _eliminate(i: int, S: Array, G: Array, L: Array, gain: Array) -> None:
         c, s = S[i, i] / length, G[i, j] / length
         _rotate(S[:, i], G[:, j], i, c, s)
         _rotate(gain, L[:, j], j, c, s)
+
+
+@kernel
+def add_velocity_step(sd: float, time_s: float, position_sd: float, L: Array) -> None:
+    """``motion.add_velocity_step`` to the factor ``L`` (n, n)."""
+    if sd == 0.0:
+        return
+    for p in range(2):
+        x = np.zeros(L.shape[0])
+        x[X.PX + p], x[X.VX + p] = sd * time_s, sd
+        _up_date(L, x)
+    for p in range(2):
+        x = np.zeros(L.shape[0])
+        x[X.PX + p] = position_sd
+        _up_date(L, x)
+
+
+@kernel
+def _write_cov(L: Array, cov: Array) -> None:
+    cov[:] = covariance(L)
+
+
+@kernel
+def _write_factor(cov: Array, L: Array) -> None:
+    L[:] = factor(cov)
+
+
+@inlined
+def _copy(source: Array, target: Array) -> None:
+    target[:] = source
+
+
+@inlined
+def _update_form(
+    mean: Array,
+    L: Array,
+    rows: Array,
+    options: FilterOptions,
+    gate_nis: Array,
+    accepted: Array,
+    _work: Array,
+) -> tuple[float, int]:
+    nis, used = update(mean, L, rows, options.height_m, gate_nis, accepted)
+    return nis, used
+
+
+FORM = FilterForm(
+    name="srukf",
+    predict=predict,
+    update=_update_form,
+    add_velocity_step=add_velocity_step,
+    write_cov=_write_cov,
+    write_cov_or_sqrt=_write_factor,
+    write_sqrt=_copy,
+    summary="square root",
+)

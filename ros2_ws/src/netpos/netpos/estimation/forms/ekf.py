@@ -4,12 +4,14 @@ works in place."""
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from netpos.estimation.bearing import fuse_around, on_top
 from netpos.estimation.compile import inlined, kernel, leaf, local_array
 from netpos.estimation.fit import map_cost
+from netpos.estimation.forms.form import FilterForm
 from netpos.estimation.fusion import (
     W_COV,
     W_GATE_VARIANCE,
@@ -40,16 +42,13 @@ from netpos.estimation.measurement import (
     curvature_variance,
     innovation_row,
 )
-from netpos.estimation.motion import (
-    Model,
-    Parameter,
-    add_noise,
-    propagate,
-    transition,
-)
+from netpos.estimation.motion import add_noise, is_straight, propagate, transition
 from netpos.estimation.sensors.row import group_end
 from netpos.estimation.state import N_CORE, X
 from netpos.messages.values import Array
+
+if TYPE_CHECKING:
+    from netpos.estimation.engine import FilterOptions
 
 __all__ = [
     "fuse",
@@ -68,11 +67,12 @@ def predict(mean: Array, cov: Array, dt: float, motion: Array, bias: Array) -> N
     """Move mean (n,) and covariance (n, n) by ``dt`` seconds: fokin2020:eq.21, 22. Nothing
     happens for dt <= 0.
 
-    motion : (Parameter,); bias : (2, k) stationary sd and time constant of each bias state
+    motion : of ``motion_parameters``
+    bias : (2, k) stationary sd and time constant of each bias state
     """
     if dt <= 0.0:
         return
-    if int(motion[Parameter.MODEL]) != Model.CONSTANT_VELOCITY or motion[Parameter.EXTRAS] > 0.0:
+    if not is_straight(motion):
         _predict_dense(mean, cov, dt, motion, bias)
     elif mean.size == N_CORE:
         _predict_core(cov, dt)
@@ -342,3 +342,29 @@ def _coloured_nis(cov: Array, m: int, work: Array) -> float:
     H = work[W_COV + n : W_COV + n + m, :n][keep]
     innovation, variance = work[W_INNOVATION, :m][keep], work[W_GATE_VARIANCE, :m][keep]
     return float(group_nis(cov, innovation, H, variance))
+
+
+@inlined
+def _update_form(
+    mean: Array,
+    cov: Array,
+    rows: Array,
+    options: FilterOptions,
+    gate_nis: Array,
+    accepted: Array,
+    work: Array,
+) -> tuple[float, int]:
+    height_m, iterations = options.height_m, options.iterations
+    nis, used = update(mean, cov, rows, height_m, gate_nis, iterations, accepted, work)
+    return nis, used
+
+
+EKF = FilterForm(name="ekf", predict=predict, update=_update_form, is_extended=True)
+IEKF = FilterForm(
+    name="iekf",
+    predict=predict,
+    update=_update_form,
+    summary="linearised again at its own result",
+    iterations=8,
+    is_extended=True,
+)

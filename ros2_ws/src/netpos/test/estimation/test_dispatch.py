@@ -1,4 +1,4 @@
-"""The compiled choice of a sensor."""
+"""The compiled choice of a sensor, a motion model or a filter form."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import netpos
 import pytest
 from netpos.estimation.compile import link
-from netpos.estimation.sensors.dispatch import choose, is_one_of
+from netpos.estimation.dispatch import choose, is_one_of
 from netpos.kernel_cache import cache_folder
 
 
@@ -68,9 +68,15 @@ def test_a_second_process_compiles_nothing() -> None:
     assert starts[1] == ["1", "0"]
 
 
-@pytest.mark.parametrize("name", ["sensors/table", "sensors/azimuth", "sensors/row", "state"])
-def test_a_changed_sensor_has_kernels_of_its_own(tmp_path: Path, name: str) -> None:
-    """Columns, the table and indices of states are compiled into kernels of other files."""
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("sensors/table", "sensors/azimuth", "sensors/row", "state"),
+        *("motion/table", "motion/parameters", "motion/inertial", "forms/table", "forms/form"),
+    ],
+)
+def test_a_changed_entry_has_kernels_of_its_own(tmp_path: Path, name: str) -> None:
+    """Columns, the tables and indices of states are compiled into kernels of other files."""
     root = tmp_path / "netpos"
     room = Path("estimation")
     shutil.copytree(Path(netpos.__file__).parent / room, root / room)

@@ -3,14 +3,22 @@ prediction is ``ekf.predict``."""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from netpos.estimation.compile import kernel
+from netpos.common.parameters import real
+from netpos.estimation.compile import inlined, kernel
 from netpos.estimation.factor import factor
+from netpos.estimation.forms import ekf
+from netpos.estimation.forms.form import FilterForm
 from netpos.estimation.gate import gate_groups, select_rows
 from netpos.estimation.measurement import GATE_VARIANCE, GROUP, KIND, VARIANCE, Kind, linearise
 from netpos.estimation.state import X
 from netpos.messages.values import Array
+
+if TYPE_CHECKING:
+    from netpos.estimation.engine import FilterOptions
 
 NO_FLOOR = np.zeros(3)
 # Position, velocity [1/s], acceleration [1/s^2]: dvornikov2017, section on the simulation.
@@ -127,3 +135,38 @@ def _raise_gain(K: Array, h: Array, gain_floor: Array) -> None:
         i = (X.PX, X.VX, X.AX)[order] + axis
         if i < h.size and gain_floor[order] > 0.0 and K[i] * h[axis] < gain_floor[order]:
             K[i] = gain_floor[order] / h[axis]
+
+
+@inlined
+def _update_form(
+    mean: Array,
+    cov: Array,
+    rows: Array,
+    options: FilterOptions,
+    gate_nis: Array,
+    accepted: Array,
+    _work: Array,
+) -> tuple[float, int]:
+    nis, used = update(mean, cov, rows, options.height_m, gate_nis, accepted, options.of_form)
+    return nis, used
+
+
+FORM = FilterForm(
+    name="kf",
+    predict=ekf.predict,
+    update=_update_form,
+    update_shared=update_shared,
+    summary="linear: position fixes and velocities only",
+    parameters={
+        "position_gain_min": real(
+            0.0, 0.0, 1.0, "kf: floor of the position gain (dvornikov2017: 0.0926)"
+        ),
+        "velocity_gain_min": real(
+            0.0, 0.0, 10.0, "kf: floor of the velocity gain [1/s] (dvornikov2017: 0.008)"
+        ),
+        "accel_gain_min": real(
+            0.0, 0.0, 10.0, "kf: floor of the acceleration gain [1/s^2] (dvornikov2017: 0.0003)"
+        ),
+    },
+    follows_manoeuvres=True,
+)

@@ -1,16 +1,19 @@
-"""Compiled choice among sensors by the number of their row kind.
+"""Compiled choice among the entries of a table by their number: sensors, motion models, filter
+forms.
 
-A chain of inlined closures, one per sensor: ``if kind == number: return model(...)``, else the
+A chain of inlined closures, one per entry: ``if kind == number: return model(...)``, else the
 rest of the chain. The compiler makes of it what it makes of the same ``if`` statements written
 one after the other. The closures are compiled as parts of their callers and cached with them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 from netpos.estimation.compile import link
-from netpos.estimation.sensors.model import Kernel
+
+Kernel = Callable[..., Any]
 
 Numbered = tuple[int, Kernel | None]
 
@@ -19,7 +22,7 @@ def choose(models: Sequence[Numbered], otherwise: Kernel) -> Kernel:
     """Function ``(kind, *args)`` that calls the model with the number ``kind``, else
     ``otherwise``, with the arguments ``*args``.
 
-    models : number and function of each sensor; a sensor whose function is None is left out. All
+    models : number and function of each entry; an entry whose function is None is left out. All
         functions, ``otherwise`` too, return the same type.
     """
     chain = _last(otherwise)

@@ -1,0 +1,72 @@
+"""An estimate of a track on FilterPy: the rules of ``engine.step`` written once more around
+``filterpy_reference``."""
+
+from __future__ import annotations
+
+import copy
+
+import filterpy_reference as reference
+import numpy as np
+from netpos.estimation import engine
+from netpos.estimation.measurement import GROUP
+from netpos.estimation.motion import Parameter, add_velocity_step
+from netpos.messages.values import Array, TrackMode
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.estimates import OneModel
+from netpos.tracking.models import augmented, initial_extra_sd, motions_of, options_of
+
+
+class FilterpyEstimate(OneModel):
+    """``estimates.Estimate`` of one motion model and one component; ``filter`` is ekf or ukf."""
+
+    def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
+        self.stamp_ns = stamp_ns
+        self._options = options_of(config)
+        self._motion: Array = motions_of(config)[0].copy()
+        self._predict = getattr(reference, f"{config.filter}_predict")
+        self._update = getattr(reference, f"{config.filter}_update")
+        self.mean, self.cov = augmented(mean, cov, initial_extra_sd(config))
+        self.prior = (self.mean, self.cov)
+
+    @property
+    def modes(self) -> tuple[TrackMode, ...]:
+        return ()
+
+    def radius(self, level_m: float) -> float:
+        return level_m
+
+    def augment(self, sd: Array) -> None:
+        self.mean, self.cov = augmented(self.mean, self.cov, sd)
+
+    def change_prior(self, index: int, before: float, after: float) -> None:
+        raise NotImplementedError
+
+    def predict(self, stamp_ns: int, bias: Array) -> None:
+        dt = (stamp_ns - self.stamp_ns) * 1e-9
+        if dt > 0.0:
+            self._motion[Parameter.VELOCITY_STEP_SD] = 0.0
+            self.mean, self.cov = self.mean.copy(), self.cov.copy()
+            self._predict(self.mean, self.cov, dt, self._motion, bias)
+            self.stamp_ns = stamp_ns
+
+    def step(
+        self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
+    ) -> tuple[float, int, Array]:
+        self.predict(stamp_ns, bias)
+        self.prior = self.mean, self.cov
+        mean, cov = self.mean.copy(), self.cov.copy()
+        opened = rejected_in_row >= self._options.inflate_after
+        sd = self._options.initial_speed_sd if opened else 0.0
+        add_velocity_step(sd, unheard_s, 0.0, cov)
+        accepted = np.zeros(int(rows[-1, GROUP]) + 1)
+        gate, height_m = self._options.gate_nis, self._options.height_m
+        nis, used = self._update(mean, cov, rows, height_m, gate, accepted)
+        if used:
+            self.mean, self.cov = mean, cov
+            engine.set_velocity_step_noise(self._motion, sd, unheard_s, 0.0, 0.0)
+        return nis, used, accepted
+
+    def copy(self) -> FilterpyEstimate:
+        twin = copy.copy(self)
+        twin._motion = self._motion.copy()
+        return twin
