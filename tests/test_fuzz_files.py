@@ -30,21 +30,21 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_small_campaign(bag: Path, tmp_path: Path) -> None:
     walk = fuzz.example(tmp_path, "pedestrian_walk")
-    counts = {"messages": 4000, "bags": 48, "contents": 50, "yaml": 60}
+    counts = {"messages": 4000, "bags": 48, "contents": 20, "yaml": 60}
     found, failures = fuzz.fuzz(counts, 500, [bag, walk])
     assert not failures
     assert found["messages"].total() == 4000
     assert min(found["messages"][kind] for kind in ("bytes refused", "refused", "taken")) > 100
     assert found["bags"].total() == 48
     assert {what.partition(":")[0] for what in found["bags"]} == set(fuzz.COMMANDS)
-    assert found["contents"].total() == 50
+    assert found["contents"].total() == 20
     assert {what.partition(":")[0] for what in found["contents"]} == set(fuzz.CONTENT_COMMANDS)
     assert found["yaml"].total() == 60
 
 
-@pytest.mark.parametrize("seed", [15])
+@pytest.mark.parametrize("seed", [15, 4852])
 def test_bags_that_once_failed(bag: Path, seed: int) -> None:
-    """15: import of a bag with a damaged chunk."""
+    """15: import of a bag with a damaged chunk. 4852: a description that describes nothing."""
     assert fuzz.one_bag(bag, fuzz.content(bag), seed).endswith((": refused", ": done"))
 
 

@@ -27,7 +27,7 @@ def run_of_description(text: str) -> Run | None:
         description = load_yaml(text)
         description = description.get("rosbag2_bagfile_information", description)
         return texts(description["custom_data"] or {})
-    except (YamlError, KeyError, AttributeError):
+    except (YamlError, KeyError, AttributeError, TypeError):  # not the shape of a description
         return None
 
 
