@@ -216,7 +216,7 @@ def test_without_odom_it_says_why_nothing_is_published(make: Any) -> None:
     know_rsus(node)
     drive(node, range(30))
     assert node._tf_pub.messages == []
-    (warning,) = (w for w in node._input_warnings() if "odom" in w)
+    (warning,) = (w for w in node._input_warnings() if "on /tf" in w)
     assert "no vue_1/odom -> vue_1/base_link on /tf" in warning
 
 
