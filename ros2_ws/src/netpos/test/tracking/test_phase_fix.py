@@ -217,7 +217,7 @@ def test_a_fix_as_linear_rows_has_its_place_and_covariance() -> None:
     rows[1, VALUE] += 2 * math.pi * turns
     others = np.full((2, rows.shape[1]), 7.0)
     rows = np.vstack([others, rows])
-    assert to_fix(rows, 3, HEIGHT)
+    assert to_fix(rows, 3, np.zeros(6), HEIGHT)
     np.testing.assert_array_equal(rows[:2], others)
     rows = rows[2:]
     assert rows[:, KIND].tolist() == [Kind.LINEAR, Kind.LINEAR]
