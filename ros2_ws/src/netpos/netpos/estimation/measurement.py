@@ -2,7 +2,9 @@
 
 A row (``sensors.row``) is of one sensor (``sensors.table``). With the antenna at a and d = a - RSU
 the value of a row is a function of d, or of the state; to it come the device's clock offset where
-the sensor has it (fokin2020:eq.41), and the states BIAS and COMMON of the row.
+the sensor has it (fokin2020:eq.41), and the states BIAS and COMMON of the row. Where the state has
+the height of the device (HEIGHT), d is a function of three states, and so is what linearising
+leaves out.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ import math
 
 import numpy as np
 
-from netpos.estimation.compile import inlined, kernel, leaf
+from netpos.estimation.compile import inlined, kernel, leaf, local_array
 from netpos.estimation.dispatch import choose, is_one_of
 from netpos.estimation.sensors.geometry import turned_lever
 from netpos.estimation.sensors.model import Wraps
@@ -23,6 +25,7 @@ from netpos.estimation.sensors.row import (
     GATE_VARIANCE,
     GROUP,
     HEADING,
+    HEIGHT,
     KIND,
     LEVER,
     ORIGIN,
@@ -42,6 +45,7 @@ __all__ = [
     "GATE_VARIANCE",
     "GROUP",
     "HEADING",
+    "HEIGHT",
     "KIND",
     "LEVER",
     "ORIGIN",
@@ -58,6 +62,7 @@ __all__ = [
     "is_range",
     "linearise",
     "of_offset",
+    "offset_up",
     "predict_row",
     "second_order_of_offset",
     "second_order_variance",
@@ -155,13 +160,24 @@ def _lever(row: Array, mean: Array) -> tuple[float, float]:
 
 
 @inlined
+def offset_up(row: Array, mean: Array, height_m: float) -> float:
+    """How far the antenna is above the RSU [m]; ``height_m``: nominal height of the device."""
+    dz = height_m + row[LEVER + 2] - row[ORIGIN + 2]
+    height = int(row[HEIGHT])
+    return float(dz + mean[height] if height > 0 else dz)
+
+
+@inlined
 def _from_rsu(kind: int, row: Array, mean: Array, height_m: float, h: Array) -> float:
     """Value of a sensor of the offset between the RSU and the device's antenna."""
     lx, ly = _lever(row, mean)
     dx = mean[X.PX] + lx - row[ORIGIN]
     dy = mean[X.PY] + ly - row[ORIGIN + 1]
-    dz = height_m + row[LEVER + 2] - row[ORIGIN + 2]
-    value, h[X.PX], h[X.PY], _ = of_offset(kind, row, dx, dy, dz)
+    dz = offset_up(row, mean, height_m)
+    value, h[X.PX], h[X.PY], up = of_offset(kind, row, dx, dy, dz)
+    height = int(row[HEIGHT])
+    if height > 0:
+        h[height] = up
     if has_clock(row):
         h[X.CLOCK] = 1.0
         value += mean[X.CLOCK]
@@ -174,7 +190,7 @@ def _from_rsu(kind: int, row: Array, mean: Array, height_m: float, h: Array) -> 
 @inlined
 def predict_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
     """Predicted value of one row at ``mean`` (n,); fills its Jacobian ``h`` (n,). ``height_m``:
-    device height in map. NaN for a kind that no sensor has."""
+    nominal height of the device in map. NaN for a kind that no sensor has."""
     for i in range(mean.size):
         h[i] = 0.0
     kind = int(row[KIND])
@@ -198,6 +214,23 @@ def innovation_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
     return wrap(innovation) if is_cyclic(row) else float(innovation)
 
 
+@leaf
+def _second_order_in_3d(
+    choice: int, kind: int, row: Array, d: tuple[float, float, float], cov: Array
+) -> float:
+    """Second-order term of a row for a prior ``cov`` (n, n) of position and height; ``choice`` 1:
+    the exact one where the update has a bound."""
+    P, height = local_array(3, 3), int(row[HEIGHT])
+    for a in range(2):
+        P[a, 2] = P[2, a] = cov[a, height]
+        for b in range(2):
+            P[a, b] = cov[a, b]
+    P[2, 2] = cov[height, height]
+    if choice == 1:
+        return float(_exact_second_order(kind, row, d[0], d[1], d[2], P, 3))
+    return float(second_order_of_offset(kind, row, d[0], d[1], d[2], P, 3))
+
+
 @inlined
 def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> float:
     """Variance of what linearising ``row`` at ``mean`` (n,) leaves out, for a prior ``cov`` (n,
@@ -214,7 +247,9 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
     lx, ly = _lever(row, mean)
     dx = mean[X.PX] + lx - row[ORIGIN]
     dy = mean[X.PY] + ly - row[ORIGIN + 1]
-    dz = height_m + row[LEVER + 2] - row[ORIGIN + 2]
+    dz = offset_up(row, mean, height_m)
+    if row[HEIGHT] > 0.0:
+        return float(_second_order_in_3d(0, kind, row, (dx, dy, dz), cov))
     return float(second_order_of_offset(kind, row, dx, dy, dz, cov, 2))
 
 
@@ -230,7 +265,9 @@ def second_order_variance(row: Array, mean: Array, cov: Array, height_m: float) 
     if row[HEADING] >= 0.0 or not _has_exact_second_order(kind):
         return float(curvature_variance(row, mean, cov, height_m))
     dx, dy = mean[X.PX] - row[ORIGIN], mean[X.PY] - row[ORIGIN + 1]
-    dz = height_m + row[LEVER + 2] - row[ORIGIN + 2]
+    dz = offset_up(row, mean, height_m)
+    if row[HEIGHT] > 0.0:
+        return float(_second_order_in_3d(1, kind, row, (dx, dy, dz), cov))
     return float(_exact_second_order(kind, row, dx, dy, dz, cov, 2))
 
 

@@ -17,12 +17,12 @@ import numpy.typing as npt
 
 from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.measurement import (
-    LEVER,
     ORIGIN,
     VARIANCE,
     curvature_variance,
     innovation_row,
     is_range,
+    offset_up,
 )
 from netpos.messages.values import Array
 
@@ -123,7 +123,7 @@ def split_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Mi
     h, at, along = np.empty(n), mean.copy(), np.zeros(n)
     residual = innovation_row(row, mean, height_m, h)
     dx, dy = mean[0] - row[ORIGIN], mean[1] - row[ORIGIN + 1]
-    dz = height_m + row[LEVER + 2] - row[ORIGIN + 2]
+    dz = offset_up(row, mean, height_m)
     slant = math.sqrt(dx * dx + dy * dy + dz * dz) + residual  # measured, less clock and biases
     own = _own_variance(row, cov, h)
     radius = math.sqrt(max(slant * slant - dz * dz, 0.25 * own, 1e-4))

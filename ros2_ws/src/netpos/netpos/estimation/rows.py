@@ -22,6 +22,7 @@ from netpos.estimation.measurement import (
     GATE_VARIANCE,
     GROUP,
     HEADING,
+    HEIGHT,
     KIND,
     LEVER,
     ORIGIN,
@@ -32,13 +33,15 @@ from netpos.estimation.measurement import (
 )
 from netpos.estimation.sensors.model import Reading
 from netpos.estimation.sensors.table import readings
-from netpos.estimation.state import N_CORE
+from netpos.estimation.state import KNOWN_HEIGHT, N_CORE, HeightState
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 
 _POSITION = int(Field.POSITION)  # a plain integer: arithmetic of flags costs ten times as much
 _MIDDLE, _POSE, _MASTER, _ALONG = 0, 3, 12, 15  # in ``rsu_place``
 _CONE = AngleConvention.CONE
-ROWS_MAX = len({reading.field for _, reading in readings()}) + 2
+_HEIGHT_SD_MIN_M, _HEIGHT_SD_MAX_M = 1e-6, 1e6  # of a fix whose height counts
+_CORRELATION_MARGIN = 1e-9
+ROWS_MAX = len({reading.field for _, reading in readings()}) + 3
 """Rows of one measurement at most: its scalars and a position."""
 
 
@@ -162,7 +165,7 @@ def put_scalars(
         row[KIND], row[VALUE] = kind, value
         row[VARIANCE] = row[GATE_VARIANCE] = variance
         row[BIAS] = row[COMMON] = -1.0
-        row[GROUP], row[HEADING], row[BLOCKED] = group, heading, 0.0
+        row[GROUP], row[HEADING], row[BLOCKED], row[HEIGHT] = group, heading, 0.0, 0.0
         for i in range(HEADING - AXES):
             row[AXES + i] = place[_POSE + i]
         for i in range(3):
@@ -189,13 +192,16 @@ def put_measurement(
     sites: tuple[bool, Array, Array | None],
     group: int,
     heading: int,
+    height: HeightState = KNOWN_HEIGHT,
 ) -> int:
     """Write the rows of one RSU measurement, without biases, from ``rows[at]`` on; the index after
-    the last one. A position fix of its antenna becomes two decorrelated LINEAR rows.
+    the last one. A position fix of its antenna becomes two decorrelated LINEAR rows, or three
+    where the height is a state and the fix has one.
 
     sites : whether the RSU's angles are those of linear arrays, its ``rsu_place``, and that of the
         second RSU of a difference
     """
+    start = at
     fields, (cone, place, reference) = int(m.fields), sites
     plan = scalar_plan(fields, cone)
     if plan.read is not None:
@@ -208,11 +214,33 @@ def put_measurement(
             between = reference[_MASTER : _MASTER + 3] - place[_MASTER : _MASTER + 3]
             rows[first + k, AXES : AXES + 3] = between
     if fields & _POSITION:
-        fix = linear_rows(m.position[:2], m.position_cov[:2, :2], np.eye(2, N_CORE), group)
+        fix = _fix_rows(m, group, height)
         fix[:, HEADING:BLOCKED] = heading, *m.lever_arm
-        rows[at : at + 2] = fix
-        at += 2
+        rows[at : at + len(fix)] = fix
+        at += len(fix)
+    if height.entry:
+        rows[start:at, HEIGHT] = height.entry
     return at
+
+
+def _fix_rows(m: RsuMeasurement, group: int, height: HeightState) -> Array:
+    """Rows (2 or 3, ROW_WIDTH) of a position fix."""
+    if height.entry and _has_height(m.position, m.position_cov):
+        H = np.zeros((3, N_CORE + 1))
+        H[:2, :2], H[2, N_CORE] = np.eye(2), 1.0
+        return linear_rows(m.position - (0.0, 0.0, height.nominal_m), m.position_cov, H, group)
+    return linear_rows(m.position[:2], m.position_cov[:2, :2], np.eye(2, N_CORE), group)
+
+
+def _has_height(position: Array, cov: Array) -> bool:
+    """Whether the third component of a fix counts: it is finite, and ``cov`` (3, 3) symmetric and
+    positive definite beyond rounding."""
+    if not (math.isfinite(position[2]) and np.isfinite(cov).all() and np.allclose(cov, cov.T)):
+        return False
+    sd = np.sqrt(np.maximum(np.diag(cov), 0.0))
+    if not _HEIGHT_SD_MIN_M <= sd[2] <= _HEIGHT_SD_MAX_M:
+        return False
+    return bool(np.linalg.eigvalsh(cov / np.outer(sd, sd))[0] > _CORRELATION_MARGIN)
 
 
 def couple(rows: Array, kinds: tuple[Kind, ...], coupling: Coupling) -> None:
@@ -233,6 +261,7 @@ def rsu_rows(
     coupling: Coupling = UNCOUPLED,
     heading: int = -1,
     reference: Array | None = None,
+    height: HeightState = KNOWN_HEIGHT,
 ) -> Array:
     """Rows (m, ROW_WIDTH) of one RSU measurement.
 
@@ -241,7 +270,7 @@ def rsu_rows(
     """
     rows = np.empty((ROWS_MAX, ROW_WIDTH))
     sites = info.angle_convention is _CONE, rsu_place(info, axes), reference
-    end = put_measurement(rows, 0, m, sites, group, heading)
+    end = put_measurement(rows, 0, m, sites, group, heading, height)
     couple(rows, scalar_kinds(int(m.fields), info.angle_convention), coupling)
     return rows[:end]
 
@@ -250,8 +279,8 @@ def linear_rows(value: Array, cov: Array, H: Array, group: int) -> Array:
     """Rows of a linear measurement ``value = H x + noise`` with full covariance, decorrelated by
     its Cholesky factor.
 
-    value (m,), cov (m, m) positive definite, H (m, 6) of the core states. Raises ``LinAlgError``
-    where cov is not.
+    value (m,), cov (m, m) positive definite, H (m, 6) of the core states, or (m, 7) with the
+    height. Raises ``LinAlgError`` where cov is not.
     """
     L = np.linalg.cholesky((cov + cov.T) / 2.0)
     rows = np.zeros((len(value), ROW_WIDTH))
@@ -260,7 +289,7 @@ def linear_rows(value: Array, cov: Array, H: Array, group: int) -> Array:
     rows[:, VARIANCE] = rows[:, GATE_VARIANCE] = 1.0
     rows[:, BIAS] = rows[:, COMMON] = rows[:, HEADING] = -1
     rows[:, GROUP] = group
-    rows[:, ORIGIN : ORIGIN + N_CORE] = np.linalg.solve(L, H)
+    rows[:, ORIGIN : ORIGIN + H.shape[1]] = np.linalg.solve(L, H)
     return rows
 
 

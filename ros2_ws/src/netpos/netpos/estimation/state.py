@@ -9,6 +9,7 @@ which they were first heard.
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import NamedTuple
 
 
 class X(IntEnum):
@@ -33,6 +34,19 @@ class X(IntEnum):
 N_CORE = 6
 """Number of states that every planar track has."""
 POSITION, VELOCITY, CLOCK_DRIFT = slice(0, 2), slice(2, 4), slice(4, 6)
+
+
+class HeightState(NamedTuple):
+    """The block ``height`` of a planar state, behind the states of the motion model: one entry,
+    the height of the device over the nominal one [m], a first-order Gauss-Markov process."""
+
+    entry: int = 0
+    """Its index; 0: the height is known, and the state has none."""
+    nominal_m: float = 0.0
+    """Height in map where the entry is 0."""
+
+
+KNOWN_HEIGHT = HeightState()
 
 
 class Nav(IntEnum):

@@ -5,18 +5,25 @@ from __future__ import annotations
 import numpy as np
 
 from netpos.estimation.compile import kernel
-from netpos.estimation.measurement import BIAS, VARIANCE, curvature_variance, innovation_row
+from netpos.estimation.measurement import (
+    BIAS,
+    HEIGHT,
+    VARIANCE,
+    curvature_variance,
+    innovation_row,
+)
 from netpos.estimation.state import X
 from netpos.messages.values import Array
 
 
 @kernel
 def unexplained(mean: Array, cov: Array, rows: Array, height_m: float) -> Array:
-    """What the posterior mean (n,), cov (n, n) leaves of each row (m, 7): the residual with the
+    """What the posterior mean (n,), cov (n, n) leaves of each row (m, 8): the residual with the
     RSU's own bias in it; its expected square, without; the variance of the update; the derivatives
-    of the row by position x, y and clock offset; and the own bias."""
+    of the row by position x, y and clock offset; the own bias; and the derivative by the height, 0
+    where that is known."""
     n = mean.size
-    h, out = np.empty(n), np.zeros((rows.shape[0], 7))
+    h, out = np.empty(n), np.zeros((rows.shape[0], 8))
     for i in range(rows.shape[0]):
         row = rows[i]
         residual = innovation_row(row, mean, height_m, h)
@@ -30,4 +37,6 @@ def unexplained(mean: Array, cov: Array, rows: Array, height_m: float) -> Array:
         out[i, 2] = row[VARIANCE] + curvature_variance(row, mean, cov, height_m)
         out[i, 3], out[i, 4], out[i, 5] = h[X.PX], h[X.PY], h[X.CLOCK]
         out[i, 6] = bias
+        height = int(row[HEIGHT])
+        out[i, 7] = h[height] if height > 0 else 0.0
     return out

@@ -22,6 +22,7 @@ from netpos.evaluation.pairing import (
     Pairs,
     Stamps,
     Trajectory,
+    has_height,
     pair,
     wrap_angle,
 )
@@ -62,14 +63,16 @@ class Figures:
     0.2 s old (5 Hz, fokin2020's priority passage), convergence included; an estimate is ready in
     state TRACKING. rmse_m, p50..max: horizontal position error; mean_error_m: mean horizontal
     error, which fokin2020:eq.34 calls RMSE; rmse_3d_m with the vertical; north, east, down: by
-    axis, as deng2022 does. velocity_rmse_mps: horizontal, map axes. heading_rmse_deg: where the
-    true speed exceeds 0.5 m/s. clock_offset_sd_ns: standard deviation of the clock offset error
-    about its mean; clock_offset_rmse_ns: about zero. nees_*: horizontal position, 2 degrees of
-    freedom, bounds as wide as those of nees_n_eff independent epochs. nis_mean: mean NIS of epochs
-    with measurements; nis_dof_mean: its expectation. rejected: all rejections counted up to the
-    end; rejected_share: of the measurements (no IMU samples, no events such as a lost track) that
-    the track accepted or refused, the share refused. lost_tracks: see ``lost_tracks``, None
-    without track status. unscored_s: seconds of the ground truth's span without a scored estimate
+    axis, as deng2022 does. vertical_rmse_m: of the height, and vertical_error_m its mean, positive
+    above the truth; None where the truth has no height (``pairing.has_height``).
+    velocity_rmse_mps: horizontal, map axes. heading_rmse_deg: where the true speed exceeds 0.5
+    m/s. clock_offset_sd_ns: standard deviation of the clock offset error about its mean;
+    clock_offset_rmse_ns: about zero. nees_*: horizontal position, 2 degrees of freedom, bounds as
+    wide as those of nees_n_eff independent epochs. nis_mean: mean NIS of epochs with measurements;
+    nis_dof_mean: its expectation. rejected: all rejections counted up to the end; rejected_share:
+    of the measurements (no IMU samples, no events such as a lost track) that the track accepted or
+    refused, the share refused. lost_tracks: see ``lost_tracks``, None without track status.
+    unscored_s: seconds of the ground truth's span without a scored estimate
     (``availability.unscored_s``): before the first one, after a loss, in gaps. share_above_5m:
     share of the estimates scored with an error above 5 m. protection_exceeded: share of the
     estimates with a horizontal error above the protection level of their status;
@@ -106,6 +109,8 @@ class Figures:
     north_rmse_m: float | None = None
     east_rmse_m: float | None = None
     down_rmse_m: float | None = None
+    vertical_rmse_m: float | None = None
+    vertical_error_m: float | None = None
     nees_n: int | None = None
     nees_n_eff: float | None = None
     nis_dof_mean: float | None = None
@@ -261,6 +266,7 @@ def _accuracy(scored: Pairs) -> dict[str, Any]:
     errors = scored.horizontal_error
     stamps = scored.estimate.stamp_ns
     p50, p95, p99, worst = _percentiles(errors)
+    up = scored.error[has_height(scored.truth), 2]
     velocity_errors = (scored.estimate.velocity - scored.truth.velocity)[:, :2]
     return {
         "n": len(scored),
@@ -270,6 +276,8 @@ def _accuracy(scored: Pairs) -> dict[str, Any]:
         "north_rmse_m": rms(scored.error[:, 1]),
         "east_rmse_m": rms(scored.error[:, 0]),
         "down_rmse_m": rms(scored.error[:, 2]),
+        "vertical_rmse_m": rms(up),
+        "vertical_error_m": float(up.mean()) if up.size else None,
         "mean_error_m": float(errors.mean()) if errors.size else None,
         "p50_m": p50,
         "p95_m": p95,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from netpos.messages.values import Array, ClockState, Odometry
+from netpos.messages.values import UNKNOWN_HEIGHT_VAR, Array, ClockState, Odometry
 
 Stamps = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -23,6 +23,12 @@ Mask = NDArray[np.bool_]
 MAX_TRUTH_GAP_S = 1.0
 # Columns of a pose after its position.
 _QUATERNION, _VELOCITY, _COV, _POSE_VALUES = slice(3, 7), slice(7, 10), 10, 19
+
+
+def has_height(truth: Trajectory) -> Mask:
+    """Whether each pose of a ground truth (n,) has a height: its variance is below
+    ``UNKNOWN_HEIGHT_VAR``, which stands for none."""
+    return np.asarray(truth.position_cov[:, 2, 2] < UNKNOWN_HEIGHT_VAR)
 
 
 def wrap_angle(angle: Array) -> Array:

@@ -9,14 +9,14 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
-from netpos.estimation.state import N_CORE
+from netpos.estimation.state import N_CORE, HeightState
 from netpos.evaluation.bounds import bound_rmse, run_bound
 from netpos.evaluation.pairing import Stamps, Trajectory
 from netpos.messages.values import Array, InitialPose, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.epoch_rows import epoch_rows_of
-from netpos.tracking.models import motions_of, pose_state
-from netpos.tracking.rsus import BiasStates, Rsu
+from netpos.tracking.epoch_rows import epoch_rows_of, planar_form
+from netpos.tracking.models import height_state, motions_of, pose_state, slow_states
+from netpos.tracking.rsus import Rsu
 
 
 def recorded_bound_m(
@@ -37,11 +37,12 @@ def recorded_bound_m(
     if not simple or not all(rsu.plain for rsu in known.values()):
         return None
     rows_by_stamp: dict[int, list[Array]] = defaultdict(list)
-    biases = BiasStates()  # of plain RSUs only what differences share
+    biases, height = slow_states(config), height_state(config)  # and what differences share
+    form = planar_form(height=height)
     first_ns, last_ns = int(truth.stamp_ns[0]), int(truth.stamp_ns[-1])
     heard = (m for m in measurements if m.rsu_id in known and first_ns <= m.stamp_ns <= last_ns)
     for stamp, together in itertools.groupby(heard, key=lambda m: m.stamp_ns):
-        rows_by_stamp[stamp].append(epoch_rows_of(list(together), known, biases).rows)
+        rows_by_stamp[stamp].append(epoch_rows_of(list(together), known, biases, form).rows)
     if len(rows_by_stamp) < 2:
         return None
     stamps = np.array(sorted(rows_by_stamp), dtype=np.int64)
@@ -53,7 +54,7 @@ def recorded_bound_m(
         np.cumsum([0, *map(len, blocks)]),
         np.vstack(blocks),
         truth.stamp_ns,
-        np.column_stack([truth.position[:, :2], truth.velocity[:, :2]]),
+        _states(truth, height),
         prior + np.diag(np.square([*[0.0] * N_CORE, *biases.sd])),
         motions_of(config),
         bias=biases.arrays(),
@@ -61,6 +62,15 @@ def recorded_bound_m(
     )
     scored = bounds[np.isin(stamps, scored_ns)]
     return bound_rmse(scored) if len(scored) else None
+
+
+def _states(truth: Trajectory, height: HeightState) -> Array:
+    """True states (T, 4), or (T, 7) with the height."""
+    states = np.column_stack([truth.position[:, :2], truth.velocity[:, :2]])
+    if not height.entry:
+        return states
+    above = truth.position[:, 2] - height.nominal_m
+    return np.column_stack([states, np.zeros((len(truth), 2)), above])
 
 
 def _prior(config: TrackerConfig, pose: InitialPose | None) -> Array:

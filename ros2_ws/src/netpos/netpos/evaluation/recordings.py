@@ -31,7 +31,10 @@ Json = dict[str, Any]
 
 # What a recording is, not how a tracker is set: these stay with default parameters.
 FACTS = frozenset(
-    {"motion_model", "device_height_m", "gravity_mps2", "earth_rate", "latitude_deg", "network"}
+    {
+        *("motion_model", "network", "gravity_mps2", "earth_rate", "latitude_deg"),
+        *("device_height_m", "device_height_sd_m", "device_height_time_s"),
+    }
 )
 # Figures of an estimate's accuracy, and figures of a whole run.
 ACCURACY = ("n", "rmse_m", "p50_m", "p95_m", "max_m", "nees_mean", "nees_bounds", "share_above_5m")

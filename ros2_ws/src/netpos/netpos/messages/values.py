@@ -156,6 +156,10 @@ class Beacon:
     clock_offset_s: float
 
 
+UNKNOWN_HEIGHT_VAR = 1.0
+"""Variance [m^2] of a height in an ``Odometry`` of which nothing is known but what was assumed."""
+
+
 @dataclass(slots=True, kw_only=True)
 class Odometry:
     """Pose and twist of a device, true or estimated.

@@ -8,8 +8,9 @@ from typing import Literal
 
 import numpy as np
 
+from netpos.estimation.measurement import HEIGHT
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
-from netpos.estimation.state import N_CORE, POSITION, VELOCITY, X
+from netpos.estimation.state import N_CORE, POSITION, VELOCITY, HeightState, X
 from netpos.evaluation.bounds import bound_covariances
 from netpos.messages.values import Array
 from netpos.reproduction.paper_filter import follow_paper
@@ -18,14 +19,20 @@ from netpos.reproduction.segments import Epochs, Flags, Followed, Follower, Ints
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.simulation import Beacons
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.models import pose_state
+from netpos.tracking.models import height_state, pose_state
 from netpos.tracking.rsus import Rsu
 
 VUE = "vue_1"
 
 Estimator = Literal["scenario", "defaults", "paper"]
 
-FACTS = ("require_initial_pose", "device_height_m", "motion_model")
+FACTS = (
+    "require_initial_pose",
+    "device_height_m",
+    "device_height_sd_m",
+    "device_height_time_s",
+    "motion_model",
+)
 """Parameters of the tracker that are no tuning: what a user knows of the device and its start."""
 
 
@@ -90,6 +97,7 @@ class Setup:
         self._templates = RowTemplates.of(rsus, self.simulation.fields)
         self._follower = Follower(self.config, tuple(Rsu.of(info) for info in rsus))
         self._experiment = experiment
+        self._height = height_state(self.config)
 
     def run(self, seed: int) -> Track:
         """Simulate, estimate and bound one seed.
@@ -103,7 +111,7 @@ class Setup:
         mean, cov = self._start(simulation)
         heard, epochs = self._epochs(simulation)
         prior = self._follower.augmented(mean, cov, epochs.bias)[1]
-        truth = _truth(simulation.beacons(VUE), heard, len(prior))
+        truth = _truth(simulation.beacons(VUE), heard, len(prior), self._height)
         if self._experiment.start_drawn:
             mean = np.random.default_rng([seed, 1]).multivariate_normal(truth[0, :N_CORE], cov)
         followed = self._followed(simulation, epochs, mean, cov, truth)
@@ -148,23 +156,29 @@ class Setup:
     def _epochs(self, simulation: Simulation) -> tuple[Ints, Epochs]:
         """The beacons heard, (N,), and their epochs."""
         seen = simulation.observations(VUE)
+        own = self._follower.own_slow
         heard, row_start, rows, bias = observation_rows(
-            seen, self._templates, self._follower.first_bias
+            seen, self._templates, self._follower.first_bias + own.shape[1]
         )
+        rows[:, HEIGHT] = self._height.entry
+        bias = np.hstack([own, bias])
         if not heard.size or heard[0] > 0:
             raise ValueError(f"no RSU hears the first beacon of {simulation.scenario.name}")
         stamps_ns = simulation.beacons(VUE).stamp_ns[heard]
         return heard, Epochs(stamps_ns, row_start, rows, bias, seen.rsu[heard])
 
 
-def _truth(beacons: Beacons, heard: Ints, n: int) -> Array:
-    """(N, n) true states of the beacons ``heard`` (N,); entries beyond the six are 0."""
+def _truth(beacons: Beacons, heard: Ints, n: int, height: HeightState) -> Array:
+    """(N, n) true states of the beacons ``heard`` (N,); of entries beyond the six there is only
+    the height."""
     c = SPEED_OF_LIGHT_MPS
     truth = np.zeros((heard.size, n))
     truth[:, POSITION] = beacons.position[heard, :2]
     truth[:, VELOCITY] = beacons.velocity[heard]
     truth[:, X.CLOCK] = c * beacons.clock_offset_s[heard]
     truth[:, X.DRIFT] = c * beacons.clock_drift[heard]
+    if height.entry:
+        truth[:, height.entry] = beacons.position[heard, 2] - height.nominal_m
     return truth
 
 

@@ -19,7 +19,14 @@ from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser
-from netpos.tracking.models import augmented, initial_extra_sd, motions_of, options_of
+from netpos.tracking.models import (
+    augmented,
+    initial_extra_sd,
+    motions_of,
+    options_of,
+    slow_states,
+    start_state,
+)
 from netpos.tracking.rsus import Rsu
 
 Ints = npt.NDArray[np.int64]
@@ -91,12 +98,21 @@ class Follower:
 
     @property
     def first_bias(self) -> int:
-        """Index of the first state of an RSU's slow error."""
+        """Index of the first state with a row in ``Epochs.bias``: the device's own, then those of
+        RSUs."""
         return N_CORE + self._extra_sd.size
 
+    @property
+    def own_slow(self) -> Array:
+        """Standard deviation and time constant (2, k) of the device's own: its height, where that
+        is unknown."""
+        return slow_states(self._config).arrays()
+
     def augmented(self, mean: Array, cov: Array, bias: Array) -> tuple[Array, Array]:
-        """A start (6,), (6, 6) with the motion model's own states and the biases (2, k)."""
-        return augmented(mean, cov, np.append(self._extra_sd, bias[0]))
+        """A start, as ``start_state`` takes it, with the motion model's own states and the biases
+        (2, k)."""
+        start = start_state(self._config, mean, cov)
+        return augmented(*start, np.append(self._extra_sd, bias[0]))
 
     def follow(
         self, epochs: Epochs, mean: Array, cov: Array, samples: list[ImuSample] | None
@@ -162,8 +178,9 @@ class Follower:
         measurement; until then it is in the results only."""
         config, first = self._config, self.first_bias
         sd = np.append(self._extra_sd, epochs.bias[0])
-        heard_ns, rejected, known = int(epochs.stamps_ns[0]), 0, first
-        estimate = estimates.start(config, heard_ns, *augmented(mean, cov, self._extra_sd))
+        heard_ns, rejected = int(epochs.stamps_ns[0]), 0
+        known = first + self.own_slow.shape[1]
+        estimate = estimates.start(config, heard_ns, mean, cov)
         for k, stamp in enumerate(epochs.stamps_ns.tolist()):
             rows = epochs.rows[epochs.row_start[k] : epochs.row_start[k + 1]].copy()
             if rows.size:

@@ -146,7 +146,15 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
     coverage_radius_m: float = real(
         150.0, 1.0, 1e5, "a device is about this far from an RSU that hears it"
     )
-    device_height_m: float = real(0.0, -1e4, 1e4, "height of the device's antenna in map")
+    device_height_m: float = real(
+        0.0, -1e4, 1e4, "height of the device in map; where it is unknown, of its mean"
+    )
+    device_height_sd_m: float = real(
+        0.0, 0.0, 1e3, "sd of the device's height about its mean, estimated on the way; 0: known"
+    )
+    device_height_time_s: float = real(
+        30.0, 0.1, 1e6, "correlation time of an unknown height (first-order Markov)"
+    )
     gate_probability: float = real(
         0.9999, 0.5, 1.0, "share of true measurements the chi-square gate accepts; 1: no gate"
     )
@@ -312,6 +320,11 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
             raise ValueError(
                 f"motion_model {self.motion_model} takes filter {extended}, not {self.filter!r}"
             )
+        if self.device_height_sd_m > 0.0 and self.motion_model == "rigid_body":
+            raise ValueError(
+                "motion_model rigid_body needs a known height, got device_height_sd_m"
+                f" {self.device_height_sd_m:g}; set it to 0 or take another motion model"
+            )
         if self.is_linear and self.calibrates_steps:
             raise ValueError(
                 f"filter {self.filter} is linear; leave step_length_factor_sd and"
@@ -348,6 +361,11 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
             raise ValueError(
                 "motion_model strapdown is smoothed afterwards only (replay --smooth); leave"
                 f" fixed_lag_s at 0, got {self.fixed_lag_s}"
+            )
+        if self.device_height_sd_m > 0.0:
+            raise ValueError(
+                "motion_model strapdown always estimates the height; set device_height_sd_m to 0,"
+                f" got {self.device_height_sd_m:g}"
             )
         if self.calibrates_steps:
             raise ValueError(

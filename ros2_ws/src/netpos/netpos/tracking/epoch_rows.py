@@ -9,9 +9,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netpos.estimation.measurement import BIAS, COMMON, KIND, ROW_WIDTH, VARIANCE, Kind, linearise
+from netpos.estimation.measurement import (
+    BIAS,
+    COMMON,
+    HEIGHT,
+    KIND,
+    ROW_WIDTH,
+    VARIANCE,
+    Kind,
+    linearise,
+)
 from netpos.estimation.rows import ROWS_MAX, couple, linear_rows, put_measurement, speed_row
-from netpos.estimation.state import N_CORE, VELOCITY, X
+from netpos.estimation.state import KNOWN_HEIGHT, N_CORE, VELOCITY, HeightState, X
 from netpos.messages.values import Array, Field, GroundSpeed, RsuMeasurement, Velocity
 from netpos.tracking.rsus import REFERENCED, BiasStates, Rsu
 
@@ -35,12 +44,17 @@ class EpochRows:
         return any(isinstance(i, RsuMeasurement) and int(i.fields) & _TOA for i in self.items)
 
     def slow_variance(self, biases: BiasStates) -> Array:
-        """Variance (m,) that the slow errors add to each row before there are states of them."""
+        """Variance (m,) that the slow errors add to each row before there are states of them; the
+        height is no error, a first fix estimates it."""
         mean = np.zeros(biases.first + len(biases.sd))
         for item in self.items:
             if isinstance(item, Velocity):
                 mean[VELOCITY] = item.velocity  # the faster, the more a factor changes
-        _, H = linearise(self.rows, mean, 0.0)
+        rows = self.rows
+        if rows[:, HEIGHT].any():
+            rows = rows.copy()
+            rows[:, HEIGHT] = 0.0
+        _, H = linearise(rows, mean, 0.0)
         variance: Array = np.square(H[:, biases.first :]) @ np.square(biases.sd)
         return variance
 
@@ -57,9 +71,10 @@ class RowForm(NamedTuple):
     speed: Callable[[float, float, int], Array]
 
 
-def planar_form(heading: int = -1) -> RowForm:
-    """Rows of a planar estimator; ``heading``: state index of the device's heading, -1: none."""
-    return RowForm(partial(put_measurement, heading=heading), speed_row)
+def planar_form(heading: int = -1, height: HeightState = KNOWN_HEIGHT) -> RowForm:
+    """Rows of a planar estimator; ``heading``: state index of the device's heading, -1: none;
+    ``height``: where its height is."""
+    return RowForm(partial(put_measurement, heading=heading, height=height), speed_row)
 
 
 _PLANAR = planar_form()

@@ -21,7 +21,7 @@ from netpos.estimation.protection import mixture_radius
 from netpos.estimation.state import N_CORE, X
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.models import augmented, initial_extra_sd, motions_of, options_of
+from netpos.tracking.models import augmented, motions_of, options_of, start_state
 
 
 class Estimate(Protocol):
@@ -121,7 +121,7 @@ class KalmanEstimate(OneModel):
         self._components: Mixture | None = None  # replaced, never changed; None: one component
         self._prior: tuple[Array, Array] | None = None  # of a mixture
         self._modes: tuple[TrackMode, ...] | None = ()  # None: not yet asked for
-        mean, cov = augmented(mean, cov, initial_extra_sd(config))
+        mean, cov = start_state(config, mean, cov)
         self.mean, self._cov_or_sqrt = mean.copy(), engine.to_cov_or_sqrt(cov, self._options)
         self._rows = 0
         self._make_room(4)
@@ -349,7 +349,7 @@ class ImmEstimate(GatedEstimate):
         self._motions = motions_of(config)
         count = len(self._motions)
         self._sojourn_s = np.full(count, config.sojourn_s)
-        mean, cov = augmented(mean, cov, initial_extra_sd(config))
+        mean, cov = start_state(config, mean, cov)
         self._prior = (mean, cov)
         means, covs = np.tile(mean, (count, 1)), np.tile(cov, (count, 1, 1))
         self._set_state((means, covs, np.full(count, 1.0 / count)))
@@ -415,7 +415,8 @@ class ImmEstimate(GatedEstimate):
 
 
 def start(config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> Estimate:
-    """Estimate of the configured kind from mean (6,) and covariance (6, 6) at ``stamp_ns``."""
+    """Estimate of the configured kind from mean and covariance at ``stamp_ns``, as ``start_state``
+    takes them."""
     if config.interacts:
         return ImmEstimate(config, stamp_ns, mean, cov)
     return KalmanEstimate(config, stamp_ns, mean, cov)

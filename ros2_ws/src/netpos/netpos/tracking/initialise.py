@@ -1,11 +1,11 @@
 """The first fix: the most probable state behind the first measurements, with the covariance it
 deserves.
 
-A maximum a posteriori fit of [x, y, vx, vy, clock, drift] at the newest stamp to all measurements
-of a short window: Gauss-Newton
-from several starts, under a prior as wide as the coverage of the RSUs, the initial speed and the
-clock allow. It takes any mixture of
-angles, times, ranges and fixes, and it waits while the measurements leave the position open.
+A maximum a posteriori fit of [x, y, vx, vy, clock, drift], and of the height where it is unknown,
+at the newest stamp to all measurements of a short window: Gauss-Newton from several starts, under
+a prior as wide as the coverage of the RSUs, the initial speed and the clock allow. It takes any
+mixture of angles, times, ranges and fixes, and it waits while the measurements leave the position
+open.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from netpos.estimation.measurement import (
     COMMON,
     GROUP,
     HEADING,
+    HEIGHT,
     KIND,
     LEVER,
     ORIGIN,
@@ -40,6 +41,7 @@ from netpos.estimation.measurement import (
 )
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.estimation.sensors.table import BY_KIND
+from netpos.estimation.state import N_CORE
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.rsus import Rsu
@@ -60,13 +62,13 @@ _CIRCLE = tuple(2.0 * math.pi * i / 12 for i in range(12))
 def _normal_equations(
     state: Array, ages_s: Array, rows: Array, height_m: float, prior: Array, prior_var: Array
 ) -> tuple[float, Array, Array]:
-    """Cost, gradient (6,) and Gauss-Newton Hessian (6, 6) of the fit at ``state``; ``ages_s`` <= 0
-    before its stamp."""
+    """Cost, gradient (n,) and Gauss-Newton Hessian (n, n) of the fit at ``state`` (n,); ``ages_s``
+    <= 0 before its stamp."""
     A = np.diag(1.0 / prior_var)
     difference = prior - state
     b = difference / prior_var
     cost = float((difference * b).sum())
-    h = np.zeros(6)
+    h = np.zeros(state.size)
     past = state.copy()
     for i in range(rows.shape[0]):
         age = ages_s[i]
@@ -82,9 +84,9 @@ def _normal_equations(
         h[5] += age * h[4]
         w = 1.0 / rows[i, VARIANCE]
         cost += w * residual * residual
-        for a in range(6):
+        for a in range(state.size):
             b[a] += w * residual * h[a]
-            for c in range(6):
+            for c in range(state.size):
                 A[a, c] += w * h[a] * h[c]
     return cost, b, A
 
@@ -131,13 +133,15 @@ class Initialiser:
         biases in each."""
         rows = rows.copy()
         rows[:, BIAS] = rows[:, COMMON] = rows[:, HEADING] = -1
+        rows[rows[:, HEIGHT] > 0, HEIGHT] = N_CORE
         self._window.append((stamp_ns, np.column_stack([rows, bias_var]), rsus))
         oldest = stamp_ns - int(self._config.initial_window_s * 1e9)
         while self._window[0][0] < oldest:
             self._window.popleft()
 
     def solve(self) -> tuple[Array, Array] | None:
-        """Mean (6,) and covariance (6, 6) at the newest stamp; None while the position is open.
+        """Mean (6,) and covariance (6, 6) at the newest stamp, the height of the device over its
+        mean as the seventh where it is unknown; None while the position is open.
 
         Where the measurements contradict each other and leaving out one of three or more RSUs
         makes them agree, the fix is that of the others.
@@ -189,7 +193,9 @@ class Initialiser:
             return 0.0
         var = var.copy()
         var[:2] += age_s**2 * var[2:4]
-        start = mean.copy()
+        var = np.append(var, problem[4][len(var) :])
+        start = mean = np.append(mean, problem[3][len(mean) :])
+        start = start.copy()
         start[4] = _clock_at(start, rows, self._config.device_height_m)
         cost = _solve(start, (*problem[:3], mean, var))[0]
         return max(0.0, cost - fits[0][0])
@@ -235,6 +241,9 @@ class Initialiser:
         sd = np.array([reach, reach, *([cfg.initial_speed_sd_mps] * 2)])
         clock_sd = c * np.array([cfg.clock_offset_sd_s, max(cfg.clock_drift_sd, 1e-15)])
         prior_var = np.concatenate([sd, np.maximum(clock_sd, 1e-6)]) ** 2
+        if cfg.device_height_sd_m > 0.0:
+            prior = np.append(prior, 0.0)
+            prior_var = np.append(prior_var, cfg.device_height_sd_m**2)
         return ages, _bias_inflated(rows), cfg.device_height_m, prior, prior_var
 
     def _fits(
@@ -263,7 +272,7 @@ class Initialiser:
         }
         for rsu in heard.values():
             dx, dy = state[:2] - rsu.info.position[:2]
-            dz = self._config.device_height_m - rsu.info.position[2]
+            dz = self._config.device_height_m + state[N_CORE:].sum() - rsu.info.position[2]
             near = dx * dx + dy * dy + dz * dz < _NEAREST_M**2
             if not rsu.in_front(dx, dy) or (near and tuple(rsu.info.position) not in ranged):
                 return False

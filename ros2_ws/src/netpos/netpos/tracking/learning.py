@@ -58,7 +58,8 @@ SCALE, SPREAD, RATE, RATE_PER_M = _grid()
 Name = tuple[str, str]
 Sums = tuple[float, ...]
 """Of the rows of a window: information, and that times residual and its derivatives by position
-and clock; number, residual and its square over the sd stated."""
+and clock; number, residual and its square over the sd stated; information times the derivative by
+height."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -241,7 +242,10 @@ class LearnedErrors:
         information = model.scale / row[2]
         i, r = information, row[0]
         sd = math.sqrt(stated)
-        new = (i, i * r, i * row[3], i * row[4], i * row[5], 1.0, r / sd, r * r / stated)
+        new = (
+            *(i, i * r, i * row[3], i * row[4], i * row[5]),
+            *(1.0, r / sd, r * r / stated, i * row[7]),
+        )
         old = self.window.get(name)
         self.window[name] = new if old is None else tuple(map(add, old, new))
         self.models[name] = model.heard(row[1] / stated)
@@ -259,6 +263,8 @@ class LearnedErrors:
         sums = np.array([window[name] for name in names])
         variance = 1.0 / sums[:, 0]
         r, H = sums[:, 1] * variance, sums[:, 2:5] * variance[:, None]
+        if sums[:, 8].any():  # an unknown height may explain a residual, too
+            H = np.column_stack([H, sums[:, 8] * variance])
         scatter = sums[:, 7] - sums[:, 6] ** 2 / sums[:, 5]
         models = [
             self.models[name].scattered(float(s), float(n) - 1.0)

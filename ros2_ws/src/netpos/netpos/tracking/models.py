@@ -10,9 +10,11 @@ from netpos.estimation.engine import GATE_SIZE, FilterOptions
 from netpos.estimation.forms.table import form_of, number_of
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS, Model, ProcessNoise, motion_parameters
 from netpos.estimation.motion.model import MotionModel
-from netpos.estimation.state import N_CORE, POSITION, X
+from netpos.estimation.state import N_CORE, POSITION, HeightState, X
 from netpos.messages.values import Array
 from netpos.tracking.config import ROBUST, TrackerConfig
+from netpos.tracking.learning import LearnedErrors
+from netpos.tracking.rsus import BiasStates
 
 
 def gate_thresholds(probability: float) -> Array:
@@ -97,6 +99,40 @@ def initial_extra_sd(config: TrackerConfig) -> Array:
     """Standard deviations of the motion models' own states at the first fix; their means are 0."""
     sds = [model.initial_sd(config) for model in config.motion_models]
     return np.array(max(sds, key=len, default=()), dtype=float)
+
+
+def height_state(config: TrackerConfig) -> HeightState:
+    """Where the state of a planar track has the height of the device."""
+    unknown = config.device_height_sd_m > 0.0
+    entry = N_CORE + initial_extra_sd(config).size if unknown else 0
+    return HeightState(entry, float(config.device_height_m))
+
+
+def slow_states(config: TrackerConfig, learned: LearnedErrors | None = None) -> BiasStates:
+    """The states of a new track that are first-order Gauss-Markov processes: the height of the
+    device where it is unknown; those of RSUs follow when they are heard."""
+    slow = BiasStates(N_CORE + initial_extra_sd(config).size, config.step_errors, learned)
+    if height_state(config).entry:
+        slow.sd = [float(config.device_height_sd_m)]
+        slow.tau_s = [float(config.device_height_time_s)]
+    return slow
+
+
+def start_state(config: TrackerConfig, mean: Array, cov: Array) -> tuple[Array, Array]:
+    """Mean and covariance that a filter starts from: core states (6,), (6, 6), to which the
+    motion model's own states and the height come; a height that was fitted with them is the
+    seventh. What has all of them stays as it is."""
+    height = height_state(config).entry
+    if not height:
+        return augmented(mean, cov, initial_extra_sd(config))
+    sd = np.append(initial_extra_sd(config), config.device_height_sd_m)
+    if mean.size in (N_CORE, N_CORE + sd.size):
+        return augmented(mean, cov, sd)
+    fitted = [*range(N_CORE), height]
+    start, start_cov = np.zeros(height + 1), np.diag(np.append(np.zeros(N_CORE), np.square(sd)))
+    start[fitted] = mean
+    start_cov[np.ix_(fitted, fitted)] = cov
+    return start, start_cov
 
 
 def pose_state(config: TrackerConfig, position: Array, position_cov: Array) -> tuple[Array, Array]:

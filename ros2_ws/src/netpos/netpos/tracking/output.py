@@ -10,12 +10,13 @@ from netpos.estimation.compile import leaf
 from netpos.estimation.factor import eigenvalues
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.estimation.protection import radius_of
-from netpos.estimation.state import POSITION, X
+from netpos.estimation.state import POSITION, HeightState, X
 from netpos.messages.values import Array, ClockState, Odometry, TrackState
 from netpos.tracking.config import TrackerConfig
 
 # What a planar tracker takes for granted and does not estimate: that the device is at the height
-# it was told, upright, and neither climbs nor tips nor (without a heading of its own) turns.
+# it was told (unless that is a state, ``with_height``), upright, and neither climbs nor tips nor
+# (without a heading of its own) turns.
 HEIGHT_SD_M, TILT_SD_RAD = 1.0, 0.2
 CLIMB_SD_MPS, TURN_SD_RADPS = 1.0, 1.0
 _YAW_VAR_MAX = math.pi**2 / 3.0  # of a heading about which nothing is known
@@ -176,6 +177,15 @@ def with_yaw_rate(odometry: Odometry, mean: Array, cov: Array, heading: int) -> 
     odometry.angular_velocity[2] = mean[rate]
     odometry.twist_cov[5, 5] = cov[rate, rate]
     odometry.pose_cov[:2, 5] = odometry.pose_cov[5, :2] = cov[POSITION, heading]
+    return odometry
+
+
+def with_height(odometry: Odometry, mean: Array, cov: Array, height: HeightState) -> Odometry:
+    """Odometry of a planar track whose state holds the height of the device."""
+    k = height.entry
+    odometry.position[2] = height.nominal_m + mean[k]
+    odometry.pose_cov[2, 2] = cov[k, k]
+    odometry.pose_cov[:2, 2] = odometry.pose_cov[2, :2] = cov[POSITION, k]
     return odometry
 
 

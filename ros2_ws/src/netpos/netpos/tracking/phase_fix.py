@@ -15,6 +15,7 @@ from netpos.estimation.measurement import (
     GATE_VARIANCE,
     GROUP,
     HEADING,
+    HEIGHT,
     KIND,
     LEVER,
     ORIGIN,
@@ -110,7 +111,27 @@ def _level_gradient(row: Array, state: Array, height_m: float, h: Array) -> None
     """Gradient of a row by the position, whatever biases and levers it has."""
     plain = row.copy()
     plain[BIAS] = plain[COMMON] = plain[HEADING] = -1.0
+    plain[HEIGHT] = 0.0
     predict_row(plain, state, height_m, h)
+
+
+@leaf
+def _by_height(phase: Array, point: Array, height_m: float) -> tuple[float, float]:
+    """Derivative of ``place`` by the height of the device, at ``point`` (2,): it moves along the
+    boresight."""
+    scale = phase_scale(phase)
+    ux, uy = phase[AXES] / scale, phase[AXES + 1] / scale
+    dz = height_m + phase[LEVER + 2] - phase[ORIGIN + 2]
+    ahead = (point[1] - phase[ORIGIN + 1]) * ux - (point[0] - phase[ORIGIN]) * uy
+    slope = dz / max(ahead, 1e-3)
+    return slope * uy, -slope * ux
+
+
+@leaf
+def _height_over(phase: Array, mean: Array) -> float:
+    """What the state mean (n,) says of the height over the nominal one; 0 where it is known."""
+    height = int(phase[HEIGHT])
+    return float(mean[height]) if height > 0 else 0.0
 
 
 @kernel
@@ -124,13 +145,14 @@ def init_hypothesis(
     height_m: float,
 ) -> float:
     """Put a device whose other states are those of mean (n,), cov (n, n) where range and phase
-    with ``turns`` say, in place, with an open velocity.
+    with ``turns`` say, in place, with an open velocity. An unknown height stays as it is.
 
     Returns the log of the area the fix leaves, its weight if the device may be anywhere; -inf,
     and nothing changed, where there is no such place.
     """
-    point, square = np.empty(2), np.empty((2, 2))
-    if not place(ranged, phase, turns, height_m, point, square):
+    point, square, height = np.empty(2), np.empty((2, 2)), int(phase[HEIGHT])
+    above_m = height_m + _height_over(phase, mean)
+    if not place(ranged, phase, turns, above_m, point, square):
         return -math.inf
     for i in range(X.CLOCK):  # position and velocity
         for j in range(mean.size):
@@ -141,17 +163,30 @@ def init_hypothesis(
         cov[v, v] = speed_sd * speed_sd
         for j in range(2):
             cov[i, j] = square[i, j]
-    return 0.5 * math.log(square[0, 0] * square[1, 1] - square[0, 1] * square[1, 0])
+    if height > 0:
+        by_height, var = _by_height(phase, point, above_m), cov[height, height]
+        for i in range(2):
+            cov[i, height] = cov[height, i] = by_height[i] * var
+            for j in range(2):
+                cov[i, j] += by_height[i] * by_height[j] * var
+    return 0.5 * math.log(cov[0, 0] * cov[1, 1] - cov[0, 1] * cov[1, 0])
 
 
 @kernel
-def to_fix(own: Array, at: int, height_m: float) -> bool:
+def to_fix(own: Array, at: int, mean: Array, height_m: float) -> bool:
     """Replace range and phase, rows ``at - 1`` and ``at``, by the position they give, as two
-    decorrelated LINEAR rows: a tangent would not reach round a circle. False where there is
+    decorrelated LINEAR rows: a tangent would not reach round a circle. Where the height is
+    unknown they hold how the position changes with it, at ``mean`` (n,). False where there is
     none."""
-    point, cov = np.empty(2), np.empty((2, 2))
-    if not place(own[at - 1], own[at], 0, height_m, point, cov):
+    point, cov, height = np.empty(2), np.empty((2, 2)), own[at, HEIGHT]
+    above = _height_over(own[at], mean)
+    if not place(own[at - 1], own[at], 0, height_m + above, point, cov):
         return False
+    by_height = (0.0, 0.0)
+    if height > 0.0:
+        by_height = _by_height(own[at], point, height_m + above)
+        point[0] -= by_height[0] * above
+        point[1] -= by_height[1] * above
     L = factor(cov)
     value = point[0] / L[0, 0]
     h00, h10, h11 = 1.0 / L[0, 0], -L[1, 0] / (L[0, 0] * L[1, 1]), 1.0 / L[1, 1]
@@ -162,7 +197,10 @@ def to_fix(own: Array, at: int, height_m: float) -> bool:
         row[KIND], row[GROUP] = _LINEAR, group
         row[VARIANCE] = row[GATE_VARIANCE] = 1.0
         row[BIAS] = row[COMMON] = row[HEADING] = -1.0
+        row[HEIGHT] = height
     own[at - 1, VALUE], own[at - 1, ORIGIN] = value, h00
     own[at, VALUE] = h10 * point[0] + h11 * point[1]
     own[at, ORIGIN], own[at, ORIGIN + 1] = h10, h11
+    own[at - 1, ORIGIN + N_CORE] = -h00 * by_height[0]
+    own[at, ORIGIN + N_CORE] = -h10 * by_height[0] - h11 * by_height[1]
     return True

@@ -14,7 +14,7 @@ from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import EpochRows
 from netpos.tracking.estimates import Estimate
-from netpos.tracking.models import by_sectors, heading_index, pose_state
+from netpos.tracking.models import by_sectors, heading_index, pose_state, start_state
 from netpos.tracking.phase_fix import TWO_PI, init_hypothesis, phase_scale
 from netpos.tracking.sectors import PhaseAmbiguityBank, phase_place
 from netpos.tracking.step_heading import choose_sector
@@ -75,7 +75,7 @@ class PhaseStart:
         self._epochs.append((stamp_ns, float(rows[at - 1, VALUE]), float(rows[at, VALUE])))
         if turns is None:
             return None
-        mean, cov = start
+        mean, cov = start_state(self.config, *start)
         speed, height = self.config.initial_speed_sd_mps, self.config.device_height_m
         if init_hypothesis(mean, cov, rows[at - 1], rows[at], turns, speed, height) == -math.inf:
             return None

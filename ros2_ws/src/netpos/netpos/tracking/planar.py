@@ -11,7 +11,7 @@ import numpy as np
 
 from netpos.estimation.measurement import VARIANCE
 from netpos.estimation.protection import FusedEpoch
-from netpos.estimation.state import N_CORE, POSITION, VELOCITY
+from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import (
     Array,
     InitialPose,
@@ -32,10 +32,17 @@ from netpos.tracking.fit import innovations_and_level, innovations_with_sd
 from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser, with_heading
 from netpos.tracking.learning import LearnedErrors
-from netpos.tracking.models import heading_index, initial_extra_sd, options_of, pose_state
+from netpos.tracking.models import (
+    heading_index,
+    height_state,
+    initial_extra_sd,
+    options_of,
+    pose_state,
+    slow_states,
+)
 from netpos.tracking.networks.secondary import OwnNoise, Secondary
 from netpos.tracking.phase_start import PhaseStart, corrections, with_sectors
-from netpos.tracking.rsus import BiasStates, Rsu
+from netpos.tracking.rsus import Rsu
 from netpos.tracking.shared_errors import SharedErrors
 from netpos.tracking.smoothing import Posterior, PosteriorRecorder
 from netpos.tracking.unnoticed import level_of_epochs
@@ -62,7 +69,8 @@ class PlanarEstimator(Estimator):
         shared: SharedErrors | None = None,
     ) -> None:
         self._heading = heading_index(config)
-        super().__init__(vue_id, config, rsus, planar_form(self._heading))
+        self._height = height_state(config)
+        super().__init__(vue_id, config, rsus, planar_form(self._heading, self._height))
         self.imu = ImuBuffer()
         self._shared, self._lives = shared, count(1)
         self._options, self._extra_sd = options_of(config), initial_extra_sd(config)
@@ -80,8 +88,8 @@ class PlanarEstimator(Estimator):
             else None
         )
         self.estimate = None
-        self.biases = BiasStates(N_CORE + self._extra_sd.size, config.step_errors, learned)
-        self.bias = np.zeros((2, 0))
+        self.biases = slow_states(config, learned)
+        self.bias = self.biases.arrays()
         self._initialiser = Initialiser(config)
         self._phase_start = PhaseStart(config)
         self._process_noise = AdaptiveProcessNoise(config)
@@ -283,6 +291,8 @@ class PlanarEstimator(Estimator):
             self._heading,
             config.integrity_risk,
         )
+        if self._height.entry:
+            output.with_height(odometry, estimate.mean, estimate.cov, self._height)
         return Description(odometry, clock, sd_m, radius_m)
 
     def step_calibration(self) -> StepCalibration | None:

@@ -185,7 +185,7 @@ def resolve(
         if parent >= 0:
             means[j], covs_or_sqrts[j] = old_means[parent], old_cov_or_sqrt[parent]
             if wide[parent] > 0.0:
-                to_fix(own, at, options.height_m)
+                to_fix(own, at, means[j], options.height_m)
             nis[j], used[j] = engine.update(
                 means[j], covs_or_sqrts[j], own, options, accepted[j], work
             )
@@ -269,7 +269,7 @@ def _fix_evidence(
     """Log likelihood of the rows with range and phase taken as the fix they give."""
     own = np.empty_like(rows)
     _unwrap(rows, at, turns, own)
-    if not to_fix(own, at, options.height_m):
+    if not to_fix(own, at, mean, options.height_m):
         return -math.inf
     innovation, G, E = regress(mean, L, own, options.height_m)
     S = innovation_cov(G, E, own[:, VARIANCE].copy())

@@ -16,7 +16,7 @@ from netpos.messages.values import Array, TrackMode
 from netpos.tracking import sector_bank
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimates import OneModel
-from netpos.tracking.models import augmented, initial_extra_sd, motions_of, options_of
+from netpos.tracking.models import augmented, motions_of, options_of, start_state
 from netpos.tracking.phase_fix import TWO_PI, init_hypothesis, phase_scale
 from netpos.tracking.sector_bank import Bank, BankResult
 
@@ -77,7 +77,7 @@ class PhaseAmbiguityBank(OneModel):
 
         The rest of the rows is applied to it; their variances have to hold their biases.
         """
-        mean, cov = augmented(*start, initial_extra_sd(config))
+        mean, cov = start_state(config, *start)
         bank = cls(config, stamp_ns, sectors_of(rows[at]), mean.size)
         speed, height = config.initial_speed_sd_mps, config.device_height_m
         half = bank._bank.weights.size // 2

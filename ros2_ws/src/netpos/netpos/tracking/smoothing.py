@@ -14,7 +14,7 @@ from netpos.messages.values import Array, Odometry
 from netpos.tracking import output
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimates import Estimate
-from netpos.tracking.models import augmented, heading_index, initial_extra_sd
+from netpos.tracking.models import augmented, heading_index, height_state, initial_extra_sd
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ class Smoother:
         self._vue_id = vue_id
         self._height_m = config.device_height_m
         self._extra_sd = initial_extra_sd(config)
-        self._heading = heading_index(config)
+        self._heading, self._height = heading_index(config), height_state(config)
         self._yaw = 0.0
 
     def interval(self, posteriors: Sequence[Posterior]) -> list[Odometry]:
@@ -101,6 +101,8 @@ class Smoother:
         )
         if self._heading >= 0:
             odometry = output.with_yaw_rate(odometry, mean, cov, self._heading)
+        if self._height.entry:
+            odometry = output.with_height(odometry, mean, cov, self._height)
         return odometry
 
 

@@ -31,7 +31,7 @@ def learned_of(errors: Array, stated_sd: float, rate_hz: int = 5) -> LearnedErro
         stamp_ns = k * 1_000_000_000 // rate_hz
         for name, error, side in zip(NAMES, row.tolist(), SIDES.tolist(), strict=True):
             variance = learned.models[name].scale * stated_sd**2
-            learned.hear(name, [error, error**2, variance, *side, 0.0], stated_sd**2)
+            learned.hear(name, [error, error**2, variance, *side, 0.0, 0.0, 0.0], stated_sd**2)
         learned.move(stamp_ns, 0.0)
         learned.conclude(stamp_ns)
     return learned
@@ -92,7 +92,7 @@ def test_nothing_is_learned_of_rsus_that_nobody_checks() -> None:
     before = {name: learned.models[name].bias_sd for name in NAMES[:2]}
     for k in range(500):
         for name, side in zip(NAMES[:2], SIDES.tolist(), strict=False):
-            learned.hear(name, [0.7, 0.49, 0.01, *side, 0.0], 0.01)
+            learned.hear(name, [0.7, 0.49, 0.01, *side, 0.0, 0.0, 0.0], 0.01)
         learned.conclude(k * 200_000_000)
     for name in NAMES[:2]:
         assert not learned.models[name].evidence.any()
@@ -116,7 +116,7 @@ def test_a_copy_goes_its_own_way() -> None:
     kept = {name: (m.bias_sd, m.scale) for name, m in twin.models.items()}
     for k, row in enumerate(errors[150:], start=150):
         for name, error, side in zip(NAMES, row.tolist(), SIDES.tolist(), strict=True):
-            learned.hear(name, [error, error**2, 0.01, *side, 0.0], 0.01)
+            learned.hear(name, [error, error**2, 0.01, *side, 0.0, 0.0, 0.0], 0.01)
         learned.conclude(k * 200_000_000)
     assert {name: (m.bias_sd, m.scale) for name, m in twin.models.items()} == kept
     assert any(learned.models[n].bias_sd != kept[n][0] for n in NAMES)

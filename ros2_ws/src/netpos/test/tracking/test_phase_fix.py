@@ -18,6 +18,7 @@ from netpos.estimation.measurement import (
     Kind,
     predict_row,
 )
+from netpos.estimation.measurement import HEIGHT as ROW_HEIGHT
 from netpos.estimation.rows import rsu_axes, rsu_rows
 from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
@@ -217,7 +218,7 @@ def test_a_fix_as_linear_rows_has_its_place_and_covariance() -> None:
     rows[1, VALUE] += 2 * math.pi * turns
     others = np.full((2, rows.shape[1]), 7.0)
     rows = np.vstack([others, rows])
-    assert to_fix(rows, 3, HEIGHT)
+    assert to_fix(rows, 3, np.zeros(6), HEIGHT)
     np.testing.assert_array_equal(rows[:2], others)
     rows = rows[2:]
     assert rows[:, KIND].tolist() == [Kind.LINEAR, Kind.LINEAR]
@@ -229,3 +230,60 @@ def test_a_fix_as_linear_rows_has_its_place_and_covariance() -> None:
     np.testing.assert_allclose(np.linalg.solve(H[:, :2], rows[:, VALUE]), xy, atol=1e-9)
     np.testing.assert_allclose(np.linalg.inv(H[:, :2].T @ H[:, :2]), cov, rtol=1e-9)
     np.testing.assert_array_equal(H[:, 2:], 0.0)
+
+
+def with_height(info: RsuInfo, xy: Array) -> tuple[Array, int]:
+    """``wrapped`` rows of a device whose height over ``HEIGHT`` is the state 6."""
+    rows, turns = wrapped(rows_of(info, xy))
+    rows[:, ROW_HEIGHT] = 6.0
+    return rows, turns
+
+
+def place_at(rows: Array, turns: int, height_m: float) -> Array:
+    point = np.empty(2)
+    assert place(rows[0], rows[1], turns, height_m, point, np.empty((2, 2)))
+    return point
+
+
+def by_height(rows: Array, turns: int, above_m: float) -> Array:
+    """Derivative of the place by height, by differences."""
+    at, eps = HEIGHT + above_m, 1e-5
+    change = place_at(rows, turns, at + eps) - place_at(rows, turns, at - eps)
+    slope: Array = change / (2.0 * eps)
+    return slope
+
+
+def test_a_hypothesis_moves_with_an_unknown_height() -> None:
+    info = anchor()
+    rows, turns = with_height(info, in_front(info, 4.0, 1.5))
+    mean, cov = np.zeros(7), np.eye(7)
+    mean[6], cov[6, 6] = 0.3, 0.25
+    area = init_hypothesis(mean, cov, rows[0], rows[1], turns, 1.5, HEIGHT)
+    own = np.empty((2, 2))
+    place(rows[0], rows[1], turns, HEIGHT + 0.3, np.empty(2), own)
+    slope = by_height(rows, turns, 0.3)
+    np.testing.assert_allclose(mean[:2], place_at(rows, turns, HEIGHT + 0.3), atol=1e-12)
+    assert (mean[6], cov[6, 6]) == (0.3, 0.25)
+    np.testing.assert_allclose(cov[:2, 6], 0.25 * slope, rtol=1e-6)
+    expected = own + 0.25 * np.outer(slope, slope)
+    np.testing.assert_allclose(cov[:2, :2], expected, rtol=1e-6)
+    assert area == pytest.approx(0.5 * math.log(np.linalg.det(expected)), rel=1e-6)
+
+
+def test_a_fix_holds_how_it_moves_with_the_height() -> None:
+    """Its rows, at another height: as if the place were found there, to first order."""
+    info = anchor()
+    rows, turns = with_height(info, in_front(info, 4.0, -1.0))
+    rows[1, VALUE] += 2.0 * math.pi * turns
+    slope, H = by_height(rows, 0, 0.3), np.empty((2, 7))
+    at, cov = place_at(rows, 0, HEIGHT + 0.3), np.empty((2, 2))
+    place(rows[0], rows[1], 0, HEIGHT + 0.3, np.empty(2), cov)
+    mean = np.array([*at, 0.0, 0.0, 0.0, 0.0, 0.3])
+    assert to_fix(rows, 1, mean, HEIGHT)
+    for above_m in (0.3, 0.5):
+        moved = np.array([*(at + (above_m - 0.3) * slope), 0.0, 0.0, 0.0, 0.0, above_m])
+        for row, h in zip(rows, H, strict=True):
+            assert row[VALUE] == pytest.approx(predict_row(row, moved, 99.0, h), rel=1e-9)
+    information = np.linalg.inv(cov)
+    np.testing.assert_allclose(H[:, :2].T @ H[:, :2], information, rtol=1e-9)
+    np.testing.assert_allclose(H[:, :2].T @ H[:, 6], -information @ slope, rtol=1e-6)

@@ -1,7 +1,8 @@
 """Position fixes, and other measurements that are linear in the state.
 
 LINEAR  H x of a planar filter, H (6,) of the core states in the first six entries of ORIGIN and
-        AXES; the position in it is that of the antenna
+        AXES, and where the row has a HEIGHT that of the height in the seventh; the position in it
+        is that of the antenna, its height over the nominal one of the device
 PLACE   u . a of a spatial filter, one axis at a time: u in ORIGIN, a the antenna (deng2022:eq.8)
 """
 
@@ -10,7 +11,7 @@ from __future__ import annotations
 from netpos.estimation.compile import leaf
 from netpos.estimation.sensors.geometry import turned_lever
 from netpos.estimation.sensors.model import Sensor
-from netpos.estimation.sensors.row import HEADING, ORIGIN
+from netpos.estimation.sensors.row import HEADING, HEIGHT, LEVER, ORIGIN
 from netpos.estimation.state import N_CORE, X
 from netpos.messages.values import Array
 
@@ -26,6 +27,10 @@ def linear(row: Array, mean: Array, h: Array) -> float:
         lx, ly = turned_lever(row, mean)
         value += h[X.PX] * lx + h[X.PY] * ly
         h[int(row[HEADING])] = h[X.PY] * lx - h[X.PX] * ly
+    height = int(row[HEIGHT])
+    if height > 0:
+        h[height] = row[ORIGIN + N_CORE]
+        value += h[height] * (mean[height] + row[LEVER + 2])
     return value
 
 

@@ -10,7 +10,8 @@ array a compiled kernel can take:
     ORIGIN 3 (RSU position, m), AXES 9 (rotation map -> RSU axes, row-major),
     HEADING (state index of the device's heading, or -1), LEVER 3 (of the antenna in the device, m;
     forward and left count only where there is a heading), BLOCKED (probability that the path was
-    blocked; 0: the option's)
+    blocked; 0: the option's), HEIGHT (state index of the device's height over the nominal one; 0:
+    the height is known)
 
 A sensor may keep other figures in ORIGIN and AXES; its module says which.
 """
@@ -22,8 +23,8 @@ from netpos.messages.values import Array
 
 KIND, VALUE, VARIANCE, GATE_VARIANCE, BIAS, COMMON, GROUP, ORIGIN = range(8)
 AXES = 10
-HEADING, LEVER, BLOCKED = 19, 20, 23
-ROW_WIDTH = 24
+HEADING, LEVER, BLOCKED, HEIGHT = 19, 20, 23, 24
+ROW_WIDTH = 25
 
 
 @inlined

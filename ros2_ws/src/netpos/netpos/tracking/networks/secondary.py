@@ -17,7 +17,7 @@ from netpos.estimation.motion import Parameter, add_velocity_step, transition
 from netpos.messages.values import Array, NetworkTrack
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimates import Estimate
-from netpos.tracking.models import options_of
+from netpos.tracking.models import height_state, options_of
 from netpos.tracking.networks.common_instant import TRACK_STATES
 
 _PLANAR = TRACK_STATES[:4]
@@ -49,7 +49,7 @@ class Secondary:
     def __init__(self, vue_id: str, config: TrackerConfig) -> None:
         self._vue_id = vue_id
         self._config = config
-        self._options = options_of(config)
+        self._options, self._height = options_of(config), height_state(config)
         self._accelerates = any(model.states == ("AX", "AY") for model in config.motion_models)
 
     def after(
@@ -90,6 +90,7 @@ class Secondary:
         A motion model without acceleration knows it as 0 with ``accel_state_sd_mps2``.
         """
         share = None if own is None else own.at(estimate, bias)
+        k, height_m = self._height
         return NetworkTrack(
             stamp_ns=estimate.stamp_ns,
             network=self._config.network,
@@ -98,7 +99,7 @@ class Secondary:
             mean=self._mean(estimate.mean),
             cov=self._matrix(estimate.cov, self._config.accel_state_sd_mps2**2),
             own_cov=np.zeros((6, 6)) if share is None else self._matrix(share, 0.0),
-            height_m=self._config.device_height_m,
+            height_m=height_m + estimate.mean.item(k) if k else height_m,
         )
 
     def _mean(self, mean: Array) -> Array:

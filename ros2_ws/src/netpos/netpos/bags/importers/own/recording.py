@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +59,7 @@ class Truth:
                 f"{self.source} has latitudes: say with --truth-origin LATITUDE,LONGITUDE,HEIGHT "
                 "where the origin of map is, or move it there with --truth-align shift or rigid"
             )
-        poses = poses_of(found, skipped)
+        poses = replace(poses_of(found, skipped), has_height=columns.has_height)
         return local(poses, self.origin) if columns.on_earth else poses
 
 

@@ -14,7 +14,7 @@ from netpos.bags.importers.common import truth_of_poses
 from netpos.bags.importers.own.columns import ANGLE, CLOCK_NS, LENGTH, pairs, time_ns
 from netpos.bags.importers.own.records import Record, Skipped, number, problem
 from netpos.common.parameters import nearest
-from netpos.messages.values import Array, Odometry
+from netpos.messages.values import UNKNOWN_HEIGHT_VAR, Array, Odometry
 from netpos.world.geodesy import Datum
 
 Stamps = NDArray[np.int64]
@@ -82,6 +82,11 @@ class TruthColumns:
         return bool(set(_ON_EARTH) & set(self.sources))
 
     @property
+    def has_height(self) -> bool:
+        """Whether there is a third coordinate."""
+        return self._place[2] in self.sources
+
+    @property
     def _place(self) -> tuple[str, str, str]:
         return _ON_EARTH if self.on_earth else _PLACE
 
@@ -131,10 +136,12 @@ class TruthColumns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
-    """stamps_ns (n,) increasing, values (n, 4): x y z m, yaw rad (NaN where not known)."""
+    """stamps_ns (n,) increasing, values (n, 4): x y z m, yaw rad (NaN where not known); where
+    there is no height, z is 0 and its variance says so."""
 
     stamps_ns: Stamps
     values: Array
+    has_height: bool = True
 
     def shifted(self, offset_ns: int) -> Poses:
         """The same poses, later by ``offset_ns``."""
@@ -153,7 +160,11 @@ class Poses:
         values = self.values.copy()
         if not np.isfinite(values[:, 3]).all():
             values[:, 3] = _course(self.stamps_ns, values[:, :2])
-        return truth_of_poses(self.stamps_ns.tolist(), values, vue_id)
+        truth = truth_of_poses(self.stamps_ns.tolist(), values, vue_id)
+        if not self.has_height:
+            for pose in truth:
+                pose.pose_cov[2, 2] = UNKNOWN_HEIGHT_VAR
+        return truth
 
 
 def poses_of(found: Iterable[Pose | None], skipped: Skipped) -> Poses:
