@@ -43,6 +43,15 @@ Recent = tuple[tuple[int, EpochRows], ...]
 """Stamps and rows of the newest epochs that fitted, oldest first."""
 
 
+class Past(NamedTuple):
+    """What came before an epoch: seconds since the last accepted measurement, epochs in a row that
+    did not fit, and the newest that did."""
+
+    unheard_s: float
+    rejected_in_row: int
+    recent: Recent
+
+
 class FirstFix(NamedTuple):
     """Whether there is a first fix now, and whether it knows the clock. ``refused``: why the
     measurements of the epoch count as rejected; empty: they do not."""
@@ -233,19 +242,8 @@ class Estimator(ABC):
         """Move the estimate to ``stamp_ns``; nothing happens to one that is there already."""
 
     @abstractmethod
-    def update(
-        self,
-        stamp_ns: int,
-        epoch_rows: EpochRows,
-        unheard_s: float,
-        rejected_in_row: int,
-        recent: Recent,
-    ) -> UpdateResult:
-        """Move the estimate to ``stamp_ns``, gate the groups of rows and fuse those that pass.
-
-        unheard_s : time since the last accepted measurement; rejected_in_row : epochs in a row
-        that did not fit; recent : epochs before this one
-        """
+    def update(self, stamp_ns: int, epoch_rows: EpochRows, past: Past) -> UpdateResult:
+        """Move the estimate to ``stamp_ns``, gate the groups of rows and fuse those that pass."""
 
     def learn(
         self, stamp_ns: int, rows: Array, accepted: Sequence[float]

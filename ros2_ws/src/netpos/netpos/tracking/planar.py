@@ -27,7 +27,14 @@ from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import EpochRows, Source, planar_form
 from netpos.tracking.estimates import Estimate, KalmanEstimate
-from netpos.tracking.estimator import Description, Estimator, FirstFix, Recent, UpdateResult
+from netpos.tracking.estimator import (
+    Description,
+    Estimator,
+    FirstFix,
+    Past,
+    Recent,
+    UpdateResult,
+)
 from netpos.tracking.fit import innovations_and_level, innovations_with_sd
 from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser, with_heading
@@ -208,19 +215,12 @@ class PlanarEstimator(Estimator):
                 estimate.set_process_noise(density)
         return estimate
 
-    def update(
-        self,
-        stamp_ns: int,
-        epoch_rows: EpochRows,
-        unheard_s: float,
-        rejected_in_row: int,
-        recent: Recent,
-    ) -> UpdateResult:
-        rows = epoch_rows.rows
+    def update(self, stamp_ns: int, epoch_rows: EpochRows, past: Past) -> UpdateResult:
+        rows, unheard_s = epoch_rows.rows, past.unheard_s
         self.estimate = with_sectors(self._config, self.estimate, rows)
         estimate = self._prepared(stamp_ns, epoch_rows.items)
         was_ambiguous = bool(estimate.modes)
-        nis, dof, flags = estimate.step(stamp_ns, unheard_s, rejected_in_row, rows, self.bias)
+        nis, dof, flags = estimate.step(stamp_ns, unheard_s, past.rejected_in_row, rows, self.bias)
         if self._secondary is not None:
             self._own = self._secondary.after(self._own, stamp_ns, estimate, rows, self.bias)
         corrected = corrections(estimate)
@@ -228,17 +228,10 @@ class PlanarEstimator(Estimator):
         breaks = corrected + (bool(estimate.modes) != was_ambiguous)
         innovations = np.empty((len(rows), 2))
         fused = FusedEpoch(*estimate.prior, rows, flags, unheard_s, estimate.mean)
-        undetected_m = self._undetected_m(fused, innovations, stamp_ns, recent)
-        return UpdateResult(
-            nis,
-            dof,
-            flags.tolist(),
-            innovations,
-            undetected_m,
-            not math.isnan(undetected_m),
-            breaks,
-            corrected,
-        )
+        undetected_m = self._undetected_m(fused, innovations, stamp_ns, past.recent)
+        sound, accepted = not math.isnan(undetected_m), flags.tolist()
+        fit = nis, dof, accepted, innovations
+        return UpdateResult(*fit, undetected_m, sound, breaks, corrected)
 
     def _undetected_m(
         self, fused: FusedEpoch, innovations: Array, stamp_ns: int, recent: Recent

@@ -117,14 +117,14 @@ def track_status(
 def waiting_output(
     config: TrackerConfig,
     vue_id: str,
-    stamp_ns: int,
+    epoch: EpochResult,
     accepted: int,
     rejected: dict[str, int],
     missing: str,
 ) -> TrackOutput:
-    """What is told of a device without an estimate, for want of ``missing``."""
+    """What is told after an ``epoch`` without an estimate, for want of ``missing``."""
     open_ = EstimateStatus(missing=missing)
-    status = track_status(config, vue_id, EpochResult(stamp_ns), accepted, dict(rejected), open_)
+    status = track_status(config, vue_id, epoch, accepted, rejected, open_)
     return TrackOutput(None, None, status, network=config.network)
 
 

@@ -49,6 +49,7 @@ from netpos.tracking.estimator import (
     Description,
     Estimator,
     FirstFix,
+    Past,
     Recent,
     UpdateResult,
 )
@@ -268,14 +269,7 @@ class SpatialEstimator(Estimator):
     def _sensors_now(self) -> Sensors:
         return self._sensors._replace(slow=self._sensors.slow._replace(biases=self.bias))
 
-    def update(
-        self,
-        stamp_ns: int,
-        epoch_rows: EpochRows,
-        unheard_s: float,
-        rejected_in_row: int,
-        recent: Recent,
-    ) -> UpdateResult:
+    def update(self, stamp_ns: int, epoch_rows: EpochRows, past: Past) -> UpdateResult:
         self.predict(stamp_ns)
         self._grow()
         estimate, rows = self._there(), epoch_rows.rows

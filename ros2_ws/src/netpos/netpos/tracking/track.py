@@ -22,7 +22,7 @@ from netpos.messages.values import (
 )
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import EpochRows, Source, mostly_accepted, velocity_inflation
-from netpos.tracking.estimator import RECENT, Estimator, ImuInput, UpdateResult
+from netpos.tracking.estimator import RECENT, Estimator, ImuInput, Past, UpdateResult
 from netpos.tracking.fit import fits, observe_excluded, with_refused, without_excluded
 from netpos.tracking.health import RsuHealth
 from netpos.tracking.history import History, merge
@@ -103,9 +103,11 @@ class Track:
 
     def waiting(self, stamp_ns: int, missing: str) -> TrackOutput:
         """What is told while there is no estimate, for want of ``missing``."""
-        return waiting_output(
-            self._config, self._vue_id, stamp_ns, self._state.accepted, self.rejected, missing
-        )
+        return self._waiting(EpochResult(stamp_ns), missing)
+
+    def _waiting(self, epoch: EpochResult, missing: str) -> TrackOutput:
+        state, rejected = self._state, total(self.refused, self._state.rejected)
+        return waiting_output(self._config, self._vue_id, epoch, state.accepted, rejected, missing)
 
     def reset(self) -> None:
         """Forget the estimate and start anew; the counts of accepted and rejected measurements go
@@ -271,10 +273,9 @@ class Track:
     def _update(self, stamp_ns: int, epoch_rows: EpochRows) -> EpochResult:
         state = self._state
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
+        past = Past(unheard_s, state.rejected_in_row, state.recent)
         state.nlos_rate.expect(epoch_rows)
-        result = state.estimator.update(
-            stamp_ns, epoch_rows, unheard_s, state.rejected_in_row, state.recent
-        )
+        result = state.estimator.update(stamp_ns, epoch_rows, past)
         state.nlos_rate.learn(epoch_rows)
         self._count(result)
         if not result.sound:
@@ -361,11 +362,9 @@ class Track:
     def _report(self, epoch: EpochResult, estimator: Estimator) -> TrackOutput:
         """What is told after an ``epoch``, at which the ``estimator`` is."""
         state, config = self._state, self._config
-        rejected = total(self.refused, state.rejected)
         if estimator.estimate is None:
-            open_ = EstimateStatus(missing=self._missing())
-            status = track_status(config, self._vue_id, epoch, state.accepted, rejected, open_)
-            return TrackOutput(None, None, status, network=config.network)
+            return self._waiting(epoch, self._missing())
+        rejected = total(self.refused, state.rejected)
         described = estimator.describe(epoch.stamp_ns)
         known = EstimateStatus(
             heard_ns=state.last_accepted_ns,

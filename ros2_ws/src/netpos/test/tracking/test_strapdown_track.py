@@ -279,6 +279,18 @@ def test_a_pose_that_the_measurements_permit_starts_anew(
     assert np.abs(errors(simulation, outputs)[-1]).max() < 4.0
 
 
+def test_an_unsound_estimate_ends_the_track(simulation: Simulation, items: list[Item]) -> None:
+    """At 15 s the estimate is made faster than light; nothing of it is published."""
+    tracker = tracker_of(simulation)
+    late = simulation.scenario.start_ns + 15 * NS
+    outputs = run(tracker, [item for item in items if item.stamp_ns <= late])
+    tracker._tracks[VUE]._state.estimator.estimate.nav[3] = 1e9
+    outputs += run(tracker, [item for item in items if item.stamp_ns > late])
+    assert outputs[-1].status.rejected["diverged"] == 1
+    assert np.abs(errors(simulation, outputs)).max() < 10.0
+    assert outputs[-1].odometry is not None
+
+
 def test_a_track_of_a_network_names_it(simulation: Simulation, items: list[Item]) -> None:
     tracker = tracker_of(simulation, network="one", trust="any")
     for rsu in simulation.rsus:
