@@ -165,6 +165,27 @@ class _Chunk:
         return b"".join(self._parts)
 
 
+class _Packed:
+    """The index of a chunk as the bytes of its record: a recording has four of them each second,
+    and keeps them to its end."""
+
+    __slots__ = ("_record",)
+
+    def __init__(self, index: Any) -> None:
+        records = RecordBuilder()
+        index.write(records)
+        self._record = records.end()
+
+    def write(self, records: Any) -> None:
+        """As mcap's ChunkIndex."""
+        records.write(self._record)
+
+
+class _PackedList(list[_Packed]):
+    def append(self, index: Any) -> None:
+        super().append(_Packed(index))
+
+
 class FastWriter(Writer):  # type: ignore[misc]  # mcap has no types
     """mcap's Writer; a chunk is written when it exceeds ``chunk_size`` bytes."""
 
@@ -174,6 +195,7 @@ class FastWriter(Writer):  # type: ignore[misc]  # mcap has no types
         self._statistics = self._Writer__statistics
         self._chunk = _Chunk(self._statistics)
         self._Writer__chunk_builder = self._chunk
+        self._Writer__chunk_indices = _PackedList()
 
     def add_message(
         self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0

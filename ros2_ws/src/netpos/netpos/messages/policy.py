@@ -24,6 +24,13 @@ _PARAMETER_SERVICES = (
     "set_parameters_atomically",
     "get_type_description",
 )
+_LIFECYCLE_SERVICES = (
+    "change_state",
+    "get_state",
+    "get_available_states",
+    "get_available_transitions",
+    "get_transition_graph",
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +73,11 @@ _OF_NETWORKS = (
     topics.tracks_of(ANY),
     *(topics.of_vue(ANY, name, ANY) for name in topics.TRACKER_OUTPUTS),
 )
-_TRACKER = "ekf_tracker*"
+_TRACKER, _FUSION = "ekf_tracker*", "track_fusion"
+_OF_TRACKER = tuple(
+    f"/{_TRACKER}/{name}" for name in ("reset", "enable", "accept_rsus", *_LIFECYCLE_SERVICES)
+)
+_OF_FUSION = tuple(f"/{_FUSION}/{name}" for name in ("reset", "enable", *_LIFECYCLE_SERVICES))
 
 ENCLAVES: dict[str, Rights] = {
     "/netpos/simulator": Rights(
@@ -106,19 +117,26 @@ ENCLAVES: dict[str, Rights] = {
             topics.RSU_LEARNED,
             topics.RUN_ESTIMATOR,
             topics.TF,
+            f"/{_TRACKER}/transition_event",
         ),
         subscribe=(
             topics.RSU_INFO,
             topics.RSU_MEASUREMENTS,
             *_device(topics.IMU, topics.STEP_VELOCITY, topics.GROUND_SPEED, topics.INITIAL_POSE),
         ),
-        reply=tuple(f"/{_TRACKER}/{name}" for name in ("reset", "enable", "accept_rsus")),
+        reply=_OF_TRACKER,
     ),
     "/netpos/fusion": Rights(
-        node="track_fusion",
-        publish=(*_OUTPUTS, topics.DIAGNOSTICS, topics.RUN_ESTIMATOR, topics.TF),
+        node=_FUSION,
+        publish=(
+            *_OUTPUTS,
+            topics.DIAGNOSTICS,
+            topics.RUN_ESTIMATOR,
+            topics.TF,
+            f"/{_FUSION}/transition_event",
+        ),
         subscribe=(topics.tracks_of(ANY),),
-        reply=("/track_fusion/reset", "/track_fusion/enable"),
+        reply=_OF_FUSION,
     ),
     "/netpos/recorder": Rights(
         node="netpos_record", publish=(topics.DIAGNOSTICS,), subscribe=("/*",)
@@ -133,11 +151,7 @@ ENCLAVES: dict[str, Rights] = {
         node="operator",
         publish=_device(topics.INITIAL_POSE),
         subscribe=("/*",),
-        request=(
-            *(f"/{_TRACKER}/{name}" for name in ("reset", "enable", "accept_rsus")),
-            "/track_fusion/reset",
-            "/track_fusion/enable",
-        ),
+        request=(*_OF_TRACKER, *_OF_FUSION),
     ),
 }
 """Rights by enclave."""

@@ -138,3 +138,17 @@ def test_an_index_that_does_not_fit_is_damage(tmp_path: Path, damage: str) -> No
     file.write_bytes(data)
     with BagReader(file) as reader, pytest.raises(BagError, match="netpos recover"):
         list(reader.messages())
+
+
+def test_the_index_of_a_chunk_is_kept_in_few_bytes(tmp_path: Path) -> None:
+    """Of ten topics, 160 bytes in the file: what a day of recording keeps in memory."""
+    with BagWriter(tmp_path / "run") as bag:
+        for k in range(50):
+            for topic in range(10):
+                bag.write(f"/clock_{topic}", codec().clock_to_msg(k), k)
+            bag.flush()
+        kept = bag._mcap._Writer__chunk_indices
+        assert len(kept) == 50
+        assert max(len(index._record) for index in kept) < 200
+    with BagReader(tmp_path / "run") as bag_read:
+        assert sum(1 for _ in bag_read.messages(["/clock_3"])) == 50
