@@ -320,9 +320,9 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
             raise ValueError(
                 f"motion_model {self.motion_model} takes filter {extended}, not {self.filter!r}"
             )
-        if self.device_height_sd_m > 0.0 and self.motion_model == "rigid_body":
+        if self.device_height_sd_m > 0.0 and any(m.heading >= 0 for m in self.motion_models):
             raise ValueError(
-                "motion_model rigid_body needs a known height, got device_height_sd_m"
+                f"motion_model {self.motion_model} needs a known height, got device_height_sd_m"
                 f" {self.device_height_sd_m:g}; set it to 0 or take another motion model"
             )
         if self.is_linear and self.calibrates_steps:
