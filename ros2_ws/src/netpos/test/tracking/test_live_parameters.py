@@ -130,7 +130,6 @@ def test_late_measurements_are_applied_again_with_it(
         ({}, {"hold_s": 0.5}, "hold_s cannot change"),
         ({}, {"filter": "ukf", "max_devices": 3}, "filter cannot change"),
         ({"motion_model": "interacting"}, {"gate_probability": 0.9}, "gate_probability cannot"),
-        ({"backend": "filterpy", "filter": "ekf"}, {"coast_after_s": 2.0}, "coast_after_s cannot"),
     ],
 )
 def test_others_are_refused_and_nothing_changes(
