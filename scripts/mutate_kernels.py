@@ -70,7 +70,7 @@ TESTS_OF = {
     },
     "engine": "test_engine_parts.py test_engine.py -knot+equals_the_tracker",
     "tracking/fit": "test_protection.py -kinnovations_and_level+or+is_not_sound",
-    "tracking/initialise": "test_initialise.py test_initialise_fit.py",
+    "window": "../tracking/test_initialise_fit.py",
     "tracking/output": "test_output.py",
     "tracking/phase_fix": "test_phase_fix.py",
     "protection": "test_protection.py",

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from netpos.estimation import engine
-from netpos.estimation.components import Dynamics, run_epochs
+from netpos.estimation.components import Dynamics, moments, run_epochs
 from netpos.estimation.engine import Run
 from netpos.estimation.measurement import BIAS
 from netpos.estimation.report import run_levels
@@ -214,9 +214,9 @@ class Follower:
             bias_var = variance[np.where(index < 0, -1, index - self.first_bias)]
             heard = tuple(self._rsus[i] for i in epochs.rsu[k] if i >= 0)
             initialiser.add(int(epochs.stamps_ns[k]), rows, bias_var, heard)
-            solution = initialiser.solve()
-            if solution is not None:
-                return k, *solution
+            fix = initialiser.solve()
+            if fix is not None:
+                return k, *moments(fix)
         return None
 
 

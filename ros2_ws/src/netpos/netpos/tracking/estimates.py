@@ -21,7 +21,7 @@ from netpos.estimation.protection import mixture_radius
 from netpos.estimation.state import N_CORE, X
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.models import augmented, motions_of, options_of, start_state
+from netpos.tracking.models import augmented, carries_modes, motions_of, options_of, start_state
 
 
 class Estimate(Protocol):
@@ -177,14 +177,15 @@ class KalmanEstimate(OneModel):
         held: float = mixture_radius(self._components, self.mean, risk)
         return max(level_m, held)
 
+    def split(self, mixture: Mixture) -> None:
+        """Go on with the components of a first fix, each with all states of the filter."""
+        self._set(mixture)
+
     def augment(self, sd: Array) -> None:
         if self.mean.size >= N_CORE + sd.size:
             return
         if self._components is not None:
-            means, covs, log_weights = self._components
-            pairs = [augmented(mean, cov, sd) for mean, cov in zip(means, covs, strict=True)]
-            larger = np.array([mean for mean, _ in pairs]), np.array([cov for _, cov in pairs])
-            self._set(Mixture(*larger, log_weights))
+            self._set(_augmented(self._components, sd))
         else:
             mean, cov = augmented(self.mean, self.cov, sd)
             self.mean, self._cov_or_sqrt = mean, engine.to_cov_or_sqrt(cov, self._options)
@@ -250,6 +251,13 @@ class KalmanEstimate(OneModel):
         twin.mean, twin._cov_or_sqrt = self.mean.copy(), self._cov_or_sqrt.copy()
         twin._motion = self._motion.copy()
         return twin
+
+
+def _augmented(mixture: Mixture, sd: Array) -> Mixture:
+    """Every component with the last entries of ``sd`` appended."""
+    pairs = [augmented(m, c, sd) for m, c in zip(mixture.means, mixture.covs, strict=True)]
+    means, covs = np.array([mean for mean, _ in pairs]), np.array([cov for _, cov in pairs])
+    return Mixture(means, covs, mixture.log_weights)
 
 
 def change_prior(mean: Array, cov: Array, index: int, before: float, after: float) -> None:
@@ -420,3 +428,15 @@ def start(config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> Esti
     if config.interacts:
         return ImmEstimate(config, stamp_ns, mean, cov)
     return KalmanEstimate(config, stamp_ns, mean, cov)
+
+
+def start_from(config: TrackerConfig, stamp_ns: int, mixture: Mixture) -> Estimate:
+    """As ``start``, from the components of a first fix; from their moments where the estimate is
+    one Gaussian."""
+    estimate = start(config, stamp_ns, *moments(mixture))
+    if isinstance(estimate, KalmanEstimate) and carries_modes(config):
+        pairs = zip(mixture.means, mixture.covs, strict=True)
+        states = [start_state(config, mean, cov) for mean, cov in pairs]
+        means, covs = np.array([mean for mean, _ in states]), np.array([cov for _, cov in states])
+        estimate.split(Mixture(means, covs, mixture.log_weights))
+    return estimate

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from netpos.common.least_squares import minimise
 from netpos.estimation.chi_square import chi_square_bound
-from netpos.estimation.compile import kernel
 from netpos.estimation.fit import map_cost
 from netpos.estimation.fusion import workspace
 from netpos.estimation.iteration import iterate_from
@@ -35,21 +36,24 @@ from netpos.estimation.measurement import (
     VALUE,
     VARIANCE,
     Kind,
-    is_cyclic,
-    predict_row,
     wrap,
 )
+from netpos.estimation.mixture import RING_MERGE_COST, Mixture, mode_of, reduced
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
+from netpos.estimation.ridge import Fit, components_of, inverse
 from netpos.estimation.sensors.table import BY_KIND
 from netpos.estimation.state import N_CORE
+from netpos.estimation.window import normal_equations
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.models import carries_modes
 from netpos.tracking.rsus import Rsu
 
 _REFINED = 12
 _ATTEMPT_NS = 100_000_000
-# A second solution this much worse in cost (chi-square 0.99, 2 dof) does not count as a rival.
-_RIVAL_COST = 9.21
+# Odds of another heading this much worse in cost (chi-square 0.99, 2 dof) rule it out; places that
+# cannot be told apart are waited for from the same share on, and carried along below it.
+_RIVAL_COST, _RIVAL_SHARE = 9.21, 0.01
 _CONTRADICTS = 9.0  # mean squared residual over variance
 _NEAREST_M = 1.0
 _HEADINGS = 16
@@ -58,56 +62,46 @@ _RAY_M = (2.0, 6.0, 15.0, 40.0, 100.0)
 _CIRCLE = tuple(2.0 * math.pi * i / 12 for i in range(12))
 
 
-@kernel
-def _normal_equations(
-    state: Array, ages_s: Array, rows: Array, height_m: float, prior: Array, prior_var: Array
-) -> tuple[float, Array, Array]:
-    """Cost, gradient (n,) and Gauss-Newton Hessian (n, n) of the fit at ``state`` (n,); ``ages_s``
-    <= 0 before its stamp."""
-    A = np.diag(1.0 / prior_var)
-    difference = prior - state
-    b = difference / prior_var
-    cost = float((difference * b).sum())
-    h = np.zeros(state.size)
-    past = state.copy()
-    for i in range(rows.shape[0]):
-        age = ages_s[i]
-        past[:] = state
-        past[0] += state[2] * age
-        past[1] += state[3] * age
-        past[4] += state[5] * age
-        residual = rows[i, VALUE] - predict_row(rows[i], past, height_m, h)
-        if is_cyclic(rows[i]):
-            residual = wrap(residual)
-        h[2] += age * h[0]
-        h[3] += age * h[1]
-        h[5] += age * h[4]
-        w = 1.0 / rows[i, VARIANCE]
-        cost += w * residual * residual
-        for a in range(state.size):
-            b[a] += w * residual * h[a]
-            for c in range(state.size):
-                A[a, c] += w * h[a] * h[c]
-    return cost, b, A
+Problem = tuple[Array, Array, float, Array, Array]
+"""What ``normal_equations`` takes after the state."""
 
 
-def _solve(
-    state: Array, problem: tuple[Array, Array, float, Array, Array]
-) -> tuple[float, Array, Array]:
+class _Solution(NamedTuple):
+    """A problem and its minima, best first."""
+
+    problem: Problem
+    fits: list[Fit]
+
+    def mixture(self, misfit: float, is_possible: Callable[[Array], bool]) -> Mixture:
+        """The posterior; a ``misfit`` above 1 enlarges all variances."""
+
+        def equations(state: Array) -> tuple[float, Array, Array]:
+            cost, b, A = normal_equations(state, *self.problem)
+            return cost / misfit, b / misfit, A / misfit
+
+        fits = [(cost / misfit, mean, cov * misfit) for cost, mean, cov in self.fits]
+        return components_of(equations, fits, is_possible)
+
+
+def joined(mixtures: Sequence[Mixture]) -> Mixture:
+    """Several mixtures as one, normalised; what is alike is merged."""
+    every = Mixture(*(np.concatenate(parts) for parts in zip(*mixtures, strict=True)))
+    reduced_: Mixture = reduced(every, RING_MERGE_COST)
+    return reduced_
+
+
+def has_modes(mixture: Mixture, share: float) -> bool:
+    """Whether more than one mode carries more than ``share``."""
+    sums = np.bincount(mode_of(mixture), np.exp(mixture.log_weights))
+    return bool((sums > share).sum() > 1)
+
+
+def _solve(state: Array, problem: Problem) -> Fit:
     """Levenberg-Marquardt from one start: cost, state, covariance of the fit."""
     cost, state, A = minimise(
-        lambda x: _normal_equations(x, *problem), state, lambda A, b: _inverse(A) @ b
+        lambda x: normal_equations(x, *problem), state, lambda A, b: inverse(A) @ b
     )
-    return cost, state, _inverse(A)
-
-
-def _inverse(A: Array) -> Array:
-    """Inverse of a positive definite matrix whose units differ by many orders of magnitude."""
-    scale = 1.0 / np.sqrt(np.diag(A))
-    scaling = np.outer(scale, scale)
-    # 1e-14 is rounding: it keeps inv from calling singular what is only ill-conditioned.
-    inverse: Array = np.linalg.inv(A * scaling + 1e-14 * np.eye(len(A))) * scaling
-    return inverse
+    return cost, state, inverse(A)
 
 
 class Initialiser:
@@ -139,9 +133,11 @@ class Initialiser:
         while self._window[0][0] < oldest:
             self._window.popleft()
 
-    def solve(self) -> tuple[Array, Array] | None:
-        """Mean (6,) and covariance (6, 6) at the newest stamp, the height of the device over its
-        mean as the seventh where it is unknown; None while the position is open.
+    def solve(self) -> Mixture | None:
+        """State (6,) at the newest stamp, the height of the device over its mean as the seventh
+        where it is unknown, as a mixture: a place that is a thin arc is a row of components, and
+        places that cannot be told apart are modes. None while the position is open, or for most
+        of the window while there are several modes.
 
         Where the measurements contradict each other and leaving out one of three or more RSUs
         makes them agree, the fix is that of the others.
@@ -151,13 +147,14 @@ class Initialiser:
             return None
         self._next_attempt_ns = newest + _ATTEMPT_NS
         rows, ages = self._stacked()
-        fits = self._fits(rows, self._problem(rows, ages))
+        solutions = [self._solution(rows, ages)]
+        fits = solutions[0].fits
         if fits and not self._consistent(fits[0], len(rows)):
-            fits = self._without_one(rows, ages) or fits
+            solutions = self._without_one(rows, ages) or solutions
         if not fits:
             self.missing = f"no place in front of the RSUs fits {self._heard(rows)}"
             return None
-        cost, mean, cov = fits[0]
+        cost, _, cov = solutions[0].fits[0]
         misfit = max(1.0, cost / max(len(rows), 1))
         sd_m = math.sqrt(float(np.linalg.eigvalsh(cov[:2, :2])[-1]))
         limit_m = self._config.initial_position_sd_max_m
@@ -173,11 +170,13 @@ class Initialiser:
                 " they in m, rad and s, and the RSUs where RsuInfo says?"
             )
             return None
+        mixture = joined([s.mixture(misfit, self._plausible) for s in solutions])
         waited_s = (newest - self._window[0][0]) * 1e-9
-        if waited_s < 0.8 * self._config.initial_window_s and _has_rival(fits):
+        waits = waited_s < 0.8 * self._config.initial_window_s or not carries_modes(self._config)
+        if waits and has_modes(mixture, _RIVAL_SHARE):
             self.missing = f"more than one place fits {self._heard(rows)}; waiting for more"
             return None
-        return mean, cov * misfit
+        return mixture
 
     def excess_cost(self, stamp_ns: int, mean: Array, var: Array) -> float:
         """How much worse the window fits where the device is at ``mean`` (6,), with variances
@@ -213,24 +212,31 @@ class Initialiser:
         rsus = sorted({rsu.info.rsu_id for entry in self._window for rsu in entry[2]})
         return f"{', '.join(kinds)} of {', '.join(rsus) or 'no RSU'}"
 
-    def _consistent(self, fit: tuple[float, Array, Array], rows: int) -> bool:
+    def _consistent(self, fit: Fit, rows: int) -> bool:
         """Whether the cost of a fit is one that true measurements have."""
         return bool(fit[0] <= chi_square_bound(rows, 1.0 - self._config.gate_probability))
 
-    def _without_one(self, rows: Array, ages: Array) -> list[tuple[float, Array, Array]]:
-        """Consistent fits without one of the RSUs, best first; none of fewer than three RSUs."""
-        fits = []
+    def _solution(self, rows: Array, ages: Array) -> _Solution:
+        problem = self._problem(rows, ages)
+        return _Solution(problem, self._fits(rows, problem))
+
+    def _without_one(self, rows: Array, ages: Array) -> list[_Solution]:
+        """Solutions with a consistent fit without one of the RSUs, best first; none of fewer than
+        three RSUs."""
         placed = ~np.isin(rows[:, KIND], (Kind.LINEAR, Kind.SPEED))
         origins = np.unique(rows[placed, ORIGIN:AXES], axis=0)
         if len(origins) < 3:
             return []
+        solutions = []
         for origin in origins:
             keep = ~placed | (rows[:, ORIGIN:AXES] != origin).any(axis=1)
-            rest = self._fits(rows[keep], self._problem(rows[keep], ages[keep]))
-            fits += [fit for fit in rest if self._consistent(fit, int(keep.sum()))]
-        return sorted(fits, key=lambda fit: fit[0])
+            problem, fits = self._solution(rows[keep], ages[keep])
+            fits = [fit for fit in fits if self._consistent(fit, int(keep.sum()))]
+            if fits:
+                solutions.append(_Solution(problem, fits))
+        return sorted(solutions, key=lambda solution: solution.fits[0][0])
 
-    def _problem(self, rows: Array, ages: Array) -> tuple[Array, Array, float, Array, Array]:
+    def _problem(self, rows: Array, ages: Array) -> Problem:
         cfg = self._config
         c = SPEED_OF_LIGHT_MPS
         origins = np.array([r.info.position[:2] for e in self._window for r in e[2]])
@@ -246,16 +252,14 @@ class Initialiser:
             prior_var = np.append(prior_var, cfg.device_height_sd_m**2)
         return ages, _bias_inflated(rows), cfg.device_height_m, prior, prior_var
 
-    def _fits(
-        self, rows: Array, problem: tuple[Array, Array, float, Array, Array]
-    ) -> list[tuple[float, Array, Array]]:
+    def _fits(self, rows: Array, problem: Problem) -> list[Fit]:
         """Solutions from the most promising starts, best first."""
         scored: list[tuple[float, int, Array]] = []
         for xy in _starts(rows, problem[3][:2]):
             state = problem[3].copy()
             state[:2] = xy
             state[4] = _clock_at(state, rows, self._config.device_height_m)
-            scored.append((_normal_equations(state, *problem)[0], len(scored), state))
+            scored.append((normal_equations(state, *problem)[0], len(scored), state))
         fits = [_solve(state, problem) for _, _, state in sorted(scored)[:_REFINED]]
         fits = [fit for fit in fits if _is_sound(fit) and self._plausible(fit[1])]
         return sorted(fits, key=lambda fit: fit[0])
@@ -312,21 +316,10 @@ def with_heading(
     return x, P
 
 
-def _is_sound(fit: tuple[float, Array, Array]) -> bool:
+def _is_sound(fit: Fit) -> bool:
     """Whether the fit is finite and its position covariance survived rounding."""
     cost, _, cov = fit
     return bool(math.isfinite(cost) and np.linalg.eigvalsh(cov[:2, :2])[0] > 0.0)
-
-
-def _has_rival(fits: list[tuple[float, Array, Array]]) -> bool:
-    """Whether another solution, elsewhere, explains the measurements about as well as the best."""
-    best_cost, best, best_cov = fits[0]
-    for cost, mean, cov in fits[1:]:
-        apart = mean[:2] - best[:2]
-        distance2 = float(apart @ np.linalg.solve((cov + best_cov)[:2, :2], apart))
-        if cost - best_cost < _RIVAL_COST and distance2 > _RIVAL_COST:
-            return True
-    return False
 
 
 def _bias_inflated(rows: Array) -> Array:

@@ -89,6 +89,12 @@ def heading_index(config: TrackerConfig) -> int:
     return models[0].heading if len(models) == 1 else -1
 
 
+def carries_modes(config: TrackerConfig) -> bool:
+    """Whether an estimate may start as a mixture; others are one Gaussian, or merge what differs
+    in heading only."""
+    return not config.interacts and config.motion_model != "rigid_body"
+
+
 def by_sectors(config: TrackerConfig) -> bool:
     """Whether phase differences are resolved by a bank of filters."""
     single = len(config.motion_models) == 1 and heading_index(config) < 0

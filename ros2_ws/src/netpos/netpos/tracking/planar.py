@@ -9,6 +9,7 @@ from typing import Self
 
 import numpy as np
 
+from netpos.estimation.components import moments, one_component
 from netpos.estimation.measurement import VARIANCE
 from netpos.estimation.protection import FusedEpoch
 from netpos.estimation.state import POSITION, VELOCITY
@@ -160,21 +161,23 @@ class PlanarEstimator(Estimator):
         if self._phase_start.heard(epoch_rows):
             self.estimate = self._phase_start.add(stamp_ns, epoch_rows.rows, bias_var)
             return FirstFix(self.estimate is not None)
-        solution = self._pose_at(stamp_ns)
-        if solution is None:
+        pose = self._pose_at(stamp_ns)
+        if pose is None:
             heard = self.heard(epoch_rows)
             self._initialiser.add(stamp_ns, epoch_rows.rows, bias_var, heard)
-            solution = self._initialiser.solve()
-        if solution is None:
+        fix = one_component(*pose) if pose is not None else self._initialiser.solve()
+        if fix is None:
             return FirstFix(False)
         if self._heading >= 0:
             rows = epoch_rows.rows.copy()
             rows[:, VARIANCE] += bias_var
-            solution = with_heading(*solution, rows, self._config.device_height_m)
-            if solution is None:
+            mean, cov = moments(fix)
+            turned = with_heading(mean, cov, rows, self._config.device_height_m)
+            if turned is None:
                 self._initialiser.missing = _OPEN_HEADING
                 return FirstFix(False, refused="heading_open")
-        self.estimate = estimates.start(self._config, stamp_ns, *solution)
+            fix = one_component(*turned)
+        self.estimate = estimates.start_from(self._config, stamp_ns, fix)
         return FirstFix(True, epoch_rows.has_time)
 
     def _pose_at(self, stamp_ns: int) -> tuple[Array, Array] | None:

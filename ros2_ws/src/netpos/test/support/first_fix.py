@@ -65,7 +65,19 @@ def solve(
     initialiser = Initialiser(config)
     rows = np.vstack([measure(s, state, fields, rng, group=i) for i, s in enumerate(stations)])
     initialiser.add(T0, rows, np.zeros(len(rows)), tuple(stations))
-    return initialiser.solve()
+    return fix_of(initialiser)
+
+
+def fix_of(initialiser: Initialiser) -> tuple[Array, Array] | None:
+    """Mean (6,) and covariance (6, 6) of a first fix."""
+    fix = initialiser.solve()
+    if fix is None:
+        return None
+    weights = np.exp(fix.log_weights)
+    mean = weights @ fix.means
+    away = fix.means - mean
+    spread = np.einsum("k,ki,kj->ij", weights, away, away)
+    return mean, np.einsum("k,kij->ij", weights, fix.covs) + spread
 
 
 def at(x: float, y: float, clock: float = 0.0) -> Array:

@@ -119,6 +119,7 @@ def _config(start: Start, motion: Motion, **values: Any) -> dict[str, Any]:
         "hold_s": 0.0,
         "accel_density_mps2_sqrthz": motion.accel,
         "initial_speed_sd_mps": start.velocity_sd,
+        "manoeuvre_speed_sd_mps": 0.0,
     }
     return {**shared, **values}
 

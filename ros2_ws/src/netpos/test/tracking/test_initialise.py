@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from first_fix import at, measure, rsu, solve
+from first_fix import at, fix_of, measure, rsu, solve
 from netpos.estimation.rows import linear_rows, speed_row
 from netpos.messages.values import AngleConvention, Array, Field
 from netpos.tracking.config import TrackerConfig
@@ -21,12 +21,27 @@ from track_cases import KNOWN_CLOCK, T0
 
 @pytest.mark.parametrize("target", [(20.0, 30.0), (-40.0, 20.0), (55.0, -25.0), (10.0, 3.0)])
 def test_two_directions(target: tuple[float, float]) -> None:
+    """Mean and covariance of the posterior, summed on a grid: more of a wedge lies far away."""
     config = TrackerConfig(initial_position_sd_max_m=20.0)
-    solution = solve(config, [rsu(0, 0), rsu(30, 5, 70)], at(*target), Field.AZIMUTH)
+    stations = [rsu(0, 0), rsu(30, 5, 70)]
+    solution = solve(config, stations, at(*target), Field.AZIMUTH)
     assert solution is not None
     mean, cov = solution
-    # the 150 m prior around the RSUs pulls by a few cm
-    assert math.hypot(*(mean[:2] - target)) < 0.1 * math.sqrt(cov[0, 0] + cov[1, 1])
+    axis = np.linspace(-60.0, 60.0, 1201)
+    xy = np.stack(np.meshgrid(axis + target[0], axis + target[1], indexing="ij"))
+    log = -0.5 * ((xy - np.array([15.0, 2.5])[:, None, None]) ** 2).sum(axis=0) / 150.0**2
+    for station in stations:
+        x, y = station.info.position[:2]
+        off = np.arctan2(xy[1] - y, xy[0] - x) - math.atan2(target[1] - y, target[0] - x)
+        log -= 0.5 * (np.remainder(off + math.pi, 2.0 * math.pi) - math.pi) ** 2 / 0.02**2
+    weight = np.exp(log - log.max())
+    weight /= weight.sum()
+    expected = np.einsum("ij,kij->k", weight, xy)
+    away = xy - expected[:, None, None]
+    expected_cov = np.einsum("ij,kij,lij->kl", weight, away, away)
+    error = mean[:2] - expected
+    assert math.sqrt(error @ np.linalg.solve(expected_cov, error) / 2.0) < 0.15
+    assert np.trace(cov[:2, :2]) == pytest.approx(np.trace(expected_cov), rel=0.15)
 
 
 @pytest.mark.parametrize("target", [(20.0, 30.0), (-40.0, -10.0), (-3.0, 25.0)])
@@ -87,7 +102,7 @@ def test_a_fix_far_from_the_origin_needs_no_rsu_nearby() -> None:
     initialiser = Initialiser(config)
     rows = linear_rows(np.array([3e5, -2e5]), np.eye(2), np.eye(2, 6), 0)
     initialiser.add(T0, rows, np.zeros(2), ())
-    solution = initialiser.solve()
+    solution = fix_of(initialiser)
     assert solution is not None
     np.testing.assert_allclose(solution[0][:2], [3e5, -2e5], atol=1e-3)
     np.testing.assert_allclose(solution[1][:2, :2], np.eye(2), rtol=1e-3, atol=1e-6)
@@ -151,7 +166,7 @@ def test_motion_within_the_window_is_part_of_the_fit() -> None:
     rows_of_last = Initialiser(TrackerConfig(initial_window_s=2.0))
     for stamp, rows, rsus in initialiser._window:
         rows_of_last.add(stamp, rows[:, :-1], rows[:, -1], rsus)
-    solution = rows_of_last.solve()
+    solution = fix_of(rows_of_last)
     assert solution is not None
     np.testing.assert_allclose(solution[0][:4], oracle.x, atol=1e-3)
     cov = np.linalg.inv(oracle.jac.T @ oracle.jac) * max(1.0, 2 * oracle.cost / len(observed))
@@ -168,7 +183,7 @@ def test_clock_drift_within_the_window_is_part_of_the_fit() -> None:
         state = at(15.0, 12.0, 4000.0 + 9000.0 * age)
         rows = np.vstack([measure(s, state, Field.TOA) for s in stations])
         initialiser.add(T0 + k * 100_000_000, rows, np.zeros(3), tuple(stations))
-        solution = initialiser.solve() if k == 10 else None
+        solution = fix_of(initialiser) if k == 10 else None
     assert solution is not None
     mean, cov = solution
     np.testing.assert_allclose(mean[:2], [15.0, 12.0], atol=0.1)
@@ -208,6 +223,6 @@ def test_a_fit_on_top_of_an_rsu_is_refused() -> None:
         rows.append(row)
     initialiser = Initialiser(config)
     initialiser.add(T0, np.vstack(rows), np.zeros(3), tuple(high))
-    solution = initialiser.solve()
+    solution = fix_of(initialiser)
     assert solution is not None
     np.testing.assert_allclose(solution[0][:2], [0.0, 0.5], atol=0.1)

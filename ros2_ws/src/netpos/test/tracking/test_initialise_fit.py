@@ -6,21 +6,22 @@ import math
 
 import numpy as np
 import pytest
-from first_fix import at, measure, rsu, solve
+from first_fix import at, fix_of, measure, rsu, solve
 from netpos.estimation.measurement import Kind, linearise
+from netpos.estimation.mixture import Mixture
+from netpos.estimation.ridge import inverse as inverse_of
 from netpos.estimation.rows import speed_row
+from netpos.estimation.window import normal_equations
 from netpos.messages.values import AngleConvention, Array, Field
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.initialise import (
     Initialiser,
     _bias_inflated,
     _clock_at,
-    _has_rival,
-    _inverse,
     _is_sound,
-    _normal_equations,
     _solve,
     _starts,
+    has_modes,
 )
 from netpos.tracking.rsus import Rsu
 from scipy.stats import chi2
@@ -61,7 +62,7 @@ def test_cost_gradient_and_curvature_of_the_fit() -> None:
     rng = np.random.default_rng(2)
     for _ in range(5):
         state = np.array([-12.0, 0.5, 3.0, -2.0, 500.0, 40.0]) + rng.normal(size=6)
-        cost, half_gradient, hessian = _normal_equations(state, *problem)
+        cost, half_gradient, hessian = normal_equations(state, *problem)
         assert cost == pytest.approx(cost_of(state, problem), rel=1e-10)
         numeric = np.empty(6)
         for i, e in enumerate(np.eye(6) * 1e-5):
@@ -89,7 +90,7 @@ def test_the_solver_ends_in_a_minimum_from_anywhere(seed: int) -> None:
     start = np.array([*rng.uniform(-60, 60, 2), 0, 0, 0, 0])
     cost, state, cov = _solve(start, problem)
     assert cost <= cost_of(start, problem)
-    _, half_gradient, hessian = _normal_equations(state, *problem)
+    _, half_gradient, hessian = normal_equations(state, *problem)
     # in units of the sd of the solution
     assert math.sqrt(half_gradient @ np.linalg.solve(hessian, half_gradient)) < 0.02
     np.testing.assert_allclose(cov @ hessian, np.eye(6), atol=1e-8)
@@ -102,7 +103,7 @@ def test_a_step_uphill_is_tried_again_shorter(start: tuple[float, float]) -> Non
     rows = np.vstack([measure(s, at(25.0, 18.0), Field.AZIMUTH) for s in stations])
     prior_var = np.array([150.0**2, 150.0**2, 25.0, 25.0, 1e4, 1e4])
     problem = (np.zeros(2), rows, 0.0, np.array([13.0, 13.0, 0, 0, 0, 0]), prior_var)
-    cost, b, A = _normal_equations(at(*start), *problem)
+    cost, b, A = normal_equations(at(*start), *problem)
     first = at(*start) + np.linalg.solve(A + 1e-3 * np.diag(np.diag(A)), b)
     assert cost_of(first, problem) > cost
     end, state, _ = _solve(at(*start), problem)
@@ -152,20 +153,18 @@ def test_clock_start_is_the_weighted_mean_of_what_the_times_leave() -> None:
 
 
 @pytest.mark.parametrize(
-    ("cost", "apart", "rival"),
+    ("share", "apart", "several"),
     [
-        (9.2, 10.0, True),
-        (9.22, 10.0, False),  # explains the measurements worse by more than chi-square 0.99
-        (1.0, 4.2, False),  # 4.2^2 / 2 = 8.8: the same solution
-        (1.0, 4.4, True),  # 9.7
+        (0.011, 10.0, True),
+        (0.009, 10.0, False),  # too improbable to be waited for
+        (0.4, 4.2, False),  # 4.2 sd of 1.4 m each: the same place
+        (0.4, 4.3, True),
     ],
 )
-def test_a_rival_is_elsewhere_and_about_as_good(cost: float, apart: float, rival: bool) -> None:
-    fits = [(0.0, np.zeros(6), np.eye(6)), (0.5, np.zeros(6), np.eye(6))]
-    assert not _has_rival(fits)
-    assert _has_rival([fits[0], (cost, at(0.0, apart), np.eye(6))]) is rival
-    fits.append((cost, at(0.0, apart), np.eye(6)))
-    assert _has_rival(fits) is rival
+def test_a_mode_is_elsewhere_and_probable(share: float, apart: float, several: bool) -> None:
+    means = np.array([at(0.0, 0.0), at(0.0, apart)])
+    mixture = Mixture(means, np.tile(np.eye(6), (2, 1, 1)), np.log([1.0 - share, share]))
+    assert has_modes(mixture, 0.01) is several
 
 
 def test_bias_variance_counts_once_per_row_of_the_sensor() -> None:
@@ -192,7 +191,7 @@ def test_inverse_of_units_that_differ_by_many_orders() -> None:
     rng = np.random.default_rng(1)
     B = rng.normal(size=(6, 6))
     C, sd = B @ B.T + np.eye(6), 10.0 ** np.array([9.0, -9.0, 0.0, 6.0, -6.0, 3.0])
-    inverse = _inverse(C * np.outer(sd, sd)) * np.outer(sd, sd)
+    inverse = inverse_of(C * np.outer(sd, sd)) * np.outer(sd, sd)
     np.testing.assert_allclose(inverse, np.linalg.inv(C), rtol=1e-9, atol=1e-11)
 
 
@@ -220,17 +219,22 @@ def test_attempts_are_at_least_a_tenth_of_a_second_apart() -> None:
 
 
 def test_an_ambiguity_is_waited_for_most_of_the_window_only() -> None:
+    """Two anchors: then both mirror images are modes, one as probable as the other."""
     config = TrackerConfig(initial_window_s=2.0)
     initialiser = Initialiser(config)
+    single = Initialiser(TrackerConfig(initial_window_s=2.0, motion_model="interacting"))
     stations = [rsu(0, 0), rsu(40, 0)]
-    for ms in range(0, 2000, 100):
+    for ms in range(0, 1700, 100):
         rows = np.vstack([measure(s, at(12, 25), Field.RANGE, range_sd=0.3) for s in stations])
         initialiser.add(T0 + ms * 1_000_000, rows, np.zeros(2), tuple(stations))
-        solution = initialiser.solve()
-        assert (solution is None) is (ms < 1600)
-        if solution is not None:
-            assert abs(solution[0][1]) == pytest.approx(25.0, abs=0.2)  # one of the two
-            break
+        single.add(T0 + ms * 1_000_000, rows, np.zeros(2), tuple(stations))
+        fix = initialiser.solve()
+        assert (fix is None) is (ms < 1600)
+        assert single.solve() is None  # one Gaussian cannot be at two places
+    assert fix is not None
+    above, weights = fix.means[:, 1] > 0.0, np.exp(fix.log_weights)
+    np.testing.assert_allclose(abs(fix.means[:, 1]), 25.0, atol=0.2)
+    assert weights[above].sum() == pytest.approx(0.5, abs=1e-6)
 
 
 def test_covariance_is_consistent_over_many_seeds() -> None:
@@ -261,12 +265,13 @@ def test_inconsistent_measurements_widen_the_covariance() -> None:
     for values in (good, bad):
         initialiser = Initialiser(TrackerConfig(initial_position_sd_max_m=50.0))
         initialiser.add(T0, values, np.zeros(4), tuple(stations))
-        solution = initialiser.solve()
+        solution = fix_of(initialiser)
         assert solution is not None
         results.append(solution)
     sds = [math.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]) for _, cov in results]
     assert sds[1] > 3.0 * sds[0]
-    for limit, found in ((0.99 * sds[1], False), (1.01 * sds[1], True)):
+    # The limit is for the best place alone, of which the other minima are part in the mixture.
+    for limit, found in ((0.9 * sds[1], False), (1.01 * sds[1], True)):
         strict = Initialiser(TrackerConfig(initial_position_sd_max_m=limit))
         strict.add(T0, bad, np.zeros(4), tuple(stations))
         assert (strict.solve() is not None) is found
@@ -284,7 +289,7 @@ def test_the_one_of_four_that_contradicts_the_others_is_left_out(liar: int) -> N
     rows[2 * liar + 1, 1] += 30.0
     full = Initialiser(TrackerConfig(initial_position_sd_max_m=50.0))
     full.add(T0, rows, np.zeros(8), tuple(stations))
-    solution = full.solve()
+    solution = fix_of(full)
     assert solution is not None
     np.testing.assert_allclose(solution[0][:2], [20.0, 21.0], atol=0.02)
     information = np.eye(2) / 150.0**2
@@ -314,7 +319,7 @@ def test_averaging_never_beats_the_bias() -> None:
     wide = Initialiser(TrackerConfig(initial_speed_sd_mps=1e-3))
     for stamp, rows, rsus in biased._window:
         wide.add(stamp, rows[:, :-1], rows[:, -1], rsus)
-    solution = wide.solve()
+    solution = fix_of(wide)
     assert solution is not None
     H = np.array([(np.array([15.0, 15.0]) - s.info.position[:2]) for s in stations])
     H /= np.linalg.norm(H, axis=1)[:, None]
@@ -329,7 +334,7 @@ def test_bias_columns_do_not_reach_outside_the_six_states() -> None:
     rows[:, 4], rows[:, 5] = 6, 7
     initialiser = Initialiser(TrackerConfig())
     initialiser.add(T0, rows, np.zeros(3), tuple(stations))
-    solution = initialiser.solve()
+    solution = fix_of(initialiser)
     assert solution is not None
     np.testing.assert_allclose(solution[0][:2], 15.0, atol=0.02)
     assert set(rows[:, 4]) == {6.0}
