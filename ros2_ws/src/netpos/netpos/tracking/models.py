@@ -92,7 +92,7 @@ def heading_index(config: TrackerConfig) -> int:
 def carries_modes(config: TrackerConfig) -> bool:
     """Whether an estimate may start as a mixture; others are one Gaussian, or merge what differs
     in heading only."""
-    return not config.interacts and config.motion_model != "rigid_body"
+    return not config.interacts and heading_index(config) < 0
 
 
 def by_sectors(config: TrackerConfig) -> bool:
