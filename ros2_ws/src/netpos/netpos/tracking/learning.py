@@ -4,12 +4,14 @@ Per RSU and quantity there are three unknowns: how far values scatter, how large
 and how long, or how far, it lasts. What is declared is their prior. Every second the residuals of
 all RSUs are compared: what a shift of the position and of the clock explains is taken out of them,
 
-    r = H d + b + n,   y = (r - H d^) / sqrt(1 - leverage),
+    r = h(x + d) - h(x) + b + n,   y = (r - h(x + d^) + h(x)) / sqrt(1 - leverage),
 
-so that y scatters as b + n does (studentised residuals, Cook and Weisberg 1982) and neither the
-motion model nor what the track believes of the position is in it. A grid of candidates (scale of
-the variance, sd of the bias, rates at which it is forgotten per second and per metre of way) is
-weighed by the likelihood of y, each candidate by a Kalman filter of its own for b. The scale of
+with d^ of least squares (``netpos.tracking.shift``), so that y scatters as b + n does (studentised
+residuals, Cook and Weisberg 1982) and neither the motion model nor what the track believes of the
+position is in it: a track that is wrong must not take its own error for that of the RSUs. A grid
+of candidates (scale of the variance, sd of the bias, rates at which it is forgotten per second and
+per metre of way) is weighed by the likelihood of y, each candidate by a Kalman filter of its own
+for b. All errors have Student tails, here and in the update (``TrackerConfig.tail``). The scale of
 single values, for the gate, is learned apart (variational Bayes, Särkkä and Nummenmaa 2009).
 """
 
@@ -23,6 +25,7 @@ from typing import Protocol
 import numpy as np
 
 from netpos.messages.values import Array
+from netpos.tracking.shift import unshifted
 
 CORRELATION_S = 0.2
 _WINDOW_NS = 1_000_000_000
@@ -39,7 +42,8 @@ _LOG_SCALE_SD = 1.4
 _LOG_SPREAD_SD = 1.1
 _LOG_TIME_SD = 1.5
 _MEMORY = 300.0  # windows
-_TAIL = 5.0  # degrees of freedom of a window
+TAIL = 5.0
+"""Degrees of freedom of the errors, in windows and in the update."""
 _GATE_STRENGTH, _GATE_MEMORY = 20.0, 1000.0  # values
 _WITHIN_STRENGTH, _WITHIN_MEMORY = 5.0, 1000.0  # values
 _GAUSSIAN = 0.72  # of a variance: what the tail's distribution makes of a Gaussian's
@@ -57,9 +61,8 @@ SCALE, SPREAD, RATE, RATE_PER_M = _grid()
 
 Name = tuple[str, str]
 Sums = tuple[float, ...]
-"""Of the rows of a window: information, and that times residual and its derivatives by position
-and clock; number, residual and its square over the sd stated; information times the derivative by
-height."""
+"""Of the rows of a window: information, and that times residual; number, residual and its square
+over the sd stated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,9 +168,9 @@ class ErrorModel:
         v = SCALE * variance
         S = var + v
         d2 = (y - mean) ** 2 / (_GAUSSIAN * S)
-        log_likelihood = -0.5 * np.log(S) - 0.5 * (_TAIL + 1.0) * np.log1p(d2 / _TAIL)
+        log_likelihood = -0.5 * np.log(S) - 0.5 * (TAIL + 1.0) * np.log1p(d2 / TAIL)
         log_likelihood -= log_likelihood.max()
-        weight = np.minimum((_TAIL + 1.0) / (_TAIL + d2), 1.0)
+        weight = np.minimum((TAIL + 1.0) / (TAIL + d2), 1.0)
         gain = var / (var + v / (weight * share))
         return replace(
             self,
@@ -204,10 +207,17 @@ class LearnedErrors:
     moved_ns: int = -1
     window_ns: int = -1
     window: dict[Name, Sums] = field(default_factory=dict)
+    newest: dict[Name, Array] = field(default_factory=dict)
+    """The last row (ROW_WIDTH,) of each in the window."""
 
     def copy(self) -> LearnedErrors:
         """An independent copy."""
-        return replace(self, models=self.models.copy(), window=self.window.copy())
+        return replace(
+            self,
+            models=self.models.copy(),
+            window=self.window.copy(),
+            newest=self.newest.copy(),
+        )
 
     def model(
         self, name: Name, noise_sd: float, bias_sd: float, time_s: float, stamp_ns: int = 0
@@ -236,50 +246,43 @@ class LearnedErrors:
             self.moved_m += speed_mps * (stamp_ns - self.moved_ns) * 1e-9
         self.moved_ns = stamp_ns
 
-    def hear(self, name: Name, row: list[float], stated: float) -> None:
-        """Note a row of ``unexplained``, and the variance stated."""
+    def hear(self, name: Name, row: Array, left: list[float], stated: float) -> None:
+        """Note a row (ROW_WIDTH,), what is left of it by ``unexplained``, and the variance
+        stated."""
         model = self.models[name]
-        information = model.scale / row[2]
-        i, r = information, row[0]
+        information, r = model.scale / left[2], left[0]
         sd = math.sqrt(stated)
-        new = (
-            *(i, i * r, i * row[3], i * row[4], i * row[5]),
-            *(1.0, r / sd, r * r / stated, i * row[7]),
-        )
+        new = (information, information * r, 1.0, r / sd, r * r / stated)
         old = self.window.get(name)
         self.window[name] = new if old is None else tuple(map(add, old, new))
-        self.models[name] = model.heard(row[1] / stated)
+        self.newest[name] = row
+        self.models[name] = model.heard(left[1] / stated)
 
-    def conclude(self, stamp_ns: int) -> list[Name]:
-        """Weigh a window that is over; whose models changed."""
+    def conclude(self, stamp_ns: int, mean: Array, height_m: float) -> list[Name]:
+        """Weigh a window that is over, seen from the mean (n,) of the posterior; whose models
+        changed."""
         if self.window_ns < 0:
             self.window_ns = stamp_ns
         if stamp_ns < self.window_ns + _WINDOW_NS:
             return []
-        names, window = list(self.window), self.window
-        self.window, self.window_ns = {}, stamp_ns
+        names, window, newest = list(self.window), self.window, self.newest
+        self.window, self.newest, self.window_ns = {}, {}, stamp_ns
         if not names:
             return []
         sums = np.array([window[name] for name in names])
         variance = 1.0 / sums[:, 0]
-        r, H = sums[:, 1] * variance, sums[:, 2:5] * variance[:, None]
-        if sums[:, 8].any():  # an unknown height may explain a residual, too
-            H = np.column_stack([H, sums[:, 8] * variance])
-        scatter = sums[:, 7] - sums[:, 6] ** 2 / sums[:, 5]
+        scatter = sums[:, 4] - sums[:, 3] ** 2 / sums[:, 2]
         models = [
             self.models[name].scattered(float(s), float(n) - 1.0)
-            for name, s, n in zip(names, scatter, sums[:, 5], strict=True)
+            for name, s, n in zip(names, scatter, sums[:, 2], strict=True)
         ]
-        V = np.array([m.scale * v + m.bias_sd**2 for m, v in zip(models, variance, strict=True)])
-        A = H / np.sqrt(V)[:, None]
-        U, size, _ = np.linalg.svd(A, full_matrices=False)
-        U = U[:, size > 1e-6 * max(size.max(), 1e-12)]
-        checked = 1.0 - np.square(U).sum(axis=1)
-        left = (r / np.sqrt(V)) - U @ (U.T @ (r / np.sqrt(V)))
+        sd = np.sqrt([m.scale * v + m.bias_sd**2 for m, v in zip(models, variance, strict=True)])
+        rows = np.array([newest[name] for name in names])
+        left, checked = unshifted(rows, sums[:, 1] * variance, sd, mean, height_m)
         changed = []
         for i, name in enumerate(names):
             if checked[i] > _ALONE:
-                y = float(left[i] * math.sqrt(V[i] / checked[i]))
+                y = float(left[i] / math.sqrt(checked[i]))
                 self.models[name] = models[i].weigh(
                     stamp_ns, self.moved_m, y, float(variance[i]), float(checked[i])
                 )

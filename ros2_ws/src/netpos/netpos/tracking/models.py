@@ -45,9 +45,10 @@ def options_of(config: TrackerConfig) -> FilterOptions:
 
 def robust_options_of(config: TrackerConfig) -> RobustOptions:
     """How the rows of a planar or spatial track are re-weighted."""
+    kind, parameter = config.tail
     return RobustOptions(
-        kind=ROBUST.index(config.robust),
-        parameter=float(config.robust_parameter),
+        kind=ROBUST.index(kind),
+        parameter=parameter,
         nlos_probability=float(config.nlos_probability),
         nlos_excess_m=float(config.nlos_mean_excess_m),
     )

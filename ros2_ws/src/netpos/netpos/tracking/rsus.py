@@ -238,10 +238,10 @@ class BiasStates:
             if name not in learned.models or not accepted[int(row[GROUP])]:
                 continue
             stated = float(row[GATE_VARIANCE]) / learned.models[name].gate_scale
-            learned.hear(name, said, stated)
+            learned.hear(name, row, said, stated)
         speed = math.hypot(mean[X.VX], mean[X.VY])
         learned.move(stamp_ns, speed)
-        concluded = learned.conclude(stamp_ns)
+        concluded = learned.conclude(stamp_ns, mean, height_m)
         self.sd, self.tau_s = self.sd.copy(), self.tau_s.copy()
         changes = []
         for name, model in learned.models.items():

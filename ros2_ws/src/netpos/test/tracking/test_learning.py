@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from netpos.estimation.rows import linear_rows
 from netpos.messages.values import Array, Field, Odometry, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.learning import ErrorModel, LearnedErrors
@@ -21,6 +22,13 @@ NAMES = [("rsu/a", "RANGE"), ("rsu/b", "RANGE"), ("rsu/c", "RANGE"), ("rsu/d", "
 SIDES = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 
 
+def seen_from(side: list[float]) -> Array:
+    """Row (ROW_WIDTH,) of an RSU so far away that its value is linear in the position."""
+    H = np.zeros((1, 6))
+    H[0, :2] = side
+    return linear_rows(np.zeros(1), np.eye(1), H, 0)[0]
+
+
 def learned_of(errors: Array, stated_sd: float, rate_hz: int = 5) -> LearnedErrors:
     """What is learned of four RSUs to the four sides of a device whose place is known: errors
     (n, 4) m, ``rate_hz`` a second."""
@@ -31,9 +39,10 @@ def learned_of(errors: Array, stated_sd: float, rate_hz: int = 5) -> LearnedErro
         stamp_ns = k * 1_000_000_000 // rate_hz
         for name, error, side in zip(NAMES, row.tolist(), SIDES.tolist(), strict=True):
             variance = learned.models[name].scale * stated_sd**2
-            learned.hear(name, [error, error**2, variance, *side, 0.0, 0.0, 0.0], stated_sd**2)
+            left = [error, error**2, variance]
+            learned.hear(name, seen_from(side), left, stated_sd**2)
         learned.move(stamp_ns, 0.0)
-        learned.conclude(stamp_ns)
+        learned.conclude(stamp_ns, np.zeros(6), 0.0)
     return learned
 
 
@@ -92,8 +101,8 @@ def test_nothing_is_learned_of_rsus_that_nobody_checks() -> None:
     before = {name: learned.models[name].bias_sd for name in NAMES[:2]}
     for k in range(500):
         for name, side in zip(NAMES[:2], SIDES.tolist(), strict=False):
-            learned.hear(name, [0.7, 0.49, 0.01, *side, 0.0, 0.0, 0.0], 0.01)
-        learned.conclude(k * 200_000_000)
+            learned.hear(name, seen_from(side), [0.7, 0.49, 0.01], 0.01)
+        learned.conclude(k * 200_000_000, np.zeros(6), 0.0)
     for name in NAMES[:2]:
         assert not learned.models[name].evidence.any()
         assert learned.models[name].bias_sd == before[name]
@@ -116,8 +125,8 @@ def test_a_copy_goes_its_own_way() -> None:
     kept = {name: (m.bias_sd, m.scale) for name, m in twin.models.items()}
     for k, row in enumerate(errors[150:], start=150):
         for name, error, side in zip(NAMES, row.tolist(), SIDES.tolist(), strict=True):
-            learned.hear(name, [error, error**2, 0.01, *side, 0.0, 0.0, 0.0], 0.01)
-        learned.conclude(k * 200_000_000)
+            learned.hear(name, seen_from(side), [error, error**2, 0.01], 0.01)
+        learned.conclude(k * 200_000_000, np.zeros(6), 0.0)
     assert {name: (m.bias_sd, m.scale) for name, m in twin.models.items()} == kept
     assert any(learned.models[n].bias_sd != kept[n][0] for n in NAMES)
 
