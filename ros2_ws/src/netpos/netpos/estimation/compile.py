@@ -15,9 +15,13 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np import arrayobj
 
-kernel: Callable[..., Any] = njit(cache=True, error_model="numpy", _nrt=True)
+# Said of each that it is not inlined: what is compiled for an inlined caller would be, otherwise,
+# with all that it calls.
+kernel: Callable[..., Any] = njit(cache=True, error_model="numpy", _nrt=True, forceinline=False)
 # For what allocates nothing: counting references to arrays would cost more than its arithmetic.
-leaf: Callable[..., Any] = njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+leaf: Callable[..., Any] = njit(
+    cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=False
+)
 # A leaf that becomes part of its callers: a call with arrays costs about 10 ns for each of them,
 # and a size the caller knows is known to the compiler.
 inlined: Callable[..., Any] = njit(
