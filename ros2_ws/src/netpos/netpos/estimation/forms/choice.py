@@ -7,6 +7,7 @@ import math
 from netpos.estimation.compile import inlined, kernel
 from netpos.estimation.dispatch import Kernel, choose
 from netpos.estimation.factor import factor
+from netpos.estimation.forms.form import copy_matrix
 from netpos.estimation.forms.table import FORMS
 from netpos.estimation.motion import add_velocity_step as add_to_cov
 from netpos.messages.values import Array
@@ -30,13 +31,6 @@ def _no_update(
     return math.nan, 0
 
 
-@inlined
-def _copy(source: Array, target: Array) -> None:
-    for a in range(source.shape[0]):
-        for b in range(source.shape[1]):
-            target[a, b] = source[a, b]
-
-
 @kernel
 def _factorise(cov: Array, L: Array) -> None:
     L[:] = factor(cov)
@@ -52,9 +46,9 @@ update = _chosen("update", _no_update)
 """``(number, mean, cov_or_sqrt, rows, options, gate_nis, accepted, work)``"""
 add_velocity_step = _chosen("add_velocity_step", add_to_cov)
 """``(number, sd, time_s, position_sd, cov_or_sqrt)``"""
-write_cov = _chosen("write_cov", _copy)
+write_cov = _chosen("write_cov", copy_matrix)
 """``(number, cov_or_sqrt, cov)``"""
-write_cov_or_sqrt = _chosen("write_cov_or_sqrt", _copy)
+write_cov_or_sqrt = _chosen("write_cov_or_sqrt", copy_matrix)
 """``(number, cov, cov_or_sqrt)``"""
 write_sqrt = _chosen("write_sqrt", _factorise)
 """``(number, cov_or_sqrt, L)``"""

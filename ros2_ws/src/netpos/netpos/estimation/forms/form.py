@@ -6,7 +6,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from netpos.estimation.compile import inlined
 from netpos.estimation.dispatch import Kernel
+from netpos.messages.values import Array
+
+
+@inlined
+def copy_matrix(source: Array, target: Array) -> None:
+    """Write ``source`` (n, m) to ``target`` (n, m); an assignment would need memory of its own
+    where the two may overlap."""
+    for a in range(source.shape[0]):
+        for b in range(source.shape[1]):
+            target[a, b] = source[a, b]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
