@@ -8,9 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from netpos.estimation import engine
-from netpos.estimation.components import Dynamics, moments, run_epochs
+from netpos.estimation.components import Dynamics, one_component, run_epochs
 from netpos.estimation.engine import Run
 from netpos.estimation.measurement import BIAS
+from netpos.estimation.mixture import Mixture
 from netpos.estimation.report import run_levels
 from netpos.estimation.state import N_CORE
 from netpos.evaluation.metrics import NS
@@ -125,16 +126,17 @@ class Follower:
         run = _empty_run(count, self.first_bias + epochs.bias.shape[1])
         level, tracked = np.full(count, np.nan), np.zeros(count, dtype=np.bool_)
         motions, imu = self._run_motions(count, samples is not None), _buffer(samples)
-        start: tuple[int, Array, Array] | None = (0, mean, cov)
+        start: tuple[int, Mixture] | None = (0, one_component(mean, cov))
         losses = 0
         while start is not None:
-            first, mean, cov = start
+            first, fix = start
             part, part_run = epochs.since(first, fixed=losses > 0), _part(run, first)
             part_motions = motions[first:] if imu is not None else motions
-            if imu is None and not self._config.interacts:
-                done = self._compiled(part, mean, cov, part_run)
+            is_single = fix.log_weights.size == 1
+            if imu is None and is_single and not self._config.interacts:
+                done = self._compiled(part, fix.means[0], fix.covs[0], part_run)
             else:
-                done = self._stepped(part, mean, cov, part_run, imu, part_motions)
+                done = self._stepped(part, fix, part_run, imu, part_motions)
             end = first + done
             level[first:end] = run_levels(
                 part.measured, _part(part_run, 0, done), part_motions, part.bias, self._options
@@ -167,20 +169,19 @@ class Follower:
     def _stepped(
         self,
         epochs: Epochs,
-        mean: Array,
-        cov: Array,
+        fix: Mixture,
         run: Run,
         imu: ImuBuffer | None,
         motions: Array,
     ) -> int:
-        """As ``_compiled``, epoch by epoch; ``motions`` (N, Parameter) are filled where an IMU
-        drives the filter. As in a tracker, a slow error becomes a state with its first
-        measurement; until then it is in the results only."""
+        """As ``_compiled``, epoch by epoch, from a first fix of several components, or where an
+        IMU drives the filter, which fills ``motions`` (N, Parameter). As in a tracker, a slow
+        error becomes a state with its first measurement; until then it is in the results only."""
         config, first = self._config, self.first_bias
         sd = np.append(self._extra_sd, epochs.bias[0])
         heard_ns, rejected = int(epochs.stamps_ns[0]), 0
         known = first + self.own_slow.shape[1]
-        estimate = estimates.start(config, heard_ns, mean, cov)
+        estimate = estimates.start_from(config, heard_ns, fix)
         for k, stamp in enumerate(epochs.stamps_ns.tolist()):
             rows = epochs.rows[epochs.row_start[k] : epochs.row_start[k + 1]].copy()
             if rows.size:
@@ -203,9 +204,9 @@ class Follower:
                 return k + 1
         return epochs.stamps_ns.size
 
-    def _first_fix(self, epochs: Epochs, first: int) -> tuple[int, Array, Array] | None:
-        """Epoch, mean (6,) and covariance (6, 6) of a first fix by the rows from ``first`` on;
-        None where they do not suffice."""
+    def _first_fix(self, epochs: Epochs, first: int) -> tuple[int, Mixture] | None:
+        """Epoch and components of a first fix by the rows from ``first`` on; None where they do
+        not suffice."""
         initialiser = Initialiser(self._config)
         variance = np.append(epochs.bias[0] ** 2, 0.0)  # the last: no bias
         for k in range(first, epochs.stamps_ns.size):
@@ -216,7 +217,7 @@ class Follower:
             initialiser.add(int(epochs.stamps_ns[k]), rows, bias_var, heard)
             fix = initialiser.solve()
             if fix is not None:
-                return k, *moments(fix)
+                return k, fix
         return None
 
 

@@ -47,7 +47,8 @@ def test_a_track_that_was_lost_comes_back_as_in_the_tracker(seed: int) -> None:
     stamps = track.stamps_ns.tolist()
     assert [published[stamp] is not None for stamp in stamps] == track.tracked.tolist()
     positions = np.array([published[s][0] for s in track.stamps_ns[track.tracked].tolist()])
-    np.testing.assert_allclose(positions, track.mean[track.tracked, POSITION], rtol=0, atol=1e-6)
+    # After a first fix of several components rounding decides what merges first.
+    np.testing.assert_allclose(positions, track.mean[track.tracked, POSITION], rtol=0, atol=1e-4)
     assert np.isnan(track.error_m[~track.tracked]).all()
     assert np.isnan(track.level[~track.tracked]).all()
 
@@ -57,7 +58,8 @@ def test_defaults_keep_facts_only() -> None:
     assert config == TrackerConfig(require_initial_pose=True)
     imu = Setup(Experiment(name="x", scenario="intersection_turn", estimator="defaults")).config
     assert imu == TrackerConfig(motion_model="inertial", require_initial_pose=True)
-    assert set(FACTS) == {"require_initial_pose", "device_height_m", "motion_model"}
+    height = {"device_height_m", "device_height_sd_m", "device_height_time_s"}
+    assert set(FACTS) == {"require_initial_pose", "motion_model", *height}
 
 
 def test_defaults_and_ours_see_the_same_measurements() -> None:

@@ -237,10 +237,21 @@ def test_the_first_fix_is_that_of_least_squares(seed: int) -> None:
         return np.array([*left, (p[2] - MEAN_M) / HEIGHT_SD_M, *(p[:2] - [4.0, 3.0]) / 20.0])
 
     found = least_squares(residuals, [4.0, 3.0, MEAN_M])
-    cov = np.linalg.inv(found.jac.T @ found.jac)
-    np.testing.assert_allclose(said.position, found.x, atol=1e-4)
     misfit = max(1.0, 2.0 * found.cost / len(items))
-    np.testing.assert_allclose(said.pose_cov[:3, :3], cov * misfit, rtol=2e-3, atol=1e-6)
+    # The posterior about it, summed over samples: where it bends, its mean is not its top.
+    width = 1.5 * np.linalg.cholesky(misfit * np.linalg.inv(found.jac.T @ found.jac))
+    unit = rng.normal(size=(20000, 3))
+    points = found.x + unit @ width.T
+    cost = np.array([(residuals(p) ** 2).sum() for p in points])
+    weights = np.exp(-0.5 * (cost - cost.min()) / misfit + 0.5 * (unit**2).sum(axis=1))
+    mean = np.average(points, axis=0, weights=weights)
+    cov = np.cov(points.T, aweights=weights)
+    sd = np.sqrt(np.diag(cov))
+    np.testing.assert_allclose((said.position - mean) / sd, 0.0, atol=0.15)
+    # As of the oracle: the trace within 15 %, here in units of the posterior.
+    stated, expected = (P / np.outer(sd, sd) for P in (said.pose_cov[:3, :3], cov))
+    assert np.trace(stated) == pytest.approx(np.trace(expected), rel=0.15)
+    np.testing.assert_allclose(stated, expected, atol=0.25)
 
 
 # --- by simulation

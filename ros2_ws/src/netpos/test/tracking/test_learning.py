@@ -259,14 +259,16 @@ def _start_of_the_second(first: list[RsuMeasurement], seed: int, bias: Array) ->
 
 def test_a_device_takes_over_what_others_have_learned() -> None:
     """Of biases of 3 sd that nobody declared, it knows from the start how large they are."""
-    alone, helped = np.zeros(2), np.zeros(2)
+    alone, helped = [], []
     for seed in range(12):
         bias = np.random.default_rng(seed).normal(0.0, 0.3, 5)
-        alone += _start_of_the_second([], seed, bias) / 12
+        alone.append(_start_of_the_second([], seed, bias))
         first = _measurements(100 + seed, 90.0, 0.1, bias)
-        helped += _start_of_the_second(first, seed, bias) / 12
-    assert helped[1] < 0.9 * alone[1]
-    assert helped[0] < 1.03 * alone[0]
+        helped.append(_start_of_the_second(first, seed, bias))
+    assert np.mean(helped, axis=0)[1] < 0.9 * np.mean(alone, axis=0)[1]
+    # RMSE: no worse than chance makes it, seed by seed.
+    worse = np.subtract(helped, alone)[:, 0]
+    assert worse.mean() < 2.0 * worse.std(ddof=1) / math.sqrt(worse.size)
 
 
 def test_what_is_shared_does_not_depend_on_the_order_of_arrival() -> None:

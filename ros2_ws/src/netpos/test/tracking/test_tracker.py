@@ -376,17 +376,18 @@ def test_whatever_comes_nothing_raises_and_no_nan_leaves(config: Any, items: lis
     tracker = Tracker(TrackerConfig(hold_s=0.1, **config))
     for rsu_id in "abc":
         tracker.add_rsu(station(rsu_id))
-    refused = 0
+    refused = conflicts = 0
     for item in items:
-        refused += tracker.add(item) not in (None, "clock_ahead")
+        reason = tracker.add(item)
+        refused += reason not in (None, "clock_ahead", "conflict")
+        conflicts += reason == "conflict"
         for output in tracker.process():
             assert all(np.isfinite(part).all() for part in numbers(output))
     for output in tracker.flush():
         assert all(np.isfinite(part).all() for part in numbers(output))
-    at_the_door = sum(
-        n
-        for counts in tracker.rejected().values()
-        for reason, n in counts.items()
-        if reason not in ("gate", "track_lost", "no_initial_pose", "diverged", "clock_ahead")
-    )
-    assert at_the_door == refused
+    later = ("gate", "track_lost", "no_initial_pose", "diverged", "clock_ahead", "conflict")
+    counted = [pair for counts in tracker.rejected().values() for pair in counts.items()]
+    assert sum(n for reason, n in counted if reason not in later) == refused
+    # The first of two that differ was taken, and is refused with the second.
+    in_conflict = sum(n for reason, n in counted if reason == "conflict")
+    assert conflicts <= in_conflict <= 2 * conflicts

@@ -134,8 +134,8 @@ def test_convergence_is_judged_and_its_bound_is_shown(result: Reproduction, inte
         result, f"Fig. 5, T = {interval} s: updates until the posterior bound is within 1 m"
     )
     assert ours.paper == 20.0
-    assert ours.ok is (ours.ours is not None and ours.ours <= 20.0)
     assert bound.ours is not None
+    assert ours.ok is (ours.ours is not None and ours.ours <= 1.15 * bound.ours)
     assert bound.ours > 1.0
     assert (bound.ok, bound.baseline) == (None, None)
 
