@@ -29,5 +29,6 @@ class Piecewise:
         return [
             found
             for found in self._fault.apply([arrival], self._hit)
-            if found.what is arrival.what or not isinstance(found.what, RsuInfo | Order)
+            if (found.what is arrival.what and found.at_ns == arrival.at_ns)
+            or not isinstance(found.what, RsuInfo | Order)
         ]
