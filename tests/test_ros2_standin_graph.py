@@ -169,7 +169,8 @@ def test_bags(graph: Graph, tmp_path: Path) -> None:
     assert "Topic: /recorded/info | Type: netpos_msgs/msg/RsuInfo | Count: 3 |" in told
     assert "Storage id:        mcap\n" in told
     heard = graph.collect("/recorded/info", RsuInfoMessage)
-    ros2(graph, "bag", "play", str(bag), "-r", "10")
+    # The three are over before a subscriber is found, unless the player waits for one.
+    ros2(graph, "bag", "play", str(bag), "-r", "10", "--wait-for-subscribers", "/recorded/info")
     assert len(heard.wait_for(3)) == 3
     assert "no_such" in ros2(graph, "bag", "info", str(tmp_path / "no_such"), code=1)
 
