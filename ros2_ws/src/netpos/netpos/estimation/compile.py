@@ -28,6 +28,10 @@ inlined: Callable[..., Any] = njit(
     cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True
 )
 
+# Becomes part of its callers before they are typed, and is not compiled by itself: for what only
+# passes arguments on to kernels, which would be compiled once more with it.
+spliced: Callable[..., Any] = njit(inline="always")
+
 # An inlined closure made at import. Numba cannot find one in its cache again, and it need not: it
 # is part of the callers that are cached.
 link: Callable[..., Any] = njit(

@@ -1,17 +1,18 @@
 """Compiled choice among the entries of a table by their number: sensors, motion models, filter
 forms.
 
-A chain of inlined closures, one per entry: ``if kind == number: return model(...)``, else the
-rest of the chain. The compiler makes of it what it makes of the same ``if`` statements written
-one after the other. The closures are compiled as parts of their callers and cached with them.
+One function per choice, ``if kind == number: return model(...)`` for each entry, written out and
+spliced into its callers before they are compiled. So a choice is not compiled by itself, which
+would compile all its entries once more, and is cached with its callers.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from netpos.estimation.compile import link
+from netpos.estimation.compile import link, spliced
 
 Kernel = Callable[..., Any]
 
@@ -23,13 +24,24 @@ def choose(models: Sequence[Numbered], otherwise: Kernel) -> Kernel:
     ``otherwise``, with the arguments ``*args``.
 
     models : number and function of each entry; an entry whose function is None is left out. All
-        functions, ``otherwise`` too, return the same type.
+        functions, ``otherwise`` too, take as many arguments and return the same type.
     """
-    chain = _last(otherwise)
-    for number, model in reversed(models):
+    numbers: dict[int, list[int]] = {}
+    names: dict[str, Any] = {"otherwise": otherwise}
+    for number, model in models:
         if model is not None:
-            chain = _before(number, model, chain)
-    return chain
+            numbers.setdefault(id(model), []).append(number)
+            names[f"model_{id(model)}"] = model
+    count = len(inspect.signature(getattr(otherwise, "py_func", otherwise)).parameters)
+    given = ", ".join(f"a{k}" for k in range(count))
+    lines = [f"def chosen(kind, {given}):"]
+    for identity, its in numbers.items():
+        asked = " or ".join(f"kind == {number}" for number in its)
+        lines += [f"    if {asked}:", f"        return model_{identity}({given})"]
+    lines.append(f"    return otherwise({given})")
+    exec("\n".join(lines), names)
+    chosen: Kernel = spliced(names["chosen"])
+    return chosen
 
 
 def is_one_of(kinds: Iterable[int]) -> Kernel:
@@ -41,21 +53,3 @@ def is_one_of(kinds: Iterable[int]) -> Kernel:
         return (bits >> kind) & 1 == 1
 
     return is_member  # type: ignore[no-any-return]
-
-
-def _last(otherwise: Kernel) -> Kernel:
-    @link
-    def last(_kind, *args):  # type: ignore[no-untyped-def]
-        return otherwise(*args)
-
-    return last  # type: ignore[no-any-return]
-
-
-def _before(number: int, model: Kernel, rest: Kernel) -> Kernel:
-    @link
-    def chosen(kind, *args):  # type: ignore[no-untyped-def]
-        if kind == number:
-            return model(*args)
-        return rest(kind, *args)
-
-    return chosen  # type: ignore[no-any-return]

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from netpos.estimation import conditioning, fusion
-from netpos.estimation.compile import inlined, kernel, leaf
+from netpos.estimation.compile import kernel, leaf, spliced
 from netpos.estimation.conditioning import Robust, RobustOptions
 from netpos.estimation.forms import choice
 from netpos.estimation.forms.table import FORMS
@@ -144,7 +144,7 @@ def predict(
     choice.predict(options.filter, mean, cov_or_sqrt, dt, motion, bias)
 
 
-@inlined
+@spliced
 def update_with_gate(
     mean: Array,
     cov_or_sqrt: Array,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from netpos.estimation.bearing import fuse_around, on_top
-from netpos.estimation.compile import inlined, kernel, leaf, local_array
+from netpos.estimation.compile import inlined, kernel, leaf, local_array, spliced
 from netpos.estimation.fit import map_cost
 from netpos.estimation.forms.form import FilterForm
 from netpos.estimation.fusion import (
@@ -344,7 +344,7 @@ def _coloured_nis(cov: Array, m: int, work: Array) -> float:
     return float(group_nis(cov, innovation, H, variance))
 
 
-@inlined
+@spliced
 def _update_form(
     mean: Array,
     cov: Array,

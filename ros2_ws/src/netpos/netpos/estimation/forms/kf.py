@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from netpos.common.parameters import real
-from netpos.estimation.compile import inlined, kernel
+from netpos.estimation.compile import kernel, spliced
 from netpos.estimation.factor import factor
 from netpos.estimation.forms import ekf
 from netpos.estimation.forms.form import FilterForm
@@ -137,7 +137,7 @@ def _raise_gain(K: Array, h: Array, gain_floor: Array) -> None:
             K[i] = gain_floor[order] / h[axis]
 
 
-@inlined
+@spliced
 def _update_form(
     mean: Array,
     cov: Array,

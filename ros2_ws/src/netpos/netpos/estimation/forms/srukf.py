@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from netpos.estimation.compile import inlined, kernel, leaf
+from netpos.estimation.compile import inlined, kernel, leaf, spliced
 from netpos.estimation.factor import factor
 from netpos.estimation.forms.form import FilterForm, copy_matrix
 from netpos.estimation.gate import gate_groups, select_rows
@@ -193,7 +193,7 @@ def _write_factor(cov: Array, L: Array) -> None:
     L[:] = factor(cov)
 
 
-@inlined
+@spliced
 def _update_form(
     mean: Array,
     L: Array,

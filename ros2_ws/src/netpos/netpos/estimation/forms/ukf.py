@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from netpos.estimation.compile import inlined, kernel
+from netpos.estimation.compile import kernel, spliced
 from netpos.estimation.factor import factor, solve_factored
 from netpos.estimation.forms.form import FilterForm
 from netpos.estimation.gate import gate_groups, select_rows
@@ -90,7 +90,7 @@ def fuse(
             cov[a, b] = cov[b, a] = total
 
 
-@inlined
+@spliced
 def _update_form(
     mean: Array,
     cov: Array,
