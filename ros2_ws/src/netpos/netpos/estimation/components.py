@@ -10,6 +10,9 @@ A component is one hypothesis about the device. There are three reasons to have 
   quarter of a second a component "the device has turned since" begins (``_at_once``).
 - *The likelihood of a range is a ring.* A component too wide for the tangent of a range is split
   along the ring (``netpos.estimation.mixture``).
+
+Or the device changes between several motion models: then each has a component, and they mix when
+they are moved (``netpos.estimation.imm``). They do without the three reasons above.
 """
 
 from __future__ import annotations
@@ -52,6 +55,7 @@ from netpos.estimation.measurement import (
     innovation_variance,
 )
 from netpos.estimation.mixture import Mixture
+from netpos.estimation.motion import add_velocity_step
 from netpos.estimation.protection import mixture_radius
 from netpos.estimation.sensors.row import group_end
 from netpos.messages.values import Array
@@ -62,10 +66,16 @@ _MERGE_SHARE = 0.1  # of the integrity risk: what merging two components may cos
 
 
 class Dynamics(NamedTuple):
-    """How a device moves between epochs: motion (Parameter,), and sd and time constant (2, k) of
-    the biases, as for ``ekf.predict``."""
+    """How a device moves between epochs: a vector of ``motion_parameters`` of each model (M,
+    size), the mean time (M,) a device keeps to each of several, and sd and time constant (2, k)
+    of the biases.
 
-    motion: Array
+    One model moves all components. Of several, component k of M has the model k: its place in the
+    mixture is its tag.
+    """
+
+    motions: Array
+    sojourn_s: Array
     bias: Array
 
 
@@ -105,14 +115,30 @@ def one_component(mean: Array, cov: Array) -> Mixture:
 
 
 @kernel
+def a_component_each(mean: Array, cov: Array, dynamics: Dynamics) -> Mixture:
+    """A mixture with a component for each model, all alike."""
+    count = dynamics.motions.shape[0]
+    means, covs = np.empty((count, mean.size)), np.empty((count, mean.size, mean.size))
+    for k in range(count):
+        means[k], covs[k] = mean, cov
+    return Mixture(means, covs, np.full(count, -math.log(count)))
+
+
+@kernel
 def move(components: Mixture, dt_s: float, dynamics: Dynamics, options: FilterOptions) -> Mixture:
-    """The components moved by ``dt_s`` seconds."""
+    """The components moved by ``dt_s`` seconds; those of interacting models mix before."""
     means, covs = components.means.copy(), components.covs.copy()
+    log_weights, models = components.log_weights, dynamics.motions.shape[0]
+    if models > 1 and dt_s > 0.0:
+        weights = np.exp(log_weights)
+        imm.mix(means, covs, weights, imm.transition_matrix(dynamics.sojourn_s, dt_s))
+        log_weights = np.log(weights)
     for k in range(means.shape[0]):
         cov_or_sqrt = cov_or_sqrt_of(covs[k], options)
-        predict(means[k], cov_or_sqrt, dt_s, dynamics.motion, dynamics.bias, options)
+        motion = dynamics.motions[k if models > 1 else 0]
+        predict(means[k], cov_or_sqrt, dt_s, motion, dynamics.bias, options)
         covs[k] = cov_of(cov_or_sqrt, options)
-    return Mixture(means, covs, components.log_weights)
+    return Mixture(means, covs, log_weights)
 
 
 @kernel
@@ -263,6 +289,28 @@ def _first(found: _Candidates, end: int) -> Mixture:
 
 
 @kernel
+def _open_velocity(k: int, epoch: EpochInput, options: FilterOptions, found: _Candidates) -> None:
+    """Open the velocity of the candidate ``k`` after ``inflate_after`` epochs rejected in a row:
+    no other component has it for interacting models."""
+    if epoch.rejected_in_row >= options.inflate_after:
+        add_velocity_step(options.initial_speed_sd, epoch.unheard_s, 0.0, found.covs[k])
+
+
+@kernel
+def _one_of_each(components: Mixture) -> Mixture:
+    """Components of interacting models after an epoch: none is merged, and none dies. One that is
+    no longer sound begins anew as the most probable one."""
+    means, covs, log_weights = components
+    best = int(np.argmax(log_weights))
+    weights = np.exp(log_weights - log_weights[best])
+    for k in range(weights.size):
+        if log_weights[k] == -math.inf:
+            means[k], covs[k] = means[best], covs[best]
+    imm.keep_alive(weights)
+    return Mixture(means, covs, np.log(weights))
+
+
+@kernel
 def _at_once(
     prior: Mixture,
     epoch: EpochInput,
@@ -277,7 +325,11 @@ def _at_once(
     end = count
     for k in range(count):
         found.means[k], found.covs[k] = prior.means[k], prior.covs[k]
+        if options.models > 1:
+            _open_velocity(k, epoch, options, found)
         _apply(k, prior.log_weights[k], rows, options, found)
+        if options.models > 1 and found.used[k] == 0:
+            found.covs[k] = prior.covs[k]
         refuses = found.accepted[k].sum() < groups
         if refuses and options.manoeuvre_speed_sd > 0.0:
             end = _add_explanations(k, end, prior, epoch, options, found)
@@ -296,7 +348,10 @@ def _at_once(
     accepted[:groups] = found.accepted[best]
     weights = np.exp(found.log_weights[:end] - top)
     turned = weights[found.within_s[:end] > 0.0].sum() / weights.sum()
-    components = mixture.reduced(_first(found, end), _MERGE_SHARE * options.integrity_risk)
+    if options.models > 1:
+        components = _one_of_each(_first(found, end))
+    else:
+        components = mixture.reduced(_first(found, end), _MERGE_SHARE * options.integrity_risk)
     nis, used = found.nis[best], int(found.used[best])
     return Update(components, nis, used, turned, found.within_s[:end].max(), turns)
 
@@ -335,7 +390,7 @@ def is_too_wide(
     once it is moved to the epoch; nothing is changed."""
     if epoch.dt_s <= options.coast_after_s or epoch.rows.shape[0] == 0:
         return False
-    own = Dynamics(dynamics.motion.copy(), dynamics.bias)
+    own = Dynamics(dynamics.motions.copy(), dynamics.sojourn_s, dynamics.bias)
     moved = move(one_component(mean, cov), epoch.dt_s, own, options)
     return bool(_splits(moved, epoch.rows, options.height_m))
 
@@ -423,7 +478,7 @@ def apply_epoch(
 ) -> Update:
     """The components, moved to the epoch already, after it; ``accepted`` (groups,) is filled with
     0 or 1. ``since_turn_s``: since the last component "it has turned" began."""
-    if _splits(components, epoch.rows, options.height_m):
+    if options.models == 1 and _splits(components, epoch.rows, options.height_m):
         found: Update = _one_by_one(components, epoch.rows, options, accepted)
     else:
         found = _at_once(components, epoch, options, since_turn_s, accepted)
@@ -468,10 +523,10 @@ def _advance(
         if several:
             components = one_component(x, P)
     if not several and rows.shape[0] == 0:
-        predict(x, S, epoch.dt_s, dynamics.motion, dynamics.bias, options)
+        predict(x, S, epoch.dt_s, dynamics.motions[0], dynamics.bias, options)
         return Update(components, 0.0, 0, 0.0, 0.0, False)
     if not several:
-        result = step(x, S, epoch, dynamics.motion, dynamics.bias, options, memory)
+        result = step(x, S, epoch, dynamics.motions[0], dynamics.bias, options, memory)
         if not is_not_enough(result, x, epoch, since_turn_s, options):
             return Update(components, result.nis, result.used, 0.0, 0.0, False)
         P = cov_of(memory.prior_cov_or_sqrt, options)
@@ -505,7 +560,7 @@ def run_epochs(
     stamps_ns, row_start = epochs.stamps_ns, epochs.row_start
     memory = scratch(mean.size, max(np.diff(row_start).max(), 1))
     x, S = mean.copy(), cov_or_sqrt_of(cov, options)
-    components, rejected_in_row = one_component(x, cov), 0
+    components, rejected_in_row = a_component_each(x, cov, dynamics), 0
     last_ns = heard_ns = turn_ns = stamps_ns[0]
     for k in range(stamps_ns.size):
         now_ns = stamps_ns[k]

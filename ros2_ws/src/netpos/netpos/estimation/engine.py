@@ -40,6 +40,7 @@ class FilterOptions(NamedTuple):
     coast_after_s: float  # a longer silence may leave the device anywhere
     integrity_risk: float  # share of errors that may exceed the protection level
     robust: RobustOptions
+    models: int  # motion models that interact; 1: none
     of_form: Array  # what the form has of its own (``FilterForm.parameters``)
     gate_nis: Array  # (GATE_SIZE,) largest accepted NIS for 0, 1, ... degrees of freedom
 

@@ -1,33 +1,21 @@
-"""Interacting multiple models over models that share one state (Bar-Shalom, Li and Kirubarajan
-2001, section 11.6), each an extended Kalman filter. Everything works in place.
+"""Interacting models: the mixing of components of which each has a motion model of its own (Blom
+and Bar-Shalom 1988; Bar-Shalom, Li and Kirubarajan 2001, section 11.6). Everything works in place.
 
-``Models`` is the state; ``motions`` (K, Parameter) are the models, of equal EXTRAS.
+What a component does at a measurement, and what its likelihood makes of its weight, is the same as
+for all other components (``components``).
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from netpos.estimation.compile import kernel
-from netpos.estimation.fit import neg2_log_likelihood
-from netpos.estimation.forms import ekf
-from netpos.estimation.gate import accepted_rows
 from netpos.messages.values import Array
 
 # No model is ever ruled out: its way back would take this many e-folds less.
 _LEAST_WEIGHT = 1e-12
-_NO_GATE = np.array([np.inf])
-
-
-class Models(NamedTuple):
-    """What each of K models knows, and how probable it is."""
-
-    means: Array  # (K, n)
-    covs: Array  # (K, n, n)
-    weights: Array  # (K,), their sum is 1
 
 
 @kernel
@@ -69,7 +57,7 @@ def mix(means: Array, covs: Array, weights: Array, transition: Array) -> None:
             share[j, i] = transition[i, j] * weights[i]
     for j in range(count):
         weights[j] = share[j].sum()
-    _keep_alive(weights)
+    keep_alive(weights)
     for j in range(count):
         combine(old_means, old_covs, share[j] / share[j].sum(), means[j], covs[j])
 
@@ -95,70 +83,9 @@ def combine(means: Array, covs: Array, weights: Array, mean: Array, cov: Array) 
 
 
 @kernel
-def reweigh(weights: Array, log_likelihoods: Array) -> None:
-    """Bayes' rule for the probabilities of the models, (K,) each: eq. 11.6.6-13."""
-    largest = log_likelihoods.max()
-    if not math.isfinite(largest):
-        return  # beyond all models: evidence for none
-    for k in range(weights.size):
-        weights[k] *= math.exp(log_likelihoods[k] - largest)
-    _keep_alive(weights)
-
-
-@kernel
-def _keep_alive(weights: Array) -> None:
+def keep_alive(weights: Array) -> None:
+    """Weights (K,) made to sum to one, none of them 0."""
     total = weights.sum()
     for k in range(weights.size):
         weights[k] = max(weights[k] / total, _LEAST_WEIGHT)
     weights /= weights.sum()
-
-
-@kernel
-def log_likelihood(mean: Array, cov: Array, rows: Array, height_m: float) -> float:
-    """Log density of ``rows`` (m, ROW_WIDTH) as the extended Kalman filter at mean, cov sees
-    them."""
-    distance, size = neg2_log_likelihood(mean, cov, rows, height_m, True)
-    return float(-0.5 * (distance + size))
-
-
-@kernel
-def predict(models: Models, dt: float, motions: Array, sojourn_s: Array, bias: Array) -> None:
-    """Mix, then move each model by ``dt`` seconds. Nothing happens for dt <= 0.
-
-    sojourn_s : (K,) mean time in each model; bias : (2, k) as for ``ekf.predict``
-    """
-    if dt <= 0.0:
-        return
-    means, covs, weights = models
-    mix(means, covs, weights, transition_matrix(sojourn_s, dt))
-    for k in range(weights.size):
-        ekf.predict(means[k], covs[k], dt, motions[k], bias)
-
-
-@kernel
-def update(
-    models: Models,
-    rows: Array,
-    height_m: float,
-    gate_nis: Array,
-    iterations: int,
-    accepted: Array,
-    work: Array,
-) -> tuple[float, int]:
-    """One epoch: groups are gated once, against the mixture; every model fuses the same rows and
-    is weighed by their likelihood. Arguments and result as ``ekf.update``; the NIS is the
-    mixture's."""
-    means, covs, weights = models
-    mean, cov = np.empty_like(means[0]), np.empty_like(covs[0])
-    combine(means, covs, weights, mean, cov)
-    nis, used = ekf.update(mean, cov, rows, height_m, gate_nis, iterations, accepted, work)
-    if used == 0:
-        return 0.0, 0
-    kept = rows[accepted_rows(rows, accepted)]
-    likelihoods = np.empty(weights.size)
-    unused = accepted.copy()
-    for k in range(weights.size):
-        likelihoods[k] = log_likelihood(means[k], covs[k], kept, height_m)
-        ekf.update(means[k], covs[k], kept, height_m, _NO_GATE, iterations, unused, work)
-    reweigh(weights, likelihoods)
-    return nis, used

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from netpos.estimation import engine
-from netpos.estimation.components import Dynamics, one_component, run_epochs
+from netpos.estimation.components import one_component, run_epochs
 from netpos.estimation.engine import Run
 from netpos.estimation.measurement import BIAS
 from netpos.estimation.mixture import Mixture
@@ -22,6 +22,7 @@ from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser
 from netpos.tracking.models import (
     augmented,
+    dynamics_of,
     initial_extra_sd,
     motions_of,
     options_of,
@@ -132,8 +133,7 @@ class Follower:
             first, fix = start
             part, part_run = epochs.since(first, fixed=losses > 0), _part(run, first)
             part_motions = motions[first:] if imu is not None else motions
-            is_single = fix.log_weights.size == 1
-            if imu is None and is_single and not self._config.interacts:
+            if imu is None and fix.log_weights.size == 1:
                 done = self._compiled(part, fix.means[0], fix.covs[0], part_run)
             else:
                 done = self._stepped(part, fix, part_run, imu, part_motions)
@@ -161,9 +161,8 @@ class Follower:
     def _compiled(self, epochs: Epochs, mean: Array, cov: Array, run: Run) -> int:
         """Epochs done: all in one kernel."""
         mean, cov = self.augmented(mean, cov, epochs.bias)
-        done: int = run_epochs(
-            epochs.measured, mean, cov, Dynamics(self._motions[0], epochs.bias), self._options, run
-        )
+        dynamics = dynamics_of(self._config, epochs.bias)
+        done: int = run_epochs(epochs.measured, mean, cov, dynamics, self._options, run)
         return done
 
     def _stepped(

@@ -307,20 +307,10 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
             raise ValueError(f"fixed_lag_s must be 0 with motion_model {self.motion_model}")
         if self.steady_accel_density_mps2_sqrthz > 0.0:
             self._check_steady()
-        plain = self.robust == "none" and self.nlos_probability == 0.0
-        if not plain and self.interacts:
-            raise ValueError(
-                "robust and nlos_probability need a single motion model; leave them at none and 0"
-            )
         if self.learn_errors and (self.interacts or self.is_strapdown):
             raise ValueError(
                 "learn_errors needs a single planar motion model,"
                 f" got {self.motion_model!r}; set it to false"
-            )
-        if self.interacts and not forms.form_of(self.filter).is_extended:
-            extended = " or ".join(form.name for form in forms.FORMS if form.is_extended)
-            raise ValueError(
-                f"motion_model {self.motion_model} takes filter {extended}, not {self.filter!r}"
             )
         if self.device_height_sd_m > 0.0 and any(m.heading >= 0 for m in self.motion_models):
             raise ValueError(

@@ -1,27 +1,30 @@
-"""Mean and covariance of one device, carried from epoch to epoch by the chosen filter.
-
-``KalmanEstimate`` runs one motion model in the compiled engine, ``ImmEstimate`` several at once.
-"""
+"""Mean and covariance of one device, carried from epoch to epoch by the chosen filter."""
 
 from __future__ import annotations
 
-import copy
 from typing import Protocol
 
 import numpy as np
 
-from netpos.estimation import components, engine, fusion, imm
+from netpos.estimation import components, engine
 from netpos.estimation.components import Dynamics, moments
-from netpos.estimation.engine import EpochInput, FilterOptions
+from netpos.estimation.engine import EpochInput
 from netpos.estimation.forms.table import form_of
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.mixture import Mixture, mode_of
-from netpos.estimation.motion import Parameter
+from netpos.estimation.motion import NO_BIAS, Parameter
 from netpos.estimation.protection import mixture_radius
 from netpos.estimation.state import N_CORE, X
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.models import augmented, carries_modes, motions_of, options_of, start_state
+from netpos.tracking.models import (
+    augmented,
+    carries_modes,
+    dynamics_of,
+    motions_of,
+    options_of,
+    start_state,
+)
 
 
 class Estimate(Protocol):
@@ -80,17 +83,6 @@ class Estimate(Protocol):
         """An independent copy."""
 
 
-class UnimodalEstimate:
-    """An estimate that is one Gaussian."""
-
-    @property
-    def modes(self) -> tuple[TrackMode, ...]:
-        return ()
-
-    def radius(self, level_m: float) -> float:
-        return level_m
-
-
 class OneModel:
     """The motion model of a filter that has one."""
 
@@ -110,27 +102,33 @@ class OneModel:
 
 
 class KalmanEstimate(OneModel):
-    """One motion model in the compiled engine: one component, or a mixture of them while one does
-    not explain the measurements (``estimation.components``)."""
+    """One component in the compiled engine, or a mixture of them: while one does not explain the
+    measurements, or where several motion models interact (``estimation.components``)."""
 
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
         self.stamp_ns = self._turn_ns = stamp_ns
         self._options = options_of(config)
         self._factored = not form_of(config.filter).carries_cov
-        self._motion: Array = motions_of(config)[0].copy()
+        self._dynamics = dynamics_of(config, NO_BIAS)
+        self._motion = self._dynamics.motions[0]
         self._components: Mixture | None = None  # replaced, never changed; None: one component
         self._prior: tuple[Array, Array] | None = None  # of a mixture
         self._modes: tuple[TrackMode, ...] | None = ()  # None: not yet asked for
         mean, cov = start_state(config, mean, cov)
         self.mean, self._cov_or_sqrt = mean.copy(), engine.to_cov_or_sqrt(cov, self._options)
+        if self._options.models > 1:
+            self._components = components.a_component_each(mean, cov, self._dynamics)
         self._rows = 0
         self._make_room(4)
 
     def set_config(self, config: TrackerConfig) -> None:
         """Go on with other live parameters (``live_parameters``)."""
         self._options = options_of(config)
-        self._motion[Parameter.ACCEL] = motions_of(config)[0][Parameter.ACCEL]
+        self._dynamics.motions[:, Parameter.ACCEL] = motions_of(config)[:, Parameter.ACCEL]
         self._modes = () if self._components is None else None
+
+    def _with(self, bias: Array) -> Dynamics:
+        return Dynamics(self._dynamics.motions, self._dynamics.sojourn_s, bias)
 
     def _make_room(self, rows: int) -> None:
         n = self.mean.size
@@ -203,9 +201,7 @@ class KalmanEstimate(OneModel):
         if self._components is None:
             engine.predict(self.mean, self._cov_or_sqrt, dt, self._motion, bias, self._options)
         elif dt > 0.0:
-            self._set(
-                components.move(self._components, dt, Dynamics(self._motion, bias), self._options)
-            )
+            self._set(components.move(self._components, dt, self._with(bias), self._options))
 
     def step(
         self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
@@ -218,10 +214,11 @@ class KalmanEstimate(OneModel):
             self._scratch.accepted,
         )
         motion, options, groups = self._motion, self._options, int(rows.item(-1, GROUP)) + 1
-        dynamics = Dynamics(motion, bias)
         since_turn_s = (stamp_ns - self._turn_ns) * 1e-9
         coasted = self._components is None and dt_s > options.coast_after_s
-        if coasted and components.is_too_wide(self.mean, self.cov, epoch, dynamics, options):
+        if coasted and components.is_too_wide(
+            self.mean, self.cov, epoch, self._with(bias), options
+        ):
             self._components = components.one_component(self.mean, self.cov)
         if self._components is None:
             result = engine.step(
@@ -235,7 +232,7 @@ class KalmanEstimate(OneModel):
                 return result.nis, result.used, accepted[:groups]
             prior = components.one_component(*self._prior_of_one())
         else:
-            prior = components.moved_to_epoch(self._components, epoch, dynamics, options)
+            prior = components.moved_to_epoch(self._components, epoch, self._with(bias), options)
             self.stamp_ns = stamp_ns
         found = components.apply_epoch(prior, epoch, options, since_turn_s, accepted)
         components.note_turn(found, motion, options)
@@ -249,7 +246,8 @@ class KalmanEstimate(OneModel):
         twin = KalmanEstimate.__new__(KalmanEstimate)
         twin.__dict__.update(self.__dict__)
         twin.mean, twin._cov_or_sqrt = self.mean.copy(), self._cov_or_sqrt.copy()
-        twin._motion = self._motion.copy()
+        twin._dynamics = self._dynamics._replace(motions=self._dynamics.motions.copy())
+        twin._motion = twin._dynamics.motions[0]
         return twin
 
 
@@ -288,145 +286,9 @@ def modes_of(mixture: Mixture, risk: float) -> tuple[TrackMode, ...]:
     return modes if len(modes) > 1 else ()
 
 
-class GatedEstimate(UnimodalEstimate):
-    """The rules of ``engine.step`` for estimates that are not one compiled step."""
-
-    stamp_ns: int
-    mean: Array
-    cov: Array
-    _options: FilterOptions
-    _prior: tuple[Array, Array]
-
-    def change_prior(self, index: int, before: float, after: float) -> None:
-        raise NotImplementedError("errors are learned with one motion model only")
-
-    def _move(self, stamp_ns: int, bias: Array) -> None:
-        raise NotImplementedError
-
-    def _update(self, rows: Array, accepted: Array) -> tuple[float, int]:
-        raise NotImplementedError
-
-    def _open(self, sd: float, unheard_s: float) -> None:
-        raise NotImplementedError
-
-    def _state(self) -> tuple[Array, ...]:
-        raise NotImplementedError
-
-    def _set_state(self, state: tuple[Array, ...]) -> None:
-        raise NotImplementedError
-
-    def _set_velocity_step_noise(self, opened_sd: float, unheard_s: float) -> None:
-        """Keep the velocity step allowed for, as ``engine.set_velocity_step_noise``."""
-
-    @property
-    def prior(self) -> tuple[Array, Array]:
-        return self._prior
-
-    def predict(self, stamp_ns: int, bias: Array) -> None:
-        if stamp_ns > self.stamp_ns:
-            self._move(stamp_ns, bias)
-
-    def _restore(self, state: tuple[Array, ...]) -> None:
-        self._set_state(tuple(part.copy() for part in state))
-
-    def step(
-        self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
-    ) -> tuple[float, int, Array]:
-        self.predict(stamp_ns, bias)
-        self._prior = (self.mean.copy(), self.cov.copy())
-        before = tuple(part.copy() for part in self._state())
-        opened = rejected_in_row >= self._options.inflate_after
-        speed = self._options.initial_speed_sd
-        if opened:
-            self._open(speed, unheard_s)
-        accepted = np.zeros(int(rows[-1, GROUP]) + 1)
-        nis, used = self._update(rows, accepted)
-        if accepted.any():
-            self._set_velocity_step_noise(speed if opened else 0.0, unheard_s)
-        else:
-            self._restore(before)
-        return nis, used, accepted
-
-
-class ImmEstimate(GatedEstimate):
-    """Interacting models stop, straight and turn, each an extended Kalman filter."""
-
-    def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
-        self.stamp_ns = stamp_ns
-        self._options = options_of(config)
-        self._motions = motions_of(config)
-        count = len(self._motions)
-        self._sojourn_s = np.full(count, config.sojourn_s)
-        mean, cov = start_state(config, mean, cov)
-        self._prior = (mean, cov)
-        means, covs = np.tile(mean, (count, 1)), np.tile(cov, (count, 1, 1))
-        self._set_state((means, covs, np.full(count, 1.0 / count)))
-
-    @property
-    def weights(self) -> Array:
-        """Probabilities (K,) of the models."""
-        return self._models.weights
-
-    def _state(self) -> tuple[Array, ...]:
-        return self._models
-
-    def _set_state(self, state: tuple[Array, ...]) -> None:
-        self._models = models = imm.Models(*state)
-        self.mean = np.empty_like(models.means[0])
-        self.cov = np.empty_like(models.covs[0])
-        imm.combine(models.means, models.covs, models.weights, self.mean, self.cov)
-
-    def augment(self, sd: Array) -> None:
-        if self.mean.size < N_CORE + sd.size:
-            models = self._models
-            pairs = [augmented(m, c, sd) for m, c in zip(models.means, models.covs, strict=True)]
-            means = np.array([mean for mean, _ in pairs])
-            self._set_state((means, np.array([cov for _, cov in pairs]), models.weights))
-
-    @property
-    def motion(self) -> Array:
-        raise NotImplementedError("interacting models have no single motion")
-
-    def set_imu_increment(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
-        raise NotImplementedError("interacting models take no IMU")
-
-    def set_process_noise(self, accel_density: float) -> None:
-        raise NotImplementedError("interacting models have several accelerations")
-
-    def _move(self, stamp_ns: int, bias: Array) -> None:
-        dt = (stamp_ns - self.stamp_ns) * 1e-9
-        imm.predict(self._models, dt, self._motions, self._sojourn_s, bias)
-        self.stamp_ns = stamp_ns
-        self._set_state(self._models)
-
-    def _update(self, rows: Array, accepted: Array) -> tuple[float, int]:
-        result: tuple[float, int] = imm.update(
-            self._models,
-            rows,
-            self._options.height_m,
-            self._options.gate_nis,
-            self._options.iterations,
-            accepted,
-            fusion.workspace(self.mean.size, len(rows)),
-        )
-        self._set_state(self._models)
-        return result
-
-    def _open(self, sd: float, unheard_s: float) -> None:
-        for cov in self._models.covs:
-            engine.open_velocity(cov, sd, unheard_s, self._options)
-
-    def copy(self) -> ImmEstimate:
-        twin = copy.copy(self)
-        twin._restore(self._state())
-        return twin
-
-
 def start(config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> Estimate:
-    """Estimate of the configured kind from mean and covariance at ``stamp_ns``, as ``start_state``
+    """Estimate of the chosen filter from mean and covariance at ``stamp_ns``, as ``start_state``
     takes them."""
-    if config.interacts:
-        return ImmEstimate(config, stamp_ns, mean, cov)
     return KalmanEstimate(config, stamp_ns, mean, cov)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from netpos.estimation.chi_square import chi_square_bound
+from netpos.estimation.components import Dynamics
 from netpos.estimation.conditioning import RobustOptions
 from netpos.estimation.engine import GATE_SIZE, FilterOptions
 from netpos.estimation.forms.table import form_of, number_of
@@ -38,6 +39,7 @@ def options_of(config: TrackerConfig) -> FilterOptions:
         coast_after_s=float(config.coast_after_s),
         integrity_risk=float(config.integrity_risk),
         robust=robust_options_of(config),
+        models=max(len(config.motion_models), 1),
         of_form=np.array([float(getattr(config, name)) for name in form.parameters]),
         gate_nis=gate_thresholds(config.gate_probability),
     )
@@ -60,6 +62,12 @@ def motions_of(config: TrackerConfig) -> Array:
     extras = max(len(model.states) for model in models)
     idle = max(initial_extra_sd(config), default=0.0) if len(models) > 1 else 0.0
     return np.array([_motion_of(config, model, extras, idle) for model in models])
+
+
+def dynamics_of(config: TrackerConfig, bias: Array) -> Dynamics:
+    """The motion models of a planar track, as new arrays, and the biases (2, k)."""
+    motions = motions_of(config)
+    return Dynamics(motions, np.full(len(motions), config.sojourn_s), bias)
 
 
 def _motion_of(config: TrackerConfig, model: MotionModel, extras: int, idle: float) -> Array:

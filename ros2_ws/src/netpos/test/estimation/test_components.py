@@ -18,7 +18,7 @@ from netpos.estimation.rows import linear_rows
 from netpos.messages.values import Array
 from netpos.tracking import TrackerConfig
 from netpos.tracking.estimates import KalmanEstimate
-from netpos.tracking.models import motions_of, options_of
+from netpos.tracking.models import dynamics_of, options_of
 from scipy.stats import multivariate_normal
 
 OPTIONS = options_of(TrackerConfig(filter="ekf"))
@@ -392,7 +392,7 @@ def test_rows_are_reweighted_by_the_most_probable_component(name: str) -> None:
     off = np.array([4.0, 0.0])
     rows = linear_rows(x[:2] + off, R, H, 0)
     variance = rows[:, VARIANCE].copy()
-    dynamics = components.Dynamics(motions_of(config)[0], NO_BIAS)
+    dynamics = dynamics_of(config, NO_BIAS)
     epoch = EpochInput(0.0, 0.1, 0, rows)
     components.moved_to_epoch(two, epoch, dynamics, options_of(config))
     distance = np.sqrt(off @ np.linalg.solve(H @ P @ H.T + R, off) / 2.0)

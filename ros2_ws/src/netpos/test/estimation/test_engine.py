@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from engine_cases import opened, start
 from netpos.estimation import conditioning, engine
-from netpos.estimation.components import Dynamics, run_epochs
+from netpos.estimation.components import run_epochs
 from netpos.estimation.engine import EpochInput, Epochs, FilterOptions, Run
 from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import (
@@ -23,7 +23,7 @@ from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array, Field, InitialPose, RsuInfo, RsuMeasurement
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking import Tracker, TrackerConfig
-from netpos.tracking.models import motions_of, options_of, pose_state
+from netpos.tracking.models import dynamics_of, motions_of, options_of, pose_state
 
 STATIONS = [
     RsuInfo(rsu_id=f"{i}", position=np.array([*xy, 4.0]))
@@ -175,7 +175,7 @@ def run(config: TrackerConfig, mean: Array, cov: Array, inputs: Any) -> tuple[in
     stamps, starts, rows = inputs
     N, n = len(stamps), len(mean)
     out = Run(*(np.full(shape, np.nan) for shape in ((N, n), (N, n, n), N, N, N, N)))
-    before, dynamics = rows.copy(), Dynamics(motions_of(config)[0], NO_BIAS)
+    before, dynamics = rows.copy(), dynamics_of(config, NO_BIAS)
     epochs = Epochs(stamps, starts, rows)
     done = run_epochs(epochs, mean, cov, dynamics, options_of(config), out)
     np.testing.assert_array_equal(rows, before)

@@ -1,4 +1,5 @@
-"""Interacting models against FilterPy's estimator, and on a ride with a stop and a turn."""
+"""Interacting models, components of one mixture, against FilterPy's estimator, and on a ride with
+a stop and a turn."""
 
 from __future__ import annotations
 
@@ -8,9 +9,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from filterpy.kalman import IMMEstimator, KalmanFilter
-from netpos.estimation import imm
+from netpos.estimation import components, imm
+from netpos.estimation.components import Dynamics, Update
+from netpos.estimation.engine import EpochInput, FilterOptions
+from netpos.estimation.fit import neg2_log_likelihood
 from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import Kind
+from netpos.estimation.mixture import Mixture
 from netpos.estimation.motion import (
     NO_BIAS,
     Model,
@@ -21,11 +26,47 @@ from netpos.estimation.motion import (
 )
 from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.models import options_of
 from scipy.linalg import expm
 from scipy.stats import multivariate_normal
 
 Maker = Callable[..., Array]
 OPEN = np.array([np.inf])
+
+
+def options_for(models: int, gate_nis: Array = OPEN) -> FilterOptions:
+    """Of an extended Kalman filter for as many interacting models."""
+    config = TrackerConfig(filter="ekf", motion_model="interacting")
+    return options_of(config)._replace(models=models, gate_nis=gate_nis)
+
+
+def after_epoch(
+    before: Mixture,
+    rows: Array,
+    options: FilterOptions,
+    accepted: Array,
+    rejected_in_row: int = 0,
+) -> Update:
+    """The components, moved to the epoch already, after its rows."""
+    epoch = EpochInput(0.5, 0.5, rejected_in_row, rows)
+    result: Update = components.apply_epoch(before, epoch, options, 0.0, accepted)
+    return result
+
+
+def moved_and_updated(
+    before: Mixture, dt: float, motions: Array, sojourn_s: Array, rows: Array
+) -> Mixture:
+    """One step without a gate."""
+    options = options_for(len(motions))
+    moved = components.move(before, dt, Dynamics(motions, sojourn_s, NO_BIAS), options)
+    return after_epoch(moved, rows, options, np.zeros(1)).components
+
+
+def log_likelihood(mean: Array, cov: Array, rows: Array) -> float:
+    """Log density of ``rows`` as the extended Kalman filter at mean, cov sees them."""
+    distance, size = neg2_log_likelihood(mean, cov, rows, 0.0, True)
+    return float(-0.5 * (distance + size))
 
 
 @pytest.mark.parametrize("dt", [1e-6, 0.1, 3.0, 1e5])
@@ -62,14 +103,13 @@ def test_linear_track_equals_filterpy(row: Maker, random_cov: Maker) -> None:
         noise(means[k], dt, motions[k], NO_BIAS, f.Q)
         filters.append(f)
     reference = IMMEstimator(filters, weights.copy(), expm(rates * dt))
-    work, accepted, mean, cov = ekf.workspace(n, 2), np.zeros(1), np.empty(n), np.empty((n, n))
+    mixture = Mixture(means, covs, np.log(weights))
     wild = []
     for step in range(40):
         z = np.array([0.8 * step + rng.normal(), (step > 20) * 3.0 * (step - 20) + rng.normal()])
         rows = np.array([row(Kind.LINEAR, z[i], R[i, i], 0, h=H[i]) for i in range(2)])
-        imm.predict(imm.Models(means, covs, weights), dt, motions, sojourn_s, NO_BIAS)
-        imm.update(imm.Models(means, covs, weights), rows, 0.0, OPEN, 1, accepted, work)
-        imm.combine(means, covs, weights, mean, cov)
+        mixture = moved_and_updated(mixture, dt, motions, sojourn_s, rows)
+        weights, (mean, cov) = np.exp(mixture.log_weights), components.moments(mixture)
         reference.predict()
         reference.update(z)
         np.testing.assert_allclose(weights, reference.mu, rtol=1e-9, atol=1e-9)
@@ -77,8 +117,8 @@ def test_linear_track_equals_filterpy(row: Maker, random_cov: Maker) -> None:
         np.testing.assert_allclose(cov, reference.P, rtol=1e-9, atol=1e-9)
         wild.append(weights[1])
         for k in range(2):
-            np.testing.assert_allclose(means[k], filters[k].x, rtol=1e-9, atol=1e-9)
-            np.testing.assert_allclose(covs[k], filters[k].P, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(mixture.means[k], filters[k].x, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(mixture.covs[k], filters[k].P, rtol=1e-9, atol=1e-9)
     assert wild[20] < 0.5
     assert max(wild[21:]) > 0.8
 
@@ -120,7 +160,7 @@ def test_log_likelihood_equals_scipys(row: Maker, random_cov: Maker) -> None:
     )
     S = H @ cov @ H.T + np.diag(variance)
     expected = multivariate_normal(H @ mean, S).logpdf(z)
-    assert imm.log_likelihood(mean, cov, rows, 0.0) == pytest.approx(expected, rel=1e-12)
+    assert log_likelihood(mean, cov, rows) == pytest.approx(expected, rel=1e-12)
 
 
 def test_likelihood_counts_the_curvature(row: Maker) -> None:
@@ -129,19 +169,15 @@ def test_likelihood_counts_the_curvature(row: Maker) -> None:
     rows = np.array([row(Kind.RANGE, 4.0, 0.5)])
     spread = 0.5 + 0.5 * (4.0 / 3.0) ** 2
     expected = multivariate_normal(3.0, spread).logpdf(4.0)
-    assert imm.log_likelihood(mean, cov, rows, 0.0) == pytest.approx(expected, rel=1e-9)
+    assert log_likelihood(mean, cov, rows) == pytest.approx(expected, rel=1e-9)
 
 
 def test_weights_never_die() -> None:
-    weights = np.array([0.5, 0.3, 0.2])
-    imm.reweigh(weights, np.array([-1e6, -5.0, -5.0 + math.log(2.0)]))
-    assert weights[0] == pytest.approx(1e-12, rel=1e-9)
-    assert weights[1] == pytest.approx(3.0 / 7.0, rel=1e-9)
-    assert weights.sum() == pytest.approx(1.0, abs=1e-15)
+    weights = np.array([0.0, 0.3, 0.6])
     for _ in range(3):
-        imm.reweigh(weights, np.array([0.0, -2000.0, -3000.0]))
-    assert weights[0] > 0.999
-    assert (weights >= 0.999e-12).all()
+        imm.keep_alive(weights)
+    np.testing.assert_allclose(weights, [1e-12, 1.0 / 3.0, 2.0 / 3.0], rtol=1e-9)
+    assert weights.sum() == pytest.approx(1.0, abs=1e-15)
     imm.mix(np.zeros((3, 1)), np.ones((3, 1, 1)), weights, np.eye(3))
     assert (weights >= 0.999e-12).all()
 
@@ -159,36 +195,76 @@ def test_a_model_left_for_long_comes_back() -> None:
     assert covs[0, X.PX, X.PX] == pytest.approx(17.0)
 
 
-def test_one_decision_for_all_models(row: Maker) -> None:
-    """Rejected by each model alone, accepted by their mixture: its spread counts. Rejected by the
-    mixture: nobody moves."""
+def two_places() -> Mixture:
+    """Models that are as probable and believe the device 20 m apart, 1 m sd each."""
     means, covs = np.zeros((2, 6)), np.array([np.eye(6)] * 2)
     means[:, X.PX] = -10.0, 10.0
+    return Mixture(means, covs, np.log([0.25, 0.75]))
+
+
+def test_each_model_gates_by_itself(row: Maker) -> None:
+    """As every component does: one takes the row, to the other it is an outlier and its weight
+    falls; it stays alive where it was."""
+    before, accepted = two_places(), np.full(2, 9.0)
     rows = np.array(
         [
-            row(Kind.LINEAR, 0.0, 1.0, 0, h=[1, 0, 0, 0, 0, 0]),
+            row(Kind.LINEAR, -9.0, 1.0, 0, h=[1, 0, 0, 0, 0, 0]),
             row(Kind.LINEAR, 20.0, 1.0, 1, h=[0, 1, 0, 0, 0, 0]),
         ]
     )
-    weights, accepted, work = np.array([0.5, 0.5]), np.full(2, 9.0), ekf.workspace(6, 2)
-    gate_nis = np.array([0.0, 9.0])
-    before = means.copy()
-    nis, dof = imm.update(imm.Models(means, covs, weights), rows, 0.0, gate_nis, 1, accepted, work)
+    found = after_epoch(before, rows, options_for(2, np.array([0.0, 9.0])), accepted)
     assert accepted.tolist() == [1.0, 0.0]
-    assert (nis, dof) == (pytest.approx(0.0, abs=1e-12), 1)
-    np.testing.assert_allclose(means[:, X.PX], [-5.0, 5.0], rtol=1e-12)
-    assert (means[:, 1:] == before[:, 1:]).all()
-    before, before_covs = means.copy(), covs.copy()
-    result = imm.update(
-        imm.Models(means, covs, weights), rows[1:], 0.0, gate_nis, 1, accepted, work
-    )
-    assert result == (0.0, 0)
-    assert accepted[1] == 0.0
-    assert (means == before).all()
-    assert (covs == before_covs).all()
-    assert weights.tolist() == [0.5, 0.5]
-    imm.predict(imm.Models(means, covs, weights), 0.0, np.zeros((2, 16)), np.ones(2), NO_BIAS)
-    assert (means == before).all()
+    assert (found.nis, found.used) == (pytest.approx(0.5), 1)
+    np.testing.assert_allclose(found.components.means[:, X.PX], [-9.5, 10.0], rtol=1e-12)
+    np.testing.assert_array_equal(found.components.covs[1], np.eye(6))
+    assert found.components.log_weights[1] < math.log(0.75) - 1.0
+    assert np.exp(found.components.log_weights).sum() == pytest.approx(1.0)
+
+
+def test_what_all_models_refuse_moves_none(row: Maker) -> None:
+    """And speaks for none: an outlier is as probable to all."""
+    before, accepted = two_places(), np.full(1, 9.0)
+    rows = np.array([row(Kind.LINEAR, 90.0, 1.0, 0, h=[1, 0, 0, 0, 0, 0])])
+    options = options_for(2, np.array([0.0, 9.0]))
+    found = after_epoch(before, rows, options, accepted)
+    assert (accepted.tolist(), found.nis, found.used) == ([0.0], 0.0, 0)
+    for got, want in zip(found.components, before, strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-12)
+
+
+def test_velocities_open_after_rejections(row: Maker) -> None:
+    """Each model's own, by the initial speed over the time since it was last heard (0.5 s); where
+    nothing is accepted even then, it is as if they had not."""
+    before, options = two_places(), options_for(2, np.array([0.0, 9.0]))
+    rows = np.array([row(Kind.LINEAR, -3.5, 1.0, 0, h=[1, 0, 0, 0, 0, 0])])
+    refused = after_epoch(before, rows, options, np.zeros(1))
+    assert refused.used == 0
+    opened = after_epoch(before, rows, options, np.zeros(1), options.inflate_after)
+    assert opened.used == 1
+    variance = 1.0 + (options.initial_speed_sd * 0.5) ** 2
+    expected = -10.0 + 6.5 * variance / (variance + 1.0)
+    assert opened.components.means[0, X.PX] == pytest.approx(expected)
+    rows[0, 1] = 1e4
+    still = after_epoch(before, rows, options, np.zeros(1), options.inflate_after)
+    np.testing.assert_array_equal(still.components.covs, before.covs)
+
+
+def test_a_model_that_is_no_longer_sound_begins_anew(row: Maker) -> None:
+    before = two_places()
+    before.means[1, X.PX] = math.nan
+    rows = np.array([row(Kind.LINEAR, -10.0, 1.0, 0, h=[1, 0, 0, 0, 0, 0])])
+    found = after_epoch(before, rows, options_for(2), np.zeros(1)).components
+    np.testing.assert_array_equal(found.means[1], found.means[0])
+    np.testing.assert_array_equal(found.covs[1], found.covs[0])
+    assert np.exp(found.log_weights[1]) == pytest.approx(1e-12, rel=1e-6)
+
+
+def test_models_do_not_mix_without_time() -> None:
+    before = two_places()
+    dynamics = Dynamics(np.zeros((2, 16)), np.ones(2), NO_BIAS)
+    moved = components.move(before, 0.0, dynamics, options_for(2))
+    for got, want in zip(moved, before, strict=True):
+        np.testing.assert_array_equal(got, want)
 
 
 DT = 0.2
@@ -232,14 +308,21 @@ def positions(row: Maker, truth: Array, rng: np.random.Generator) -> Array:
     return np.array([row(Kind.LINEAR, z[i], 0.09, 0, h=np.eye(6)[i]) for i in range(2)])
 
 
-def test_only_ratios_of_likelihoods_count() -> None:
-    """However unlikely all are; and what no model can explain speaks for none."""
-    weights = np.array([0.5, 0.3, 0.2])
-    imm.reweigh(weights, np.log([0.2, 0.5, 0.1]) - 5000.0)
-    np.testing.assert_allclose(weights, np.array([0.1, 0.15, 0.02]) / 0.27, rtol=1e-9)
-    before = weights.copy()
-    imm.reweigh(weights, np.full(3, -np.inf))
-    assert (weights == before).all()
+def test_only_ratios_of_likelihoods_count(row: Maker) -> None:
+    """However unlikely all are: 1000 sd away the weights follow Bayes' rule by SciPy."""
+    before = two_places()
+    rows = np.array([row(Kind.LINEAR, 1000.0, 1.0, 0, h=[1, 0, 0, 0, 0, 0])])
+    found = after_epoch(before, rows, options_for(2), np.zeros(1)).components
+    logs = [multivariate_normal(m, 2.0).logpdf(1000.0) for m in (-10.0, 10.0)]
+    logs = np.array(logs) + before.log_weights
+    assert logs[0] - logs[1] < -1000.0
+    assert found.log_weights[0] == pytest.approx(math.log(1e-12))
+    rows[0, 1] = 0.1
+    found = after_epoch(before, rows, options_for(2), np.zeros(1)).components
+    logs = [multivariate_normal(m, 2.0).logpdf(0.1) for m in (-10.0, 10.0)] + before.log_weights
+    np.testing.assert_allclose(
+        np.exp(found.log_weights), np.exp(logs) / np.exp(logs).sum(), rtol=1e-9
+    )
 
 
 def test_likelihood_of_what_says_the_same_twice(row: Maker) -> None:
@@ -247,7 +330,7 @@ def test_likelihood_of_what_says_the_same_twice(row: Maker) -> None:
     mean, cov = np.zeros(6), np.diag([1e10, 1, 1, 1, 1, 1.0])
     rows = np.array([row(Kind.LINEAR, 3.0, 1e-10, 0, h=[1, 0, 0, 0, 0, 0])] * 2)
     expected = multivariate_normal(0.0, 1e10).logpdf(3.0)
-    assert imm.log_likelihood(mean, cov, rows, 0.0) == pytest.approx(expected, rel=1e-9)
+    assert log_likelihood(mean, cov, rows) == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -258,15 +341,14 @@ def test_stop_straight_turn(seed: int, row: Maker) -> None:
     truth = ride()
     epochs = [positions(row, p, rng) for p in truth]
     motions, sojourn_s = interacting_set(), np.array([8.0, 8.0, 6.0])
-    means, covs = np.zeros((3, 7)), np.array([np.diag([1.0, 1, 1, 1, 1, 1, 0.01])] * 3)
-    weights, accepted, work = np.full(3, 1 / 3), np.zeros(1), ekf.workspace(7, 2)
-    mean, cov, errors, leader = np.empty(7), np.empty((7, 7)), [], []
+    covs = np.array([np.diag([1.0, 1, 1, 1, 1, 1, 0.01])] * 3)
+    mixture = Mixture(np.zeros((3, 7)), covs, np.log(np.full(3, 1 / 3)))
+    errors, leader = [], []
     for rows, p in zip(epochs, truth, strict=True):
-        imm.predict(imm.Models(means, covs, weights), DT, motions, sojourn_s, NO_BIAS)
-        imm.update(imm.Models(means, covs, weights), rows, 0.0, OPEN, 1, accepted, work)
-        imm.combine(means, covs, weights, mean, cov)
+        mixture = moved_and_updated(mixture, DT, motions, sojourn_s, rows)
+        mean, _ = components.moments(mixture)
         errors.append(np.sum((mean[POSITION] - p) ** 2))
-        leader.append(int(np.argmax(weights)))
+        leader.append(int(np.argmax(mixture.log_weights)))
     single = min(constant_velocity(epochs, truth, accel) for accel in (0.5, 1.0, 2.0, 3.0))
     assert math.sqrt(np.mean(errors)) < 0.93 * single
     start = 0

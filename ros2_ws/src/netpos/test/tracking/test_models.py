@@ -72,6 +72,7 @@ def test_options_hold_what_the_parameters_say() -> None:
         integrity_risk=1e-5,
         coast_after_s=0.7,
         robust=RobustOptions(ROBUST.index("student_t"), 5.5, 0.1, 33.0),
+        models=1,
         of_form=options.of_form,
         gate_nis=options.gate_nis,
     )

@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from netpos.estimation.components import Dynamics, run_epochs
+from netpos.estimation.components import run_epochs
 from netpos.estimation.engine import Epochs, Run
 from netpos.estimation.intersection import METHODS, fuse_pair
 from netpos.estimation.measurement import GATE_VARIANCE, GROUP, ROW_WIDTH, VALUE, VARIANCE
@@ -28,7 +28,7 @@ from netpos.scenario.schema import NS
 from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import epoch_rows_of
-from netpos.tracking.models import motions_of, options_of
+from netpos.tracking.models import dynamics_of, options_of
 from netpos.tracking.networks.common_instant import TRACK_STATES, at_common_instant, step_matrices
 from netpos.tracking.networks.secondary import OwnNoise, Secondary
 from netpos.tracking.rsus import Rsu
@@ -110,7 +110,7 @@ class Pass:
         self._sd = np.array([network.sd_m for network in networks])[self._which]
         self._setting = setting
         config = setting.tracker
-        self._motion, self._options = motions_of(config)[0], options_of(config)
+        self._options = options_of(config)
         # the start of the run comes first, without a fix
         self._epochs = np.concatenate([[START_NS], self.stamps_ns])
         self._row_start = np.concatenate([[0], 2 * np.arange(len(self.stamps_ns) + 1)])
@@ -135,7 +135,7 @@ class Pass:
         mean[TRACK_STATES] = start
         run = Run(np.empty((n, 8)), np.empty((n, 8, 8)), *np.empty((4, n)))
         epochs = Epochs(self._epochs, self._row_start, position_rows(fixes, self._sd))
-        dynamics = Dynamics(self._motion, NO_BIAS)
+        dynamics = dynamics_of(self._setting.tracker, NO_BIAS)
         run_epochs(epochs, mean, self._start_cov, dynamics, self._options, run)
         kept = np.ix_(np.arange(1, n), TRACK_STATES, TRACK_STATES)
         return run.means[1:, TRACK_STATES], run.covs[kept]
