@@ -36,10 +36,10 @@ TESTS_OF = {
     "../test_bearing.py ../test_ekf_wide_prior.py",
     "error_state": "test_error_state_rules.py test_error_state_chunks.py test_error_state.py",
     "factor": "test_factor.py",
-    "fit": "test_fit.py test_gate.py test_imm.py::test_likelihood_of_what_says_the_same_twice",
+    "fit": "test_fit.py test_gate.py "
+    "test_interacting.py::test_likelihood_of_what_says_the_same_twice",
     "fusion": "test_ekf.py",
     "gate": "test_gate.py test_kf.py",
-    "imm": "test_imm.py -knot+stop_straight_turn",
     "iteration": "test_ekf_iteration.py test_ekf_bending.py test_ekf_wide_prior.py",
     "estimation/forms/kf": "../test_kf.py ../test_gate.py",
     "manoeuvre": "test_manoeuvre.py",
@@ -70,12 +70,19 @@ TESTS_OF = {
     },
     "engine": "test_engine_parts.py test_engine.py -knot+equals_the_tracker",
     "tracking/fit": "test_protection.py -kinnovations_and_level+or+is_not_sound",
-    "window": "../tracking/test_initialise_fit.py",
+    "estimation/mixture/window": "../../tracking/test_initialise_fit.py",
     "tracking/output": "test_output.py",
     "tracking/phase_fix": "test_phase_fix.py",
     "protection": "test_protection.py",
     "report": "test_report.py",
-    "components": "test_components.py",
+    "estimation/mixture/interacting": "../test_interacting.py -knot+stop_straight_turn",
+    **{
+        f"estimation/mixture/{name}": "../test_components.py"
+        for name in (
+            *("candidates", "cuts", "epoch", "gaussians", "paths", "reduction"),
+            *("ring", "turns"),
+        )
+    },
     "tracking/sectors": "test_sector_bank.py -kwhere_a_phase",
     "tracking/sector_bank": "test_sector_bank_rules.py test_sector_bank.py",
     "estimation/forms/ukf": "../test_ukf.py ../test_gate.py",

@@ -32,7 +32,7 @@ TDOA_ANCHORS_M = np.array(
         (-2.7228, 3.2191, 0.1583),
     ]
 )
-TDOA_HEIGHT_M = 1.5
+TDOA_HEIGHT_M, TDOA_HEIGHT_SD_M, TDOA_ARM_M = 1.5, 1.0, 0.0908
 UWB_SD_M = 0.2
 SHEET_SD_M = 0.1
 BEACON_SD_M = 0.5
@@ -70,8 +70,8 @@ def in_order(
 
 
 def import_uwb_tdoa(folder: Path, bag: Path) -> object:
-    """Time differences of eight anchors to a drone, one pair after the other. It flies at 1.5 m
-    most of the time; its antenna is 0.18 m below the tracked body."""
+    """Time differences of eight anchors to a drone, one pair after the other. Its height is
+    unknown but for that of a room; its antenna is above the tracked body, as the authors say."""
     file = folder / "const1_trial1_tdoa2.csv.gz"
     return import_csv(
         file,
@@ -80,7 +80,7 @@ def import_uwb_tdoa(folder: Path, bag: Path) -> object:
             "time=t_tdoa,rsu=idB,reference=idA,tdoa=tdoa_meas",
             "tdoa=m",
             f"tdoa={SHEET_SD_M}",
-            lever_arm_m=(0.0, 0.0, -0.18),
+            lever_arm_m=(0.0, 0.0, TDOA_ARM_M),
         ),
         [
             RsuInfo(rsu_id=str(name), position=position)
@@ -90,7 +90,7 @@ def import_uwb_tdoa(folder: Path, bag: Path) -> object:
             source=file,
             columns=TruthColumns.parse("time=t_pose,x=pose_x,y=pose_y,z=pose_z"),
         ),
-        tracker={"device_height_m": TDOA_HEIGHT_M},
+        tracker={"device_height_m": TDOA_HEIGHT_M, "device_height_sd_m": TDOA_HEIGHT_SD_M},
     )
 
 

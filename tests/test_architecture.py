@@ -147,7 +147,7 @@ def test_nodes_do_not_import_one_another(package: str) -> None:
         assert not others & {name.split(".")[0] for name in imports(path)}, path.name
 
 
-CORE = ("estimation/engine", "estimation/components", "tracking/estimates", "tracking/models")
+CORE = ("estimation/engine", "estimation/mixture/epoch", "tracking/estimates", "tracking/models")
 CORE += ("tracking/config", "tracking/smoothing", "tracking/sector_bank")
 
 

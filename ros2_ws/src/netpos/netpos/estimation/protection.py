@@ -20,7 +20,7 @@ from netpos.estimation.factor import eigenvalues
 from netpos.estimation.fusion import W_GAIN, fuse
 from netpos.estimation.manoeuvre import add_manoeuvre, detection_delay_s
 from netpos.estimation.measurement import GROUP, VARIANCE, curvature_variance, innovation_row
-from netpos.estimation.mixture import Mixture
+from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.state import X
 from netpos.messages.values import Array
 

@@ -161,6 +161,36 @@ def nlos_mixture_exponential(
 
 
 @leaf
+def blocked_excess(
+    innovation: float, innovation_var: float, mean_excess_m: float
+) -> tuple[float, float, float]:
+    """A late range taken for one of a blocked path: how much likelier it is than a direct one
+    (log), E [m] and V [m^2] of (M)."""
+    sd = math.sqrt(innovation_var)
+    z = innovation / sd - sd / mean_excess_m
+    mean, variance = _positive_normal(z)
+    likelier = math.log(sd / mean_excess_m) + _log_mills(z)
+    return likelier, sd * mean, innovation_var * variance
+
+
+@leaf
+def matching_cost(
+    blocked: float, mean: float, variance: float, innovation_var: float, measurement_var: float
+) -> float:
+    """What one Gaussian for both paths adds to the divergence, at most (Runnalls 2007, eq. 21).
+
+    The path is ``blocked`` with this probability, with the excess ``mean`` [m], ``variance``
+    [m^2].
+
+    Along the gain K of the update both covariances differ from that of the direct path, and
+    K' P^-1 K = A / (S R) with A = S - R.
+    """
+    known = (innovation_var - measurement_var) / (innovation_var * measurement_var)
+    _, _, together = _mixed(blocked, mean, variance)
+    return 0.5 * (math.log1p(known * together) - blocked * math.log1p(known * variance))
+
+
+@leaf
 def update_prior(
     alpha: float,
     beta: float,

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from netpos.estimation import engine
-from netpos.estimation.components import one_component, run_epochs
 from netpos.estimation.engine import Run
 from netpos.estimation.measurement import BIAS
-from netpos.estimation.mixture import Mixture
+from netpos.estimation.mixture.epoch import run_epochs
+from netpos.estimation.mixture.gaussians import Mixture, one_component
 from netpos.estimation.report import run_levels
 from netpos.estimation.state import N_CORE
 from netpos.evaluation.metrics import NS

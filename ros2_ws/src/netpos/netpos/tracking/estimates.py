@@ -6,12 +6,15 @@ from typing import Protocol
 
 import numpy as np
 
-from netpos.estimation import components, engine
-from netpos.estimation.components import Dynamics, moments
-from netpos.estimation.engine import EpochInput
+from netpos.estimation import engine
+from netpos.estimation.engine import EpochInput, StepResult
 from netpos.estimation.forms.table import form_of
 from netpos.estimation.measurement import GROUP
-from netpos.estimation.mixture import Mixture, mode_of
+from netpos.estimation.mixture import epoch as mixtures
+from netpos.estimation.mixture.epoch import Dynamics
+from netpos.estimation.mixture.gaussians import Mixture, mode_of, moments, one_component
+from netpos.estimation.mixture.paths import paths_are_open
+from netpos.estimation.mixture.ring import NARROW_M
 from netpos.estimation.motion import NO_BIAS, Parameter
 from netpos.estimation.protection import mixture_radius
 from netpos.estimation.state import N_CORE, X
@@ -51,7 +54,7 @@ class Estimate(Protocol):
 
     def change_prior(self, index: int, before: float, after: float) -> None:
         """Take the bias state ``index``, whose prior had the sd ``before``, for one of sd
-        ``after``; nothing happens to several components."""
+        ``after``; nothing happens to several mixtures."""
 
     def predict(self, stamp_ns: int, bias: Array) -> None:
         """Move to ``stamp_ns``."""
@@ -103,7 +106,7 @@ class OneModel:
 
 class KalmanEstimate(OneModel):
     """One component in the compiled engine, or a mixture of them: while one does not explain the
-    measurements, or where several motion models interact (``estimation.components``)."""
+    measurements, or where several motion models interact (``estimation.mixture``)."""
 
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
         self.stamp_ns = self._turn_ns = stamp_ns
@@ -117,7 +120,7 @@ class KalmanEstimate(OneModel):
         mean, cov = start_state(config, mean, cov)
         self.mean, self._cov_or_sqrt = mean.copy(), engine.to_cov_or_sqrt(cov, self._options)
         if self._options.models > 1:
-            self._components = components.a_component_each(mean, cov, self._dynamics)
+            self._components = mixtures.a_component_each(mean, cov, self._dynamics)
         self._rows = 0
         self._make_room(4)
 
@@ -134,6 +137,10 @@ class KalmanEstimate(OneModel):
         n = self.mean.size
         self._rows = max(rows, self._rows)
         self._scratch: engine.Scratch = engine.scratch(n, self._rows)
+
+    @property
+    def _paths_may_be_blocked(self) -> bool:
+        return self._options.models == 1 and self._options.robust.nlos_probability > 0.0
 
     @property
     def cov(self) -> Array:
@@ -201,7 +208,7 @@ class KalmanEstimate(OneModel):
         if self._components is None:
             engine.predict(self.mean, self._cov_or_sqrt, dt, self._motion, bias, self._options)
         elif dt > 0.0:
-            self._set(components.move(self._components, dt, self._with(bias), self._options))
+            self._set(mixtures.move(self._components, dt, self._with(bias), self._options))
 
     def step(
         self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
@@ -216,31 +223,54 @@ class KalmanEstimate(OneModel):
         motion, options, groups = self._motion, self._options, int(rows.item(-1, GROUP)) + 1
         since_turn_s = (stamp_ns - self._turn_ns) * 1e-9
         coasted = self._components is None and dt_s > options.coast_after_s
-        if coasted and components.is_too_wide(
-            self.mean, self.cov, epoch, self._with(bias), options
-        ):
-            self._components = components.one_component(self.mean, self.cov)
+        if coasted and mixtures.is_too_wide(self.mean, self.cov, epoch, self._with(bias), options):
+            self._components = one_component(self.mean, self.cov)
         if self._components is None:
+            raw = rows.copy() if self._paths_may_be_blocked else rows
             result = engine.step(
                 self.mean, self._cov_or_sqrt, epoch, motion, bias, options, self._scratch
             )
             self.stamp_ns, self._prior = stamp_ns, None
-            refused = result.groups < groups
-            if not (refused or groups == 1) or not components.is_not_enough(
-                result, self.mean, epoch, since_turn_s, options
-            ):
+            before = self._prior_of_one()
+            if self._explains(result, raw, epoch, since_turn_s):
+                self._cut(rows)
                 return result.nis, result.used, accepted[:groups]
-            prior = components.one_component(*self._prior_of_one())
+            prior = one_component(*before)
+            rows[:] = raw
         else:
-            prior = components.moved_to_epoch(self._components, epoch, self._with(bias), options)
+            prior = mixtures.moved_to_epoch(self._components, epoch, self._with(bias), options)
             self.stamp_ns = stamp_ns
-        found = components.apply_epoch(prior, epoch, options, since_turn_s, accepted)
-        components.note_turn(found, motion, options)
+        found = mixtures.apply_epoch(prior, epoch, options, since_turn_s, accepted)
+        mixtures.note_turn(found, motion, options)
         self._prior = moments(prior)
         self._set(found.components)
         if found.begun:
             self._turn_ns = stamp_ns
         return found.nis, found.used, accepted[:groups]
+
+    def _explains(
+        self, result: StepResult, raw: Array, epoch: EpochInput, since_turn_s: float
+    ) -> bool:
+        """Whether one component explains an epoch with the rows ``raw``, of which ``engine.step``
+        made ``result``."""
+        groups, options = int(raw.item(-1, GROUP)) + 1, self._options
+        if result.groups < groups or groups == 1:
+            more = mixtures.is_not_enough(result, self.mean, epoch, since_turn_s, options)
+            if more:
+                return False
+        if not self._paths_may_be_blocked:
+            return True
+        return not paths_are_open(*self._prior_of_one(), raw, options)
+
+    def _cut(self, rows: Array) -> None:
+        """Cut the one component where ``rows`` bend over it."""
+        if self._options.models > 1:
+            return
+        cov = self.cov
+        if cov.item(0, 0) + cov.item(1, 1) >= NARROW_M**2:
+            cut = mixtures.cut_where_bent(self.mean, cov, rows, self._options)
+            if cut.log_weights.size > 1:
+                self._set(cut)
 
     def copy(self) -> KalmanEstimate:
         twin = KalmanEstimate.__new__(KalmanEstimate)

@@ -38,12 +38,14 @@ from netpos.estimation.measurement import (
     Kind,
     wrap,
 )
-from netpos.estimation.mixture import RING_MERGE_COST, Mixture, mode_of, reduced
+from netpos.estimation.mixture.gaussians import Mixture, mode_of
+from netpos.estimation.mixture.reduction import reduced
+from netpos.estimation.mixture.ridge import Fit, components_of, inverse
+from netpos.estimation.mixture.ring import RING_MERGE_COST
+from netpos.estimation.mixture.window import normal_equations
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
-from netpos.estimation.ridge import Fit, components_of, inverse
 from netpos.estimation.sensors.table import BY_KIND
 from netpos.estimation.state import N_CORE
-from netpos.estimation.window import normal_equations
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.models import carries_modes

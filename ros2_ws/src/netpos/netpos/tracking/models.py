@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from netpos.estimation.chi_square import chi_square_bound
-from netpos.estimation.components import Dynamics
 from netpos.estimation.conditioning import RobustOptions
 from netpos.estimation.engine import GATE_SIZE, FilterOptions
 from netpos.estimation.forms.table import form_of, number_of
+from netpos.estimation.mixture.epoch import Dynamics
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS, Model, ProcessNoise, motion_parameters
 from netpos.estimation.motion.model import MotionModel
 from netpos.estimation.state import N_CORE, POSITION, HeightState, X

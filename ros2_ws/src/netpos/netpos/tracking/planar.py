@@ -9,8 +9,8 @@ from typing import Self
 
 import numpy as np
 
-from netpos.estimation.components import moments, one_component
 from netpos.estimation.measurement import VARIANCE
+from netpos.estimation.mixture.gaussians import moments, one_component
 from netpos.estimation.protection import FusedEpoch
 from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import (

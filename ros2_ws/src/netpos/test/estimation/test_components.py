@@ -8,18 +8,21 @@ from typing import Any
 import numpy as np
 import pytest
 from filter_rows import make_cov, row
-from netpos.estimation import components, mixture
-from netpos.estimation.components import moments, one_component
 from netpos.estimation.engine import EpochInput
 from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import GROUP, VARIANCE, Kind
+from netpos.estimation.mixture import epoch as epochs
+from netpos.estimation.mixture.cuts import cut, cut_length
+from netpos.estimation.mixture.gaussians import Mixture, mode_of, moments, one_component
+from netpos.estimation.mixture.reduction import reduced
+from netpos.estimation.mixture.ring import RING_MERGE_COST, is_wide, split_along_ring
 from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.rows import linear_rows
 from netpos.messages.values import Array
 from netpos.tracking import TrackerConfig
 from netpos.tracking.estimates import KalmanEstimate
 from netpos.tracking.models import dynamics_of, options_of
-from scipy.stats import multivariate_normal
+from scipy.stats import exponnorm, multivariate_normal, norm
 
 OPTIONS = options_of(TrackerConfig(filter="ekf"))
 ANCHORS = np.array([[2.6, 0.0, 1.0], [0.0, 2.6, 1.0], [-2.6, 0.0, 1.0], [0.0, -2.6, 1.0]])
@@ -36,10 +39,10 @@ def prior(
     return x, P
 
 
-def after(parts: mixture.Mixture, *rows: Array) -> tuple[mixture.Mixture, int]:
+def after(parts: Mixture, *rows: Array) -> tuple[Mixture, int]:
     """The mixture after one epoch, and the number of rows taken."""
     epoch = EpochInput(0.0, 0.0, 0, np.array(rows))
-    found = components.apply_epoch(parts, epoch, OPTIONS, 0.0, np.zeros(len(rows)))
+    found = epochs.apply_epoch(parts, epoch, OPTIONS, 0.0, np.zeros(len(rows)))
     return found.components, found.used
 
 
@@ -70,10 +73,10 @@ def test_a_ring_is_the_product_of_prior_and_range(
     """Evidence and moments of the position, also where the prior lies on the RSU."""
     x, P = prior(centre, sd)
     measured = row(Kind.RANGE, 15.0, 0.3**2)
-    parts = mixture.split_along_ring(x, P, measured, 0.0)
+    parts = split_along_ring(x, P, measured, 0.0)
     evidence, mean, cov = on_grid(x, P, [measured], 30.0, 0.1)
     assert np.exp(parts[2]).sum() == pytest.approx(evidence, rel=0.03)
-    parts = mixture.Mixture(parts[0], parts[1], parts[2] - np.log(np.exp(parts[2]).sum()))
+    parts = Mixture(parts[0], parts[1], parts[2] - np.log(np.exp(parts[2]).sum()))
     found, found_cov = moments(parts)
     scale = np.sqrt(np.trace(cov))
     np.testing.assert_allclose(found[:2], mean, atol=0.03 * scale)
@@ -83,7 +86,7 @@ def test_a_ring_is_the_product_of_prior_and_range(
 def test_the_other_states_follow_the_position() -> None:
     """A velocity that hangs together with the position is told by it, component by component."""
     x, P = prior((14.0, 0.0), (6.0, 6.0), rho=0.8)
-    means, covs, logs = mixture.split_along_ring(x, P, row(Kind.RANGE, 15.0, 0.3**2), 0.0)
+    means, covs, logs = split_along_ring(x, P, row(Kind.RANGE, 15.0, 0.3**2), 0.0)
     gain = P[2:4, :2] @ np.linalg.inv(P[:2, :2])
     np.testing.assert_allclose(means[:, 2:4] - x[2:4], (means[:, :2] - x[:2]) @ gain.T, atol=1e-9)
     rest = P[2:4, 2:4] - gain @ P[:2, 2:4]
@@ -112,7 +115,7 @@ def test_ranges_of_four_near_anchors_after_silence(seed: int) -> None:
     found, found_cov = moments(parts)
     assert np.linalg.norm(found[:2] - mean) < 0.15 * np.sqrt(np.trace(cov))
     assert np.trace(found_cov[:2, :2]) == pytest.approx(np.trace(cov), rel=0.15)
-    assert not mixture.mode_of(parts).any()
+    assert not mode_of(parts).any()
 
 
 def test_two_anchors_leave_two_modes_of_equal_weight() -> None:
@@ -123,7 +126,7 @@ def test_two_anchors_leave_two_modes_of_equal_weight() -> None:
         value = np.linalg.norm(np.append(truth, 0.0) - anchor)
         r = row(Kind.RANGE, value, 0.2**2, origin=anchor)
         parts, _ = after(parts, r)
-    mode, weights = mixture.mode_of(parts), np.exp(parts[2])
+    mode, weights = mode_of(parts), np.exp(parts[2])
     assert set(mode.tolist()) == {0, 1}
     np.testing.assert_allclose(np.bincount(mode, weights), 0.5, atol=0.05)
     for side in (0, 1):
@@ -143,7 +146,7 @@ def test_one_narrow_component_is_the_extended_filter() -> None:
     )
     accepted = np.zeros(3)
     epoch = EpochInput(0.0, 0.0, 0, rows)
-    found = components.apply_epoch(one_component(x, P), epoch, OPTIONS, 0.0, accepted)
+    found = epochs.apply_epoch(one_component(x, P), epoch, OPTIONS, 0.0, accepted)
     means, covs, logs = found.components
     assert (logs.tolist(), found.used, accepted.tolist()) == ([0.0], 3, [1.0, 1.0, 1.0])
     expected, expected_cov, work = x.copy(), P.copy(), ekf.workspace(6, 3)
@@ -158,11 +161,11 @@ def test_merging_keeps_the_moments_and_what_is_alike_becomes_one() -> None:
     means = rng.normal(0.0, 0.01, (6, 6)) + np.repeat([[0.0] * 6, [50.0] * 6], 3, axis=0)
     covs = np.array([make_cov(rng, 6, 4.0)] * 6)
     logs = np.log(np.full(6, 1.0 / 6.0)) + 3.0  # not normalised
-    parts = mixture.reduced(mixture.Mixture(means, covs, logs), mixture.RING_MERGE_COST)
+    parts = reduced(Mixture(means, covs, logs), RING_MERGE_COST)
     assert parts[2].size == 2
     np.testing.assert_allclose(np.exp(parts[2]).sum(), 1.0)
     for ours, expected in zip(
-        moments(parts), moments(mixture.Mixture(means, covs, logs - 3.0)), strict=True
+        moments(parts), moments(Mixture(means, covs, logs - 3.0)), strict=True
     ):
         np.testing.assert_allclose(ours, expected, rtol=1e-10, atol=1e-10)
 
@@ -172,22 +175,22 @@ def test_components_without_weight_go_and_never_too_many_stay() -> None:
     means = np.column_stack([100.0 * np.arange(100.0), *rng.normal(size=(5, 100))])
     covs, logs = np.tile(np.eye(6), (100, 1, 1)), np.zeros(100)
     logs[7] = -30.0
-    kept, _, weights = mixture.reduced(mixture.Mixture(means, covs, logs), mixture.RING_MERGE_COST)
+    kept, _, weights = reduced(Mixture(means, covs, logs), RING_MERGE_COST)
     assert weights.size == 64
     assert not (np.abs(kept[:, 0] - 700.0) < 1.0).any()
 
 
-def crowd(rng: np.random.Generator, count: int) -> mixture.Mixture:
+def crowd(rng: np.random.Generator, count: int) -> Mixture:
     """Components round a ring of 5 m."""
     angle = rng.uniform(0.0, 2.0 * np.pi, count)
     means = np.column_stack(
         [5.0 * np.cos(angle), 5.0 * np.sin(angle), *rng.normal(0.0, 0.3, (4, count))]
     )
     covs = np.array([0.2 * make_cov(rng, 6, 1.0) for _ in range(count)])
-    return mixture.Mixture(means, covs, rng.normal(0.0, 1.0, count))
+    return Mixture(means, covs, rng.normal(0.0, 1.0, count))
 
 
-def merged_step_by_step(parts: mixture.Mixture, cost: float) -> list[tuple[float, Array]]:
+def merged_step_by_step(parts: Mixture, cost: float) -> list[tuple[float, Array]]:
     """Weights and means after Runnalls' algorithm as he writes it: all pairs, each time."""
     weights = np.exp(parts.log_weights)
     left = list(zip(weights / weights.sum(), parts.means, parts.covs, strict=True))
@@ -216,7 +219,7 @@ def merged_step_by_step(parts: mixture.Mixture, cost: float) -> list[tuple[float
 def test_the_pair_that_costs_least_is_merged_first() -> None:
     parts = crowd(np.random.default_rng(8), 25)
     expected = merged_step_by_step(parts, 0.05)
-    means, _, logs = mixture.reduced(parts, 0.05)
+    means, _, logs = reduced(parts, 0.05)
     assert 3 < len(expected) == logs.size < 20
     np.testing.assert_allclose(np.exp(logs), [w for w, _ in expected], rtol=1e-9)
     np.testing.assert_allclose(means, [mean for _, mean in expected], rtol=1e-9)
@@ -224,10 +227,10 @@ def test_the_pair_that_costs_least_is_merged_first() -> None:
 
 def test_very_many_are_merged_in_parts_and_keep_their_moments() -> None:
     parts = crowd(np.random.default_rng(9), 1500)
-    few = mixture.reduced(parts, 1e-5)
+    few = reduced(parts, 1e-5)
     assert few.log_weights.size <= 64
     weights = np.exp(parts.log_weights)
-    normal = mixture.Mixture(parts.means, parts.covs, np.log(weights / weights.sum()))
+    normal = Mixture(parts.means, parts.covs, np.log(weights / weights.sum()))
     for ours, expected in zip(moments(few), moments(normal), strict=True):
         np.testing.assert_allclose(ours, expected, rtol=1e-9, atol=1e-9)
 
@@ -261,15 +264,15 @@ def test_a_component_is_wide_where_the_tangent_costs_a_quarter_of_the_noise(
     distance: float, sd: float, wide: bool
 ) -> None:
     x, P = prior((distance, 0.0), (0.1, sd))
-    assert mixture.is_wide(row(Kind.RANGE, distance, 0.04), x, P, 0.0) is wide
-    assert not mixture.is_wide(row(Kind.AZIMUTH, 0.0, 0.04), x, P, 0.0)
+    assert is_wide(row(Kind.RANGE, distance, 0.04), x, P, 0.0) is wide
+    assert not is_wide(row(Kind.AZIMUTH, 0.0, 0.04), x, P, 0.0)
 
 
 def test_modes_are_chains_of_components() -> None:
     means = np.zeros((5, 6))
     means[:, 0] = 0.0, 3.0, 6.0, 9.0, 40.0
     covs = np.tile(np.eye(6), (5, 1, 1))
-    mode = mixture.mode_of(mixture.Mixture(means, covs, np.log([0.1, 0.1, 0.1, 0.1, 0.6])))
+    mode = mode_of(Mixture(means, covs, np.log([0.1, 0.1, 0.1, 0.1, 0.6])))
     assert mode.tolist() == [1, 1, 1, 1, 0]
 
 
@@ -309,7 +312,7 @@ def test_a_refused_fix_is_an_outlier_a_tail_or_a_turn(off_m: float, unheard_s: f
     z = x[:2] + off_m * np.array([1.0, 0.0])
     rows, accepted = linear_rows(z, R, H, 0), np.zeros(1)
     epoch = EpochInput(0.1, unheard_s, 0, rows)
-    found = components.apply_epoch(one_component(x, P), epoch, TURNING, 0.0, accepted)
+    found = epochs.apply_epoch(one_component(x, P), epoch, TURNING, 0.0, accepted)
     S = H @ P @ H.T + R
     delay_s = 2.0 * np.sqrt(2.0 * TURNING.gate_nis[2] / np.trace(np.linalg.inv(S))) / 5.0
     within_s = max(unheard_s, delay_s)
@@ -320,7 +323,7 @@ def test_a_refused_fix_is_an_outlier_a_tail_or_a_turn(off_m: float, unheard_s: f
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     means, covs = np.array([x, tail[1], turn[1]]), np.array([P, tail[2], turn[2]])
-    mean, cov = moments(mixture.Mixture(means, covs, np.log(weights)))
+    mean, cov = moments(Mixture(means, covs, np.log(weights)))
     ours, our_cov = moments(found.components)
     np.testing.assert_allclose(ours, mean, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(our_cov, cov, rtol=1e-5, atol=1e-6)
@@ -335,7 +338,7 @@ def test_a_fix_within_the_gate_leaves_one_component_and_without_manoeuvres_so_do
         rows = linear_rows(x[:2] + off_m * np.array([1.0, 0.0]), R, H, 0)
         rows = np.vstack([rows, linear_rows(x[:2], R, H, 1)])
         epoch = EpochInput(0.1, 0.1, 0, rows)
-        found = components.apply_epoch(one_component(x, P), epoch, options, 9.0, np.zeros(2))
+        found = epochs.apply_epoch(one_component(x, P), epoch, options, 9.0, np.zeros(2))
         assert found.components.log_weights.size == 1
         assert found.turned == 0.0
 
@@ -345,7 +348,7 @@ def test_one_rsu_lets_a_turn_begin_every_quarter_of_a_second(since_s: float, beg
     x, P = prior((1.0, 2.0), (0.2, 0.3))
     rows = linear_rows(x[:2], R, H, 0)
     epoch = EpochInput(0.1, 0.1, 0, rows)
-    found = components.apply_epoch(one_component(x, P), epoch, TURNING, since_s, np.zeros(1))
+    found = epochs.apply_epoch(one_component(x, P), epoch, TURNING, since_s, np.zeros(1))
     assert found.begun is begins
     assert (found.components.log_weights.size > 1) is begins
     if begins:
@@ -388,12 +391,96 @@ def test_rows_are_reweighted_by_the_most_probable_component(name: str) -> None:
         filter=name, robust="huber", robust_parameter=1.5, manoeuvre_speed_sd_mps=5.0
     )
     x, P = prior((1.0, 2.0), (0.2, 0.3))
-    two = mixture.Mixture(np.array([x + 40.0, x]), np.array([P, P]), np.log(np.array([0.1, 0.9])))
+    two = Mixture(np.array([x + 40.0, x]), np.array([P, P]), np.log(np.array([0.1, 0.9])))
     off = np.array([4.0, 0.0])
     rows = linear_rows(x[:2] + off, R, H, 0)
     variance = rows[:, VARIANCE].copy()
     dynamics = dynamics_of(config, NO_BIAS)
     epoch = EpochInput(0.0, 0.1, 0, rows)
-    components.moved_to_epoch(two, epoch, dynamics, options_of(config))
+    epochs.moved_to_epoch(two, epoch, dynamics, options_of(config))
     distance = np.sqrt(off @ np.linalg.solve(H @ P @ H.T + R, off) / 2.0)
     np.testing.assert_allclose(rows[:, VARIANCE] / variance, distance / 1.5, rtol=1e-9)
+
+
+@pytest.mark.parametrize("share", [0.9, 0.5, 0.2])
+def test_a_cut_gaussian_is_still_the_same(share: float) -> None:
+    """Weights, mean and covariance are kept; each part is shorter along the widest axis only."""
+    x, P = prior((30.0, 4.0), (6.0, 1.0), rho=0.5)
+    P[0, 1] = P[1, 0] = 3.0
+    values, vectors = np.linalg.eigh(P[:2, :2])
+    parts = cut(x, P, share)
+    assert np.exp(parts.log_weights).sum() == pytest.approx(1.0, abs=1e-3)
+    parts = parts._replace(log_weights=parts.log_weights - np.log(np.exp(parts.log_weights).sum()))
+    mean, cov = moments(parts)
+    np.testing.assert_allclose(mean, x, atol=1e-6)
+    np.testing.assert_allclose(cov, P, rtol=1e-3, atol=1e-3)
+    for part in parts.covs:
+        along = vectors.T @ part[:2, :2] @ vectors
+        assert along[1, 1] == pytest.approx(share**2 * values[1], rel=1e-9)
+        assert along[0, 0] == pytest.approx(values[0], rel=1e-9)
+
+
+@pytest.mark.parametrize(("across_m", "is_cut"), [(0.19, True), (0.21, False)])
+def test_a_component_is_cut_where_a_range_bends_over_its_width(
+    across_m: float, is_cut: bool
+) -> None:
+    """25 m away and so long that the second-order sd l^2 / (sqrt(2) 25 m) is 0.1 m: half of the
+    width across must be more."""
+    x, P = prior((25.0, 0.0), (across_m, np.sqrt(0.1 * np.sqrt(2.0) * 25.0)))
+    share = cut_length(np.array([row(Kind.RANGE, 25.0, 0.04)]), x, P, 0.0)
+    assert (share < 1.0) is is_cut
+
+
+@pytest.mark.parametrize(("along_m", "share"), [(1.9, 1.0), (2.1, 2.0 / 2.1), (4.0, 0.5)])
+def test_a_component_is_cut_to_a_tenth_of_the_distance_along_a_ray(
+    along_m: float, share: float
+) -> None:
+    x, P = prior((20.0, 0.0), (along_m, 0.4))
+    bearing = np.array([row(Kind.AZIMUTH, 0.0, 0.02**2)])
+    assert cut_length(bearing, x, P, 0.0) == pytest.approx(share, rel=1e-3)
+
+
+def blocked_on_grid(
+    x: Array, P: Array, rows: list[Array], share: float, excess_m: float
+) -> tuple[Array, Array]:
+    """Mean and covariance of the position, each range direct or late, by sums."""
+    axis = np.arange(-8.0, 8.0, 0.04)
+    grid = np.stack(np.meshgrid(axis + x[0], axis + x[1], indexing="ij"), axis=-1).reshape(-1, 2)
+    log = multivariate_normal(x[:2], P[:2, :2]).logpdf(grid)
+    for r in rows:
+        off = r[1] - np.linalg.norm(grid - r[7:9], axis=1)
+        late = exponnorm(excess_m / np.sqrt(r[2]), scale=np.sqrt(r[2])).pdf(off)
+        log += np.log((1.0 - share) * norm(scale=np.sqrt(r[2])).pdf(off) + share * late + 1e-300)
+    weight = np.exp(log - log.max())
+    weight /= weight.sum()
+    mean = weight @ grid
+    away = grid - mean
+    return mean, (away * weight[:, None]).T @ away
+
+
+@pytest.mark.parametrize("late_m", [(0.0, 0.0, 0.0), (2.5, 0.0, 0.0), (1.2, 0.0, 3.0)])
+def test_blocked_paths_against_the_grid(late_m: tuple[float, float, float]) -> None:
+    """A device known to 2 m, ranges of three anchors far away, the first of them late."""
+    share, excess_m = 0.3, 2.0
+    options = options_of(
+        TrackerConfig(
+            filter="ekf",
+            nlos_probability=share,
+            nlos_mean_excess_m=excess_m,
+            manoeuvre_speed_sd_mps=0.0,
+        )
+    )
+    x, P = prior((1.0, -2.0), (2.0, 2.0))
+    x[2:4] = 0.0
+    truth, parts, rows = x[:2] + np.array([0.7, -0.5]), one_component(x, P), []
+    for origin, late in zip([(60.0, 0.0), (0.0, 60.0), (-40.0, -40.0)], late_m, strict=True):
+        value = float(np.hypot(*(truth - origin))) + late
+        rows.append(row(Kind.RANGE, value, 0.2**2, origin=np.array([*origin, 0.0])))
+        epoch = EpochInput(0.0, 0.0, 0, np.array(rows[-1:]))
+        parts = epochs.apply_epoch(parts, epoch, options, 0.0, np.zeros(1)).components
+    found, found_cov = moments(parts)
+    mean, cov = blocked_on_grid(x, P, rows, share, excess_m)
+    off = found[:2] - mean
+    assert np.sqrt(off @ np.linalg.solve(cov, off) / 2.0) < 0.15
+    # The excess of a blocked path is exponential; a component takes its moments.
+    assert np.trace(found_cov[:2, :2]) == pytest.approx(np.trace(cov), rel=0.4)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from engine_cases import opened, start
 from netpos.estimation import conditioning, engine
-from netpos.estimation.components import run_epochs
 from netpos.estimation.engine import EpochInput, Epochs, FilterOptions, Run
 from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import (
@@ -17,6 +16,7 @@ from netpos.estimation.measurement import (
     ROW_WIDTH,
     Kind,
 )
+from netpos.estimation.mixture.epoch import run_epochs
 from netpos.estimation.motion import NO_BIAS, SPEED_OF_LIGHT_MPS, Parameter, noise
 from netpos.estimation.rows import rsu_axes, rsu_rows
 from netpos.estimation.state import POSITION, X

@@ -21,7 +21,7 @@ from netpos.estimation.measurement import (
     curvature_variance,
     linearise,
 )
-from netpos.estimation.mixture import Mixture
+from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.protection import (
     RISK_MIN,
     FusedEpoch,

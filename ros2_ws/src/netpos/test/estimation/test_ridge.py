@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 from netpos.common.least_squares import minimise
-from netpos.estimation.mixture import Mixture
-from netpos.estimation.ridge import Equations, Fit, components_of, inverse
+from netpos.estimation.mixture.gaussians import Mixture
+from netpos.estimation.mixture.ridge import Equations, Fit, components_of, inverse
 from netpos.messages.values import Array
 
 ANCHORS = np.array([[1.3, 2.2], [-1.3, 2.2], [1.3, -2.2], [-1.3, -2.2]])

@@ -305,3 +305,36 @@ def test_a_filter_with_the_mixture_is_consistent() -> None:
             assert np.mean(nees) == pytest.approx(1.0, abs=0.15)
         else:
             assert np.mean(errors) > 4.0
+
+
+@pytest.mark.parametrize("innovation", [-0.4, 0.3, 1.5, 6.0])
+def test_a_blocked_path_alone_by_integration(innovation: float) -> None:
+    """How much likelier a blocked path is, and the moments of its excess, from sums."""
+    total, mean_m = 0.34, 2.0
+    excess = np.linspace(0.0, 40.0, 400_001)
+    density = stats.norm.pdf(innovation - excess, scale=math.sqrt(total))
+    density *= np.exp(-excess / mean_m) / mean_m
+    evidence = integrate.trapezoid(density, excess)
+    expected = integrate.trapezoid(excess * density, excess) / evidence
+    variance = integrate.trapezoid((excess - expected) ** 2 * density, excess) / evidence
+    found = robust.blocked_excess(innovation, total, mean_m)
+    direct = stats.norm.pdf(innovation, scale=math.sqrt(total))
+    assert found[0] == pytest.approx(math.log(evidence / direct), abs=1e-6)
+    assert found[1:] == pytest.approx((expected, variance), rel=1e-5)
+
+
+@pytest.mark.parametrize("blocked", [0.0, 0.2, 0.7, 1.0])
+def test_cost_of_one_gaussian_for_both_paths_is_runnalls_bound(blocked: float) -> None:
+    """From the covariances of three states, of which one range sees two."""
+    rng = np.random.default_rng(2)
+    B = rng.normal(size=(3, 3))
+    P, h, noise = B @ B.T + np.eye(3), np.array([0.6, -0.8, 0.0]), 0.04
+    total = float(h @ P @ h) + noise
+    K = P @ h / total
+    direct = P - np.outer(K, K) * total
+    mean, variance = 1.7, 0.6
+    both = blocked * variance + blocked * (1.0 - blocked) * mean**2
+    log_dets = [np.linalg.slogdet(direct + np.outer(K, K) * v)[1] for v in (both, variance, 0.0)]
+    expected = log_dets[0] - blocked * log_dets[1] - (1.0 - blocked) * log_dets[2]
+    cost = robust.matching_cost(blocked, mean, variance, total, noise)
+    assert cost == pytest.approx(0.5 * expected, rel=1e-9, abs=1e-12)

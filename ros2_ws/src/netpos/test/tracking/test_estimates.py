@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from filterpy_estimate import FilterpyEstimate
-from netpos.estimation.components import run_epochs
 from netpos.estimation.engine import Epochs, Run
+from netpos.estimation.mixture.epoch import run_epochs
 from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.rows import linear_rows
 from netpos.estimation.state import POSITION, X

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from first_fix import at, fix_of, measure, rsu, solve
 from netpos.estimation.measurement import Kind, linearise
-from netpos.estimation.mixture import Mixture
-from netpos.estimation.ridge import inverse as inverse_of
+from netpos.estimation.mixture.gaussians import Mixture
+from netpos.estimation.mixture.ridge import inverse as inverse_of
+from netpos.estimation.mixture.window import normal_equations
 from netpos.estimation.rows import speed_row
-from netpos.estimation.window import normal_equations
 from netpos.messages.values import AngleConvention, Array, Field
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.initialise import (

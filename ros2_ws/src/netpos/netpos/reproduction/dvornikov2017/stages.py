@@ -14,10 +14,10 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from netpos.estimation.components import run_epochs
 from netpos.estimation.engine import Epochs, Run
 from netpos.estimation.intersection import METHODS, fuse_pair
 from netpos.estimation.measurement import GATE_VARIANCE, GROUP, ROW_WIDTH, VALUE, VARIANCE
+from netpos.estimation.mixture.epoch import run_epochs
 from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array, Field, NetworkTrack, RsuInfo, RsuMeasurement

@@ -2,7 +2,7 @@
 and Bar-Shalom 1988; Bar-Shalom, Li and Kirubarajan 2001, section 11.6). Everything works in place.
 
 What a component does at a measurement, and what its likelihood makes of its weight, is the same as
-for all other components (``components``).
+for all other components (``epoch``). No other component has its velocity opened, none is merged.
 """
 
 from __future__ import annotations
@@ -12,6 +12,10 @@ import math
 import numpy as np
 
 from netpos.estimation.compile import kernel
+from netpos.estimation.engine import EpochInput, FilterOptions
+from netpos.estimation.mixture.candidates import Candidates
+from netpos.estimation.mixture.gaussians import Mixture, combine
+from netpos.estimation.motion import add_velocity_step
 from netpos.messages.values import Array
 
 # No model is ever ruled out: its way back would take this many e-folds less.
@@ -63,29 +67,31 @@ def mix(means: Array, covs: Array, weights: Array, transition: Array) -> None:
 
 
 @kernel
-def combine(means: Array, covs: Array, weights: Array, mean: Array, cov: Array) -> None:
-    """Mean and covariance of the mixture, the spread of the means included: eq. 11.6.6-14, 15;
-    written to ``mean`` (n,) and ``cov`` (n, n)."""
-    count, n = means.shape
-    mean[:] = 0.0
-    cov[:] = 0.0
-    for k in range(count):
-        for a in range(n):
-            mean[a] += weights[k] * means[k, a]
-    for k in range(count):
-        for a in range(n):
-            for b in range(a + 1):
-                away = (means[k, a] - mean[a]) * (means[k, b] - mean[b])
-                cov[a, b] += weights[k] * (covs[k, a, b] + away)
-    for a in range(n):
-        for b in range(a):
-            cov[b, a] = cov[a, b]
-
-
-@kernel
 def keep_alive(weights: Array) -> None:
     """Weights (K,) made to sum to one, none of them 0."""
     total = weights.sum()
     for k in range(weights.size):
         weights[k] = max(weights[k] / total, _LEAST_WEIGHT)
     weights /= weights.sum()
+
+
+@kernel
+def open_velocity(k: int, epoch: EpochInput, options: FilterOptions, found: Candidates) -> None:
+    """Open the velocity of the candidate ``k`` after ``inflate_after`` epochs rejected in a row:
+    no other component has it for interacting models."""
+    if epoch.rejected_in_row >= options.inflate_after:
+        add_velocity_step(options.initial_speed_sd, epoch.unheard_s, 0.0, found.covs[k])
+
+
+@kernel
+def one_of_each(components: Mixture) -> Mixture:
+    """Components of interacting models after an epoch: none is merged, and none dies. One that is
+    no longer sound begins anew as the most probable one."""
+    means, covs, log_weights = components
+    best = int(np.argmax(log_weights))
+    weights = np.exp(log_weights - log_weights[best])
+    for k in range(weights.size):
+        if log_weights[k] == -math.inf:
+            means[k], covs[k] = means[best], covs[best]
+    keep_alive(weights)
+    return Mixture(means, covs, np.log(weights))

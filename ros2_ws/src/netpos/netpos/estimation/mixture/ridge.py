@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netpos.common.least_squares import minimise
-from netpos.estimation.mixture import Mixture
+from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import Array
 

@@ -9,13 +9,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from filterpy.kalman import IMMEstimator, KalmanFilter
-from netpos.estimation import components, imm
-from netpos.estimation.components import Dynamics, Update
 from netpos.estimation.engine import EpochInput, FilterOptions
 from netpos.estimation.fit import neg2_log_likelihood
 from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import Kind
-from netpos.estimation.mixture import Mixture
+from netpos.estimation.mixture import epoch as epochs
+from netpos.estimation.mixture import interacting
+from netpos.estimation.mixture.candidates import Update
+from netpos.estimation.mixture.epoch import Dynamics
+from netpos.estimation.mixture.gaussians import Mixture, combine, moments
 from netpos.estimation.motion import (
     NO_BIAS,
     Model,
@@ -50,7 +52,7 @@ def after_epoch(
 ) -> Update:
     """The components, moved to the epoch already, after its rows."""
     epoch = EpochInput(0.5, 0.5, rejected_in_row, rows)
-    result: Update = components.apply_epoch(before, epoch, options, 0.0, accepted)
+    result: Update = epochs.apply_epoch(before, epoch, options, 0.0, accepted)
     return result
 
 
@@ -59,7 +61,7 @@ def moved_and_updated(
 ) -> Mixture:
     """One step without a gate."""
     options = options_for(len(motions))
-    moved = components.move(before, dt, Dynamics(motions, sojourn_s, NO_BIAS), options)
+    moved = epochs.move(before, dt, Dynamics(motions, sojourn_s, NO_BIAS), options)
     return after_epoch(moved, rows, options, np.zeros(1)).components
 
 
@@ -76,14 +78,14 @@ def test_transition_matrix(sojourn: list[float], dt: float) -> None:
     count = sojourn_s.size
     rates = np.repeat(1.0 / sojourn_s / (count - 1), count).reshape(count, count)
     rates[np.diag_indices(count)] = -1.0 / sojourn_s
-    result = imm.transition_matrix(sojourn_s, dt)
+    result = interacting.transition_matrix(sojourn_s, dt)
     np.testing.assert_allclose(result, expm(rates * dt), rtol=1e-9, atol=1e-10)
     np.testing.assert_allclose(result.sum(axis=1), 1.0, rtol=1e-9)
     assert (result >= 0.0).all()
 
 
 def test_one_model_stays() -> None:
-    assert imm.transition_matrix(np.array([3.0]), 1.0).tolist() == [[1.0]]
+    assert interacting.transition_matrix(np.array([3.0]), 1.0).tolist() == [[1.0]]
 
 
 def test_linear_track_equals_filterpy(row: Maker, random_cov: Maker) -> None:
@@ -109,7 +111,7 @@ def test_linear_track_equals_filterpy(row: Maker, random_cov: Maker) -> None:
         z = np.array([0.8 * step + rng.normal(), (step > 20) * 3.0 * (step - 20) + rng.normal()])
         rows = np.array([row(Kind.LINEAR, z[i], R[i, i], 0, h=H[i]) for i in range(2)])
         mixture = moved_and_updated(mixture, dt, motions, sojourn_s, rows)
-        weights, (mean, cov) = np.exp(mixture.log_weights), components.moments(mixture)
+        weights, (mean, cov) = np.exp(mixture.log_weights), moments(mixture)
         reference.predict()
         reference.update(z)
         np.testing.assert_allclose(weights, reference.mu, rtol=1e-9, atol=1e-9)
@@ -127,7 +129,7 @@ def test_mixture_moments_by_sampling(random_cov: Maker) -> None:
     rng = np.random.default_rng(2)
     means, covs = 3.0 * rng.normal(size=(3, 2)), np.array([random_cov(rng, 2) for _ in range(3)])
     weights, mean, cov = np.array([0.2, 0.5, 0.3]), np.empty(2), np.empty((2, 2))
-    imm.combine(means, covs, weights, mean, cov)
+    combine(means, covs, weights, mean, cov)
     counts = 200_000 * weights
     samples = np.vstack(
         [rng.multivariate_normal(means[k], covs[k], int(counts[k])) for k in range(3)]
@@ -143,7 +145,7 @@ def test_spread_of_a_mixture_far_from_the_origin(random_cov: Maker) -> None:
     rng = np.random.default_rng(5)
     away, weights = rng.integers(-9, 10, size=(3, 2)) / 8.0, np.array([0.2, 0.5, 0.3])
     covs, mean, cov = np.array([random_cov(rng, 2) for _ in range(3)]), np.empty(2), np.eye(2)
-    imm.combine(np.array([500_000.0, 6_600_000.0]) + away, covs, weights, mean, cov)
+    combine(np.array([500_000.0, 6_600_000.0]) + away, covs, weights, mean, cov)
     expected = np.einsum("k,kab->ab", weights, covs) + np.cov(away.T, aweights=weights, ddof=0)
     np.testing.assert_allclose(cov, expected, rtol=1e-12)
 
@@ -175,10 +177,10 @@ def test_likelihood_counts_the_curvature(row: Maker) -> None:
 def test_weights_never_die() -> None:
     weights = np.array([0.0, 0.3, 0.6])
     for _ in range(3):
-        imm.keep_alive(weights)
+        interacting.keep_alive(weights)
     np.testing.assert_allclose(weights, [1e-12, 1.0 / 3.0, 2.0 / 3.0], rtol=1e-9)
     assert weights.sum() == pytest.approx(1.0, abs=1e-15)
-    imm.mix(np.zeros((3, 1)), np.ones((3, 1, 1)), weights, np.eye(3))
+    interacting.mix(np.zeros((3, 1)), np.ones((3, 1, 1)), weights, np.eye(3))
     assert (weights >= 0.999e-12).all()
 
 
@@ -187,7 +189,7 @@ def test_a_model_left_for_long_comes_back() -> None:
     means, covs = np.array([[0.0], [8.0]]), np.ones((2, 1, 1))
     weights, transition = np.array([0.5, 0.5]), np.array([[1.0, 0.0], [0.5, 0.5]])
     for _ in range(2000):
-        imm.mix(means, covs, weights, transition)
+        interacting.mix(means, covs, weights, transition)
     assert weights[1] == pytest.approx(1e-12, rel=1e-9)
     assert weights.sum() == pytest.approx(1.0, abs=1e-15)
     assert means[1, X.PX] == 8.0
@@ -262,7 +264,7 @@ def test_a_model_that_is_no_longer_sound_begins_anew(row: Maker) -> None:
 def test_models_do_not_mix_without_time() -> None:
     before = two_places()
     dynamics = Dynamics(np.zeros((2, 16)), np.ones(2), NO_BIAS)
-    moved = components.move(before, 0.0, dynamics, options_for(2))
+    moved = epochs.move(before, 0.0, dynamics, options_for(2))
     for got, want in zip(moved, before, strict=True):
         np.testing.assert_array_equal(got, want)
 
@@ -346,7 +348,7 @@ def test_stop_straight_turn(seed: int, row: Maker) -> None:
     errors, leader = [], []
     for rows, p in zip(epochs, truth, strict=True):
         mixture = moved_and_updated(mixture, DT, motions, sojourn_s, rows)
-        mean, _ = components.moments(mixture)
+        mean, _ = moments(mixture)
         errors.append(np.sum((mean[POSITION] - p) ** 2))
         leader.append(int(np.argmax(mixture.log_weights)))
     single = min(constant_velocity(epochs, truth, accel) for accel in (0.5, 1.0, 2.0, 3.0))

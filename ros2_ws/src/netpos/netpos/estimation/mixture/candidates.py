@@ -1,0 +1,156 @@
+"""Candidates: components before they are reduced, each an explanation of the measurements of an
+epoch, weighed by its likelihood."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from netpos.estimation import fusion
+from netpos.estimation.compile import kernel
+from netpos.estimation.engine import (
+    GATE_SIZE,
+    FilterOptions,
+    cov_of,
+    cov_or_sqrt_of,
+    is_sound,
+    update,
+    update_with_gate,
+)
+from netpos.estimation.fit import neg2_log_likelihood
+from netpos.estimation.gate import accepted_rows
+from netpos.estimation.measurement import GROUP, is_range
+from netpos.estimation.mixture.gaussians import Mixture
+from netpos.estimation.sensors.row import group_end
+from netpos.messages.values import Array
+
+_OUTLIERS = 1e-2  # of all values; those of a range lie anywhere within
+_OUTLIER_RANGE_M = 100.0
+
+
+class Update(NamedTuple):
+    """What came of an epoch: the components; of the most probable one the NIS of the rows it
+    accepted and their number; the probability that the device turned in the ``within_s`` seconds
+    before the epoch; whether a component "it has turned" has begun."""
+
+    components: Mixture
+    nis: float
+    used: int
+    turned: float
+    within_s: float
+    begun: bool
+
+
+class Candidates(NamedTuple):
+    """Components before they are reduced: states, log weights, which groups (K, groups) each
+    accepted, NIS of the accepted rows and their number, and for how long the device may have been
+    turning (K,), 0 for components without a turn."""
+
+    means: Array
+    covs: Array
+    log_weights: Array
+    accepted: Array
+    nis: Array
+    used: Array
+    within_s: Array
+
+
+@kernel
+def candidates(size: int, n: int, groups: int) -> Candidates:
+    return Candidates(
+        np.empty((size, n)),
+        np.empty((size, n, n)),
+        np.full(size, -np.inf),
+        np.zeros((size, groups)),
+        np.zeros(size),
+        np.zeros(size),
+        np.zeros(size),
+    )
+
+
+@kernel
+def first_of(found: Candidates, end: int) -> Mixture:
+    return Mixture(found.means[:end], found.covs[:end], found.log_weights[:end])
+
+
+@kernel
+def outlier_log(rows: Array) -> float:
+    """Log density of the values of one measurement that has nothing to do with the device."""
+    total = math.log(_OUTLIERS)
+    for i in range(rows.shape[0]):
+        total -= math.log(_OUTLIER_RANGE_M if is_range(rows[i]) else 2.0 * math.pi)
+    return total
+
+
+@kernel
+def log_likelihood(
+    mean: Array, cov: Array, rows: Array, height_m: float, accepted: Array
+) -> float:
+    """Log density of ``rows`` as mean (n,), cov (n, n) predict them; what is not accepted is an
+    outlier."""
+    total, start = 0.0, 0
+    kept = accepted_rows(rows, accepted)
+    if kept.size > 0:
+        distance, size = neg2_log_likelihood(mean, cov, rows[kept], height_m, False)
+        total = -0.5 * (distance + size)
+    while start < rows.shape[0]:
+        stop = group_end(rows, start)
+        if accepted[int(rows[start, GROUP])] == 0.0:
+            total += outlier_log(rows[start:stop])
+        start = stop
+    return float(total)
+
+
+@kernel
+def weigh(
+    k: int,
+    log_weight: float,
+    prior_mean: Array,
+    prior_cov: Array,
+    rows: Array,
+    options: FilterOptions,
+    found: Candidates,
+) -> None:
+    """Weigh the candidate ``k`` by what its prediction says of ``rows``."""
+    likelihood = log_likelihood(prior_mean, prior_cov, rows, options.height_m, found.accepted[k])
+    sound = math.isfinite(likelihood) and is_sound(found.means[k], found.covs[k])
+    found.log_weights[k] = log_weight + likelihood if sound else -math.inf
+
+
+@kernel
+def apply(
+    k: int, log_weight: float, rows: Array, options: FilterOptions, found: Candidates
+) -> None:
+    """Gate and apply ``rows`` to the candidate ``k``, which holds its prediction, and weigh it.
+    Nothing accepted leaves the prediction."""
+    mean, cov, accepted = found.means[k], found.covs[k], found.accepted[k]
+    prior_mean, prior_cov = mean.copy(), cov.copy()
+    work = fusion.workspace(mean.size, rows.shape[0])
+    cov_or_sqrt = cov_or_sqrt_of(cov, options)
+    nis, used = update(mean, cov_or_sqrt, rows, options, accepted, work)
+    if used > 0:
+        cov[:] = cov_of(cov_or_sqrt, options)
+    else:
+        mean[:] = prior_mean
+    found.nis[k], found.used[k], found.within_s[k] = nis, used, 0.0
+    weigh(k, log_weight, prior_mean, prior_cov, rows, options, found)
+
+
+@kernel
+def apply_all(
+    k: int, log_weight: float, rows: Array, options: FilterOptions, found: Candidates
+) -> None:
+    """As ``apply`` without a gate: ``rows`` come from the tail of their errors."""
+    mean, cov, accepted = found.means[k], found.covs[k], found.accepted[k]
+    prior_mean, prior_cov = mean.copy(), cov.copy()
+    work = fusion.workspace(mean.size, rows.shape[0])
+    no_gate = np.full(GATE_SIZE, np.inf)
+    cov_or_sqrt = cov_or_sqrt_of(cov, options)
+    found.nis[k], found.used[k] = update_with_gate(
+        mean, cov_or_sqrt, rows, options, no_gate, accepted, work
+    )
+    cov[:] = cov_of(cov_or_sqrt, options)
+    found.within_s[k] = 0.0
+    weigh(k, log_weight, prior_mean, prior_cov, rows, options, found)

@@ -1,0 +1,220 @@
+"""A path that may be blocked: a range is direct or late, and each is a component where one
+Gaussian for both loses much."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from netpos.estimation.compile import kernel
+from netpos.estimation.conditioning import RobustOptions, may_be_late, reweight
+from netpos.estimation.engine import EpochInput, FilterOptions, is_sound
+from netpos.estimation.fit import neg2_log_likelihood
+from netpos.estimation.measurement import (
+    BLOCKED,
+    GROUP,
+    VARIANCE,
+    innovation_row,
+    innovation_variance,
+)
+from netpos.estimation.mixture.candidates import Candidates, Update, apply, candidates, first_of
+from netpos.estimation.mixture.gaussians import Mixture
+from netpos.estimation.mixture.reduction import reduced
+from netpos.estimation.mixture.ring import RING_MERGE_COST
+from netpos.estimation.mixture.turns import add_explanations, add_turns, may_turn
+from netpos.estimation.robust import blocked_excess, matching_cost
+from netpos.estimation.sensors.row import group_end
+from netpos.messages.values import Array
+
+
+@kernel
+def reweight_by_best(
+    components: Mixture, rows: Array, height_m: float, robust: RobustOptions
+) -> None:
+    """Re-weight ``rows`` in place as the most probable component predicts them."""
+    best = int(np.argmax(components.log_weights))
+    h = np.empty(components.means.shape[1])
+    reweight(components.means[best], components.covs[best], rows, height_m, robust, h)
+
+
+@kernel
+def _late_row(rows: Array) -> int:
+    """The row of one measurement that a blocked path makes late; -1 for none or several."""
+    found = -1
+    for i in range(rows.shape[0]):
+        if may_be_late(rows[i]):
+            if found >= 0:
+                return -1
+            found = i
+    return found
+
+
+class _Path(NamedTuple):
+    """A late row seen from a component: log probability of a direct and of a blocked path before
+    it and, after it, by how much a blocked one is likelier (log), the probability of a blocked
+    path, mean and variance of its excess, and what one Gaussian for both paths costs."""
+
+    direct_log: float
+    blocked_log: float
+    likelier: float
+    blocked: float
+    excess: float
+    excess_var: float
+    cost: float
+
+
+@kernel
+def _path(mean: Array, cov: Array, row: Array, options: FilterOptions) -> _Path:
+    robust, h = options.robust, np.empty(mean.size)
+    innovation = innovation_row(row, mean, options.height_m, h)
+    variance = innovation_variance(row, mean, cov, options.height_m, row[VARIANCE], h)
+    share = row[BLOCKED] if row[BLOCKED] > 0.0 else robust.nlos_probability
+    share = min(max(share, 1e-9), 1.0 - 1e-9)
+    likelier, excess, excess_var = blocked_excess(innovation, variance, robust.nlos_excess_m)
+    odds = math.exp(min(math.log(share / (1.0 - share)) + likelier, 700.0))
+    blocked = odds / (1.0 + odds)
+    cost = matching_cost(blocked, excess, excess_var, variance, row[VARIANCE])
+    return _Path(
+        math.log(1.0 - share), math.log(share), likelier, blocked, excess, excess_var, cost
+    )
+
+
+@kernel
+def _fuse_blocked(mean: Array, cov: Array, row: Array, path: _Path, height_m: float) -> float:
+    """Fuse a range of a blocked path in place, by the moments of its excess; its NIS."""
+    h = np.empty(mean.size)
+    innovation = innovation_row(row, mean, height_m, h) - path.excess
+    variance = innovation_variance(row, mean, cov, height_m, row[VARIANCE], h)
+    gain = cov @ h / variance
+    mean += gain * innovation
+    cov -= np.outer(gain, gain) * (variance - path.excess_var)
+    return float(innovation * innovation / variance)
+
+
+@kernel
+def paths_are_open(mean: Array, cov: Array, rows: Array, options: FilterOptions) -> bool:
+    """Whether for a late range of ``rows`` a direct and a blocked path make two components of the
+    prediction mean (n,), cov (n, n)."""
+    start = 0
+    while start < rows.shape[0]:
+        stop = group_end(rows, start)
+        late = _late_row(rows[start:stop])
+        if late >= 0:
+            path = _path(mean, cov, rows[start + late], options)
+            if path.cost > RING_MERGE_COST:
+                return True
+        start = stop
+    return False
+
+
+@kernel
+def _ungated(mean: Array, cov: Array, rows: Array, options: FilterOptions) -> float:
+    distance, size = neg2_log_likelihood(mean, cov, rows, options.height_m, False)
+    return float(-0.5 * (distance + size))
+
+
+@kernel
+def _both_paths(
+    k: int,
+    end: int,
+    late: int,
+    prior: Mixture,
+    rows: Array,
+    options: FilterOptions,
+    found: Candidates,
+    blocked: Array,
+) -> int:
+    """Add the candidates of the component ``k``: the path of the row ``late`` of one measurement
+    is direct, and it is blocked, or both as one where that costs nothing; their probabilities of a
+    ``blocked`` path. The number of candidates then."""
+    mean, cov, log_weight = prior.means[k], prior.covs[k], prior.log_weights[k]
+    path = _path(mean, cov, rows[late], options)
+    read = rows.copy()
+    several = math.exp(log_weight) * path.cost > RING_MERGE_COST
+    found.means[end], found.covs[end] = mean, cov
+    likelihood = log_weight + _ungated(mean, cov, rows, options)
+    if not several:
+        reweight(mean, cov, read, options.height_m, options.robust, np.empty(mean.size))
+        apply(end, log_weight, read, options, found)
+        if found.accepted[end, 0] == 1.0 and math.isfinite(found.log_weights[end]):
+            late_log = path.blocked_log + path.likelier
+            smaller = math.exp(-abs(late_log - path.direct_log))
+            both_log = max(late_log, path.direct_log) + math.log1p(smaller)
+            found.log_weights[end] = likelihood + both_log
+        blocked[end] = path.blocked
+        return end + 1
+    apply(end, log_weight + path.direct_log, rows, options, found)
+    blocked[end] = 0.0
+    found.means[end + 1], found.covs[end + 1] = mean, cov
+    nis = _fuse_blocked(
+        found.means[end + 1], found.covs[end + 1], rows[late], path, options.height_m
+    )
+    found.accepted[end + 1, 0], found.used[end + 1], found.within_s[end + 1] = 1.0, 0.0, 0.0
+    if rows.shape[0] > 1:
+        others = np.concatenate((rows[:late], rows[late + 1 :]))
+        apply(end + 1, log_weight, others, options, found)
+    found.nis[end + 1] += nis
+    found.used[end + 1] += 1.0
+    sound = is_sound(found.means[end + 1], found.covs[end + 1])
+    found.log_weights[end + 1] = (
+        likelihood + path.blocked_log + path.likelier if sound else -math.inf
+    )
+    blocked[end + 1] = 1.0
+    return end + 2
+
+
+@kernel
+def along_paths(
+    components: Mixture,
+    epoch: EpochInput,
+    options: FilterOptions,
+    since_turn_s: float,
+    accepted: Array,
+) -> Update:
+    """Measurement by measurement, where paths may be blocked. The rows of the epoch are
+    re-weighted in place as the most probable component predicts them, for who reads them later;
+    BLOCKED becomes the probability that the mixture gives."""
+    raw, nis, used, start, turns = epoch.rows.copy(), 0.0, 0, 0, False
+    turned, longest_s = 0.0, 0.0
+    reweight_by_best(components, epoch.rows, options.height_m, options.robust)
+    while start < raw.shape[0]:
+        group, stop = int(raw[start, GROUP]), group_end(raw, start)
+        alone = raw[start:stop].copy()
+        alone[:, GROUP] = 0.0
+        late = _late_row(alone)
+        single = EpochInput(epoch.dt_s, epoch.unheard_s, epoch.rejected_in_row, alone)
+        count, n = components.means.shape
+        found = candidates(5 * count, n, 1)
+        blocked, end = np.zeros(5 * count), np.int64(0)
+        for k in range(count):
+            first = end
+            if late >= 0:
+                end = _both_paths(k, end, late, components, alone, options, found, blocked)
+            else:
+                found.means[end], found.covs[end] = components.means[k], components.covs[k]
+                apply(end, components.log_weights[k], alone, options, found)
+                end += 1
+            if found.accepted[first, 0] == 0.0 and options.manoeuvre_speed_sd > 0.0:
+                end = add_explanations(k, first, end, components, single, options, found)
+        best = int(np.argmax(components.log_weights))
+        if stop - start == raw.shape[0]:
+            turns = may_turn(components.means[best], raw, since_turn_s, options)
+        if turns:
+            within_s = max(since_turn_s, epoch.unheard_s)
+            end = add_turns(end, components, within_s, alone, options, found)
+        best = int(np.argmax(found.log_weights[:end]))
+        top = found.log_weights[best]
+        accepted[group] = found.accepted[best, 0] if math.isfinite(top) else 0.0
+        if math.isfinite(top):
+            weights = np.exp(found.log_weights[:end] - top)
+            weights /= weights.sum()
+            turned = max(turned, weights[found.within_s[:end] > 0.0].sum())
+            longest_s = max(longest_s, found.within_s[:end].max())
+            if late >= 0:
+                epoch.rows[start + late, BLOCKED] = (weights * blocked[:end]).sum()
+            nis, used = nis + found.nis[best], used + int(found.used[best])
+            components = reduced(first_of(found, end), RING_MERGE_COST)
+        start = stop
+    return Update(components, nis, used, turned, longest_s, turns)

@@ -1,0 +1,178 @@
+"""A range or time that meets a wide prior: its likelihood is a ring, and the ring is a sum of
+Gaussians along it, each short enough for the tangent to hold (Alspach and Sorenson 1972; along the
+direction of greatest curvature, Tuggle and Zanetti 2018)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from netpos.estimation.compile import kernel
+from netpos.estimation.engine import FilterOptions
+from netpos.estimation.measurement import (
+    GROUP,
+    ORIGIN,
+    VARIANCE,
+    curvature_variance,
+    innovation_row,
+    innovation_variance,
+    is_range,
+    offset_up,
+)
+from netpos.estimation.mixture.candidates import (
+    Candidates,
+    Update,
+    apply,
+    candidates,
+    first_of,
+    outlier_log,
+)
+from netpos.estimation.mixture.gaussians import Mixture, fuse_value
+from netpos.estimation.mixture.reduction import reduced
+from netpos.estimation.sensors.row import group_end
+from netpos.messages.values import Array
+
+_VELOCITY_END = 4  # position and velocity come first
+# A component is split where the second-order variance exceeds this share of the row's,
+WIDE = 0.25
+# or where it reaches the RSU within so many sd; narrower components (m) never are, nor cut.
+_REACH_SD, NARROW_M = 3.0, 1.0
+SPACING_SD = 1.2  # of Gaussians along a ring: their sum is flat to 1e-3 there
+_RING_MIN, RING_MAX = 12, 128
+RING_MERGE_COST = 2e-4  # divergence (Runnalls' bound) that merging parts of a ring may cost
+
+
+@kernel
+def _own_variance(row: Array, cov: Array, h: Array) -> float:
+    """Variance of a row without that of position and velocity: noise, clock and slow errors."""
+    total = row[VARIANCE]
+    for a in range(_VELOCITY_END, cov.shape[0]):
+        for b in range(_VELOCITY_END, cov.shape[0]):
+            total += h[a] * cov[a, b] * h[b]
+    return float(total)
+
+
+@kernel
+def is_wide(row: Array, mean: Array, cov: Array, height_m: float) -> bool:
+    """Whether a component is to be split for a row: a range or time of arrival that narrows the
+    position, but whose tangent does not hold over the component's width."""
+    width2 = cov[0, 0] + cov[1, 1]
+    if not is_range(row) or width2 < NARROW_M * NARROW_M:
+        return False
+    h = np.empty(mean.size)
+    innovation_row(row, mean, height_m, h)
+    own = _own_variance(row, cov, h)
+    if own > width2:
+        return False
+    if curvature_variance(row, mean, cov, height_m) > WIDE * own:
+        return True
+    dx, dy = mean[0] - row[ORIGIN], mean[1] - row[ORIGIN + 1]
+    return bool(_REACH_SD * _REACH_SD * width2 > dx * dx + dy * dy)
+
+
+@kernel
+def splits(rows: Array, mean: Array, cov: Array, height_m: float) -> bool:
+    """Whether the ``rows`` of one measurement split a component: a range alone that ``is_wide``.
+    An angle measured with it tells where on the ring the device is."""
+    return bool(rows.shape[0] == 1 and is_wide(rows[0], mean, cov, height_m))
+
+
+@kernel
+def split_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Mixture:
+    """The product of the Gaussian ``mean`` (n,), ``cov`` (n, n) and the likelihood of a range or
+    time of arrival: components along the ring, their log weights not normalised."""
+    n = mean.size
+    h, at, along = np.empty(n), mean.copy(), np.zeros(n)
+    residual = innovation_row(row, mean, height_m, h)
+    dx, dy = mean[0] - row[ORIGIN], mean[1] - row[ORIGIN + 1]
+    dz = offset_up(row, mean, height_m)
+    slant = math.sqrt(dx * dx + dy * dy + dz * dz) + residual  # measured, less clock and biases
+    own = _own_variance(row, cov, h)
+    radius = math.sqrt(max(slant * slant - dz * dz, 0.25 * own, 1e-4))
+    sd = math.sqrt(radius * math.sqrt(2.0 * WIDE * own))  # whose second-order variance is own
+    wanted = math.ceil(2.0 * math.pi * radius / (SPACING_SD * sd))
+    count = int(min(max(wanted, _RING_MIN), RING_MAX))
+    arc = 2.0 * math.pi * radius / count
+    sd = arc / SPACING_SD
+    means, covs, logs = np.empty((count, n)), np.empty((count, n, n)), np.empty(count)
+    for k in range(count):
+        angle = 2.0 * math.pi * (k + 0.5) / count
+        c, s = math.cos(angle), math.sin(angle)
+        at[0], at[1] = row[ORIGIN] + radius * c, row[ORIGIN + 1] + radius * s
+        means[k], covs[k] = mean, cov
+        residual = innovation_row(row, at, height_m, h)
+        residual -= h[0] * (mean[0] - at[0]) + h[1] * (mean[1] - at[1])
+        logs[k] = math.log(arc) + fuse_value(means[k], covs[k], h, residual, row[VARIANCE])
+        along[0], along[1] = -s, c
+        residual = c * (at[1] - means[k, 1]) - s * (at[0] - means[k, 0])
+        logs[k] += fuse_value(means[k], covs[k], along, residual, sd * sd)
+    return Mixture(means, covs, logs)
+
+
+@kernel
+def any_splits(components: Mixture, rows: Array, height_m: float) -> bool:
+    """Whether a range of ``rows`` splits a component along its ring."""
+    start = 0
+    while start < rows.shape[0]:
+        stop = group_end(rows, start)
+        for k in range(components.log_weights.size):
+            mean, cov = components.means[k], components.covs[k]
+            if splits(rows[start:stop], mean, cov, height_m):
+                return True
+        start = stop
+    return False
+
+
+@kernel
+def ring(k: int, prior: Mixture, rows: Array, end: int, height_m: float, found: Candidates) -> int:
+    """Add the candidates of the component ``k`` along the ring of a range, and the component
+    itself, to which the range is an outlier; the number of candidates then."""
+    mean, cov, h = prior.means[k], prior.covs[k], np.empty(prior.means.shape[1])
+    residual = innovation_row(rows[0], mean, height_m, h)
+    variance = innovation_variance(rows[0], mean, cov, height_m, rows[0, VARIANCE], h)
+    ring = split_along_ring(mean, cov, rows[0], height_m)
+    stop = end + ring.log_weights.size
+    found.means[end:stop], found.covs[end:stop] = ring.means, ring.covs
+    found.log_weights[end:stop] = prior.log_weights[k] + ring.log_weights
+    found.accepted[end:stop], found.used[end:stop] = 1.0, 1.0
+    found.nis[end:stop] = residual * residual / variance
+    found.means[stop], found.covs[stop] = mean, cov
+    found.log_weights[stop] = prior.log_weights[k] + outlier_log(rows)
+    found.accepted[stop], found.used[stop] = 0.0, 0.0
+    return int(stop + 1)
+
+
+@kernel
+def one_by_one(
+    components: Mixture, rows: Array, options: FilterOptions, accepted: Array
+) -> Update:
+    """Measurement by measurement, where ranges split components; ``accepted`` where most of the
+    mixture does."""
+    nis, used, start = 0.0, 0, 0
+    while start < rows.shape[0]:
+        group, stop = int(rows[start, GROUP]), group_end(rows, start)
+        alone = rows[start:stop].copy()
+        alone[:, GROUP] = 0.0
+        count, n = components.means.shape
+        found = candidates(count * (RING_MAX + 1), n, 1)
+        end = np.int64(0)  # no literal: it would make another version of each kernel below
+        for k in range(count):
+            mean, cov = components.means[k], components.covs[k]
+            if splits(alone, mean, cov, options.height_m):
+                end = ring(k, components, alone, end, options.height_m, found)
+            else:
+                found.means[end], found.covs[end] = mean, cov
+                apply(end, components.log_weights[k], alone, options, found)
+                end += 1
+        best = int(np.argmax(found.log_weights[:end]))
+        weights = np.exp(found.log_weights[:end] - found.log_weights[best])
+        taken = weights[found.accepted[:end, 0] == 1.0].sum()
+        accepted[group] = 1.0 if 2.0 * taken > weights.sum() else 0.0
+        if accepted[group] == 1.0:
+            likely = np.where(found.accepted[:end, 0] == 1.0, weights, -1.0)
+            best = int(np.argmax(likely))
+            nis, used = nis + found.nis[best], used + stop - start
+        components = reduced(first_of(found, end), RING_MERGE_COST)
+        start = stop
+    return Update(components, nis, used, 0.0, 0.0, False)
