@@ -384,8 +384,7 @@ def example(folder: Path, scenario: str = "fast_pass") -> Path:
     """A tracked run, in chunks of 50 messages."""
     run, tracked = folder / f"{scenario}_run", folder / f"{scenario}_tracked"
     bag = folder / scenario
-    netpos.simulate(netpos.load_scenario(scenario, seed=1), run)
-    netpos.track(run, tracked)
+    netpos.Scenario.load(scenario, seed=1).simulate(run).track(tracked)
     with BagReader(tracked) as source, BagWriter(bag, metadata=source.metadata) as copy:
         for name, info in source.topics.items():
             copy.add_topic(name, info.type_name, info.qos)

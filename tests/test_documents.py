@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import ast
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import netpos
 import pytest
 import yaml
+from netpos import messages
 from netpos.estimation.sensors.table import readings
 from netpos.messages import topics
 from netpos.scenario import load_scenario
@@ -138,3 +142,47 @@ def test_the_readme_is_two_screens() -> None:
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
     assert len(lines) <= README_LINES
     assert max(map(len, lines)) <= 400
+
+
+# Pages for who changes netpos use what is inside.
+INSIDE = {"adding_a_sensor.md", "adding_a_motion_model_or_filter.md", "robustness.md"}
+
+
+def python_of_pages() -> Iterator[tuple[str, str]]:
+    """Python that a user is shown, with the name of its page."""
+    for path in [ROOT / "README.md", *DOCS.glob("*.md"), *DOCS.glob("tutorials/*.md")]:
+        text = path.read_text(encoding="utf-8")
+        for block in re.findall(r"```python[^\n]*\n(.*?)```", text, re.DOTALL):
+            if path.name not in INSIDE:
+                yield path.name, block
+    for path in DOCS.glob("notebooks/*.ipynb"):
+        for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+            if cell["cell_type"] == "code":
+                yield path.name, "".join(cell["source"])
+
+
+def test_pages_use_public_names_and_each_is_used() -> None:
+    used: set[str] = set()
+    for page, block in python_of_pages():
+        for node in ast.walk(ast.parse(block)):
+            match node:
+                case ast.Attribute(value=ast.Name(id="netpos"), attr=name):
+                    used.add(name)
+                case ast.Import(names=names):
+                    inside = [a.name for a in names if a.name.startswith("netpos.")]
+                    assert inside == [], page
+                case ast.ImportFrom(module="netpos.messages", names=names):
+                    assert {alias.name for alias in names} <= set(messages.__all__), page
+                case ast.ImportFrom(module=str(module), names=names):
+                    assert not module.startswith("netpos."), page
+                    used |= {alias.name for alias in names if module == "netpos"}
+    assert used == set(netpos.__all__)
+
+
+def test_public_names_are_decided_and_described() -> None:
+    decision = (DOCS / "decisions/0087-a-library-that-pip-installs.md").read_text("utf-8")
+    named = re.search(r"Public are eight names: ([^.]*)\.", decision)
+    assert named is not None
+    assert re.findall(r"`(\w+)`", named.group(1)) == netpos.__all__
+    described = str(netpos.__doc__).partition("-\n")[2].partition("\n\n")[0]
+    assert sorted(re.findall(r"``(\w+)``", described)) == sorted(netpos.__all__)

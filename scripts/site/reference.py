@@ -13,6 +13,7 @@ from typing import Any
 
 import netpos
 import typer
+from netpos import messages
 from netpos.cli.examples import EXAMPLES
 from netpos.cli.main import app
 from netpos.common.parameters import described_fields
@@ -196,16 +197,42 @@ def commands_page() -> str:
 
 
 def api_page() -> str:
-    """What ``import netpos`` offers."""
-    entries = [
-        f"::: {module}.{netpos._INSIDE.get(name, name)}\n    options:\n"
-        f"      heading: netpos.{name}\n      toc_label: {name}"
-        for name, module in sorted(netpos._PUBLIC.items())
-    ]
+    """What ``import netpos`` and ``netpos.messages`` offer."""
+    names = ", ".join(f"`{name}`" for name in netpos.__all__)
     intro = (
-        "What `import netpos` offers. These names and arguments stay; what is below them may "
-        "change ([decision 0087](../decisions/0087-a-library-that-pip-installs.md)). "
+        f"`import netpos` offers {len(netpos.__all__)} names: {names}. These names and their "
+        "arguments stay; what is below them may change "
+        "([decision 0087](../decisions/0087-a-library-that-pip-installs.md)). "
         "[Your own RSUs](../tutorials/own_rsus.md) and the "
         "[notebooks](../notebooks/arrays_to_track.md) use them."
     )
-    return "\n\n".join(["# Python API", intro, *entries])
+    of_messages = (
+        "What a tracker or a recording takes and gives besides `RsuInfo` and `RsuMeasurement`, "
+        "each with the fields of its ROS message: `from netpos.messages import Odometry`. They "
+        "change when the ROS messages do."
+    )
+    recording = _api("netpos.scenario.recording", "Recording", "A recording", inherited=True)
+    return "\n\n".join(
+        [
+            "# Python API",
+            intro,
+            *(_api(*home, f"netpos.{name}") for name, home in netpos._HOME.items()),
+            "## What read_bag returns",
+            recording,
+            "## What evaluate returns",
+            _api("netpos.evaluation.evaluate", "Evaluation", "With ground truth"),
+            _api("netpos.evaluation.evaluate", "VueEvaluation", "One device"),
+            _api("netpos.evaluation.metrics", "Figures", "Its figures"),
+            _api("netpos.evaluation.survey", "Survey", "Without ground truth"),
+            "## Values of messages",
+            of_messages,
+            *(_api("netpos.messages.values", name, name) for name in messages.__all__),
+        ]
+    )
+
+
+def _api(module: str, name: str, heading: str, *, inherited: bool = False) -> str:
+    return (
+        f"::: {module}.{name}\n    options:\n      heading: {heading}\n"
+        f"      toc_label: {heading}\n      inherited_members: {str(inherited).lower()}"
+    )

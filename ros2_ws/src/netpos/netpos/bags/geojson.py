@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from netpos.bags.errors import BagError
-from netpos.bags.recording import Recording
+from netpos.bags.recording import RecordedValues
 from netpos.common.yaml_text import load_yaml
 from netpos.messages.values import Array, Odometry
 from netpos.world.geodesy import Datum, datum_of_text
@@ -16,7 +16,7 @@ from netpos.world.geodesy import Datum, datum_of_text
 _DIGITS = 8  # of a degree: 1 mm
 
 
-def geojson_of(recording: Recording, datum: str = "") -> dict[str, Any]:
+def geojson_of(recording: RecordedValues, datum: str = "") -> dict[str, Any]:
     """A FeatureCollection; coordinates are longitude, latitude [deg], height [m].
 
     datum : latitude, longitude and height of the map's origin; empty: the one of the tracker.
@@ -44,7 +44,7 @@ def geojson_of(recording: Recording, datum: str = "") -> dict[str, Any]:
     return {"type": "FeatureCollection", "features": features}
 
 
-def _datum_of(recording: Recording) -> str:
+def _datum_of(recording: RecordedValues) -> str:
     for text in recording.facts.get("tracker", ()):
         parameters = load_yaml(text)
         if isinstance(parameters, dict) and parameters.get("datum"):

@@ -1,10 +1,12 @@
-"""Write values from Python as a bag, and read a bag as values."""
+"""Values from Python as the messages of a bag, and the messages of a bag as values."""
 
 from __future__ import annotations
 
+import os
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -41,8 +43,8 @@ TRUTH_ALIGNMENT = "truth_alignment"
 SKIPPED = "skipped"
 
 
-def write_bag(
-    path: Path | str,
+def write_values(
+    path: os.PathLike[str] | str,
     *,
     rsus: Sequence[RsuInfo],
     measurements: Sequence[RsuMeasurement],
@@ -51,27 +53,8 @@ def write_bag(
     tracker: Mapping[str, object] | None = None,
     metadata: Mapping[str, str] | None = None,
 ) -> dict[str, int]:
-    """Write a recording as a bag that ``netpos replay`` tracks; every input may be in any order.
-
-    Measurements of one stamp and device count as one beacon: they get its number, and
-    ``expected`` is how many there are.
-
-    Parameters
-    ----------
-    rsus : every RSU of the measurements
-    tracker : parameters that a replay takes, such as ``device_height_m``; the others are defaults
-    metadata : what made the recording; kept in the bag
-
-    Returns
-    -------
-    messages per topic
-
-    Raises
-    ------
-    BagError  no measurement, a stamp that is not positive, an RSU without RsuInfo, or one that
-        measures a device twice at a stamp
-    FileExistsError  ``path`` exists
-    """
+    """``netpos.write_bag``, which describes the arguments and errors. Returns the number of
+    messages by topic."""
     messages = codec()
     _check(rsus, measurements)
     measurements = number_beacons(measurements)
@@ -94,67 +77,122 @@ def write_bag(
         return writer.counts
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Recording:
-    """What a bag holds, in recorded order; truth, odometry, status and clock by device.
+class RecordedValues(os.PathLike[str]):
+    """The values of a bag, in recorded order.
 
-    facts : how the bag was made, by name (``scenario``, ``tracker``, ``lost``);
-    several values where they do not agree
+    They are read when one of them is first asked for, all at once: the bag must fit into memory
+    (about 1 KB a message). It can be given wherever a path of a bag is taken.
     """
 
-    rsus: tuple[RsuInfo, ...]
-    measurements: tuple[RsuMeasurement, ...]
-    imu: tuple[ImuSample, ...]
-    truth: Mapping[str, tuple[Odometry, ...]]
-    odometry: Mapping[str, tuple[Odometry, ...]]
-    clock: Mapping[str, tuple[ClockState, ...]]
-    status: Mapping[str, tuple[TrackStatus, ...]]
-    facts: Mapping[str, tuple[str, ...]]
+    def __init__(self, path: os.PathLike[str] | str) -> None:
+        self.path = Path(path)
+        """Folder or file of the bag."""
+        with BagReader(self.path) as bag:
+            self.facts: Mapping[str, tuple[str, ...]] = bag.facts
+            """How the bag was made, by name (``scenario``, ``tracker``, ``lost``); several values
+            where copies differ."""
+            self._topics = bag.topics
+            self._duration_s = (bag.end_ns - bag.start_ns) * 1e-9
+        for topic, info in self._topics.items():
+            wanted = _TYPES.get(_device_and_name(topic)[1], info.type_name)
+            if info.type_name != wanted:
+                raise BagError(
+                    f"{self.path}: {topic} holds {info.type_name} instead of {wanted}; "
+                    "record it under another name"
+                )
 
+    def __fspath__(self) -> str:
+        return os.fspath(self.path)
 
-def read_bag(path: Path | str) -> Recording:
-    """Everything of a bag as values; for a bag that fits into memory (about 1 KB a message).
+    def __repr__(self) -> str:
+        counts = {topic: info.count for topic, info in self._topics.items() if info.count}
+        measured = counts.get(RSU_MEASUREMENTS, 0)
+        by_name: dict[str, list[str]] = defaultdict(list)
+        for topic in sorted(counts):
+            vue, name = _device_and_name(topic)
+            by_name[name].append(vue)
+        tracks, truths = by_name[ODOMETRY], by_name[GROUND_TRUTH]
+        return (
+            f"{type(self).__name__}({os.fspath(self.path)!r}): {self._duration_s:.1f} s, "
+            f"{measured} measurements, tracks of {', '.join(tracks) or 'no device'}, "
+            f"ground truth of {', '.join(truths) or 'no device'}"
+        )
 
-    Raises ``BagError`` for what is no bag, or holds other types under these names.
-    """
-    convert = codec()
-    read = {
-        RSU_INFO: convert.rsu_info_from_msg,
-        RSU_MEASUREMENTS: convert.measurement_from_msg,
-        IMU: convert.imu_from_msg,
-        GROUND_TRUTH: convert.odometry_from_msg,
-        ODOMETRY: convert.odometry_from_msg,
-        CLOCK_STATE: convert.clock_state_from_msg,
-        TRACK_STATUS: convert.track_status_from_msg,
-    }
-    values_by_topic: dict[tuple[str, str], list[Any]] = defaultdict(list)
-    with BagReader(Path(path)) as bag:
-        names = {topic: split(topic) if split(topic)[0] else ("", topic) for topic in bag.topics}
-        wanted = [topic for topic, (_, name) in names.items() if name in read]
-        for entry in bag.messages(wanted):
-            vue, name = names[entry.topic]
-            try:
-                value = read[name](entry.message)
-            except (AttributeError, TypeError) as error:
-                raise BagError(f"{path}: {entry.topic} holds {entry.type_name}") from error
-            values_by_topic[name, vue].append(value)
-        facts = bag.facts
+    @property
+    def rsus(self) -> tuple[RsuInfo, ...]:
+        """Every description of an RSU; one that was sent again is there again."""
+        return tuple(self._values[RSU_INFO].get("", ()))
 
-    def of(name: str) -> dict[str, tuple[Any, ...]]:
+    @property
+    def measurements(self) -> tuple[RsuMeasurement, ...]:
+        """What the RSUs measured of all devices."""
+        return tuple(self._values[RSU_MEASUREMENTS].get("", ()))
+
+    @property
+    def imu(self) -> Mapping[str, tuple[ImuSample, ...]]:
+        """IMU samples by device."""
+        return self._values[IMU]
+
+    @property
+    def truth(self) -> Mapping[str, tuple[Odometry, ...]]:
+        """Ground truth by device."""
+        return self._values[GROUND_TRUTH]
+
+    @property
+    def odometry(self) -> Mapping[str, tuple[Odometry, ...]]:
+        """The track by device."""
+        return self._values[ODOMETRY]
+
+    @property
+    def clock(self) -> Mapping[str, tuple[ClockState, ...]]:
+        """The estimated clock by device."""
+        return self._values[CLOCK_STATE]
+
+    @property
+    def status(self) -> Mapping[str, tuple[TrackStatus, ...]]:
+        """State, counts and protection level of the track by device."""
+        return self._values[TRACK_STATUS]
+
+    @cached_property
+    def _values(self) -> dict[str, dict[str, tuple[Any, ...]]]:
+        """By name of the topic, then by device ("" for what is not a device's)."""
+        convert = codec()
+        read = {
+            RSU_INFO: convert.rsu_info_from_msg,
+            RSU_MEASUREMENTS: convert.measurement_from_msg,
+            IMU: convert.imu_from_msg,
+            GROUND_TRUTH: convert.odometry_from_msg,
+            ODOMETRY: convert.odometry_from_msg,
+            CLOCK_STATE: convert.clock_state_from_msg,
+            TRACK_STATUS: convert.track_status_from_msg,
+        }
+        found: dict[str, dict[str, list[Any]]] = {name: defaultdict(list) for name in read}
+        with BagReader(self.path) as bag:
+            names = {topic: _device_and_name(topic) for topic in bag.topics}
+            wanted = [topic for topic, (_, name) in names.items() if name in read]
+            for entry in bag.messages(wanted):
+                vue, name = names[entry.topic]
+                found[name][vue].append(read[name](entry.message))
         return {
-            vue: tuple(v) for (kind, vue), v in sorted(values_by_topic.items()) if kind == name
+            name: {vue: tuple(values) for vue, values in sorted(by_vue.items())}
+            for name, by_vue in found.items()
         }
 
-    return Recording(
-        rsus=tuple(values_by_topic[RSU_INFO, ""]),
-        measurements=tuple(values_by_topic[RSU_MEASUREMENTS, ""]),
-        imu=tuple(sample for samples in of(IMU).values() for sample in samples),
-        truth=of(GROUND_TRUTH),
-        odometry=of(ODOMETRY),
-        clock=of(CLOCK_STATE),
-        status=of(TRACK_STATUS),
-        facts=facts,
-    )
+
+_TYPES = {
+    RSU_INFO: "netpos_msgs/msg/RsuInfo",
+    RSU_MEASUREMENTS: "netpos_msgs/msg/RsuMeasurement",
+    IMU: "sensor_msgs/msg/Imu",
+    GROUND_TRUTH: "nav_msgs/msg/Odometry",
+    ODOMETRY: "nav_msgs/msg/Odometry",
+    CLOCK_STATE: "netpos_msgs/msg/ClockState",
+    TRACK_STATUS: "netpos_msgs/msg/TrackStatus",
+}
+
+
+def _device_and_name(topic: str) -> tuple[str, str]:
+    vue, name = split(topic)
+    return (vue, name) if vue else ("", topic)
 
 
 def _check(rsus: Sequence[RsuInfo], measurements: Sequence[RsuMeasurement]) -> None:

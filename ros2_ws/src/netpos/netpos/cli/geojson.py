@@ -25,11 +25,11 @@ def geojson(
 ) -> None:
     """Write RSUs, tracks and ground truth of a bag as GeoJSON."""
     from netpos.bags.geojson import geojson_of  # noqa: PLC0415
-    from netpos.bags.recording import read_bag  # noqa: PLC0415
+    from netpos.bags.recording import RecordedValues  # noqa: PLC0415
     from netpos.common.files import write_text  # noqa: PLC0415
 
     refuse_recording(out)
     with doing("reading"):
-        content = geojson_of(read_bag(bag), datum)
+        content = geojson_of(RecordedValues(bag), datum)
     write_text(out, json.dumps(content) + "\n")
     typer.echo(f"wrote {out}: {len(content['features'])} features")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -37,6 +38,12 @@ class VueEvaluation:
     delivery: Delivery
     series: tuple[Series, ...] = ()
 
+    @property
+    def figures(self) -> Figures:
+        """Errors, availability and consistency of the device; ``None`` where they cannot be
+        computed."""
+        return self.scored.figures
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evaluation:
@@ -58,7 +65,7 @@ class Evaluation:
 
     def columns(self) -> dict[str, Figures]:
         """Figures by the name of their column in a table: devices, then devices by network."""
-        fused = {name: vue.scored.figures for name, vue in self.vues.items()}
+        fused = {name: vue.figures for name, vue in self.vues.items()}
         return fused | {
             f"{vue} by {network}": scored.figures
             for network, vues in self.networks.items()
@@ -147,7 +154,7 @@ def _surveyed(bag: BagReader, path: Path, vue: str | None) -> list[str]:
 
 
 def assess_bag(
-    path: Path | str,
+    path: os.PathLike[str] | str,
     *,
     skip: int = SKIP_EPOCHS,
     vue: str | None = None,
@@ -155,8 +162,25 @@ def assess_bag(
     residuals: bool = False,
     progress: Progress | None = None,
 ) -> Evaluation | Survey:
-    """``evaluate_bag`` where there is ground truth, else ``survey_bag``; raises what they do.
-    ``progress`` is called with the number of messages read."""
+    """Score a bag that a tracker has tracked.
+
+    With ground truth every device gets its errors and verdicts (``Evaluation``), without it what
+    the recording says of itself (``Survey``).
+
+    Parameters
+    ----------
+    path : the bag, as a path or a recording
+    skip : number of first estimates of each device that do not count
+    vue : score this device only
+    truth : ground truth from elsewhere, for one device
+    residuals : also give what each RSU measured minus what it should have
+    progress : called with the number of messages read
+
+    Raises
+    ------
+    ValueError  not a readable bag, no estimates, no such device, or no device has more estimates
+        than are skipped
+    """
     path = Path(path)
     if truth is not None:
         return evaluate_bag(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +56,12 @@ class RsuInfo:
     by a network; 0 means none.
     ``noise_correlation_time_s``: power spectral density at 0 of the remaining noise over its
     variance; 0 means white.
+    ``angle_convention``: ``RsuInfo.SPHERICAL``, azimuth is atan2(y, x) in RSU axes, or
+    ``RsuInfo.CONE``, its sine is the direction cosine y / distance of a linear array.
     """
+
+    SPHERICAL: ClassVar[AngleConvention] = AngleConvention.SPHERICAL
+    CONE: ClassVar[AngleConvention] = AngleConvention.CONE
 
     rsu_id: str
     frame_id: str = "map"
@@ -78,8 +84,16 @@ class RsuInfo:
 @dataclass(slots=True, kw_only=True)
 class RsuMeasurement:
     """What one RSU measured of one device at one instant; ``fields`` names the quantities that
-    count. ``lever_arm`` [m]: antenna that was measured, in the device's base_link; ``position`` is
-    one in ``frame_id``."""
+    count, such as ``RsuMeasurement.RANGE | RsuMeasurement.AZIMUTH``. ``lever_arm`` [m]: antenna
+    that was measured, in the device's base_link; ``position`` is one in ``frame_id``."""
+
+    AZIMUTH: ClassVar[Field] = Field.AZIMUTH
+    ELEVATION: ClassVar[Field] = Field.ELEVATION
+    TOA: ClassVar[Field] = Field.TOA
+    RANGE: ClassVar[Field] = Field.RANGE
+    PHASE: ClassVar[Field] = Field.PHASE
+    POSITION: ClassVar[Field] = Field.POSITION
+    TDOA: ClassVar[Field] = Field.TDOA
 
     stamp_ns: int
     rsu_id: str

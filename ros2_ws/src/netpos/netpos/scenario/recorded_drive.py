@@ -17,7 +17,7 @@ from netpos.bags.importers.car_imu_rtk import (
     load_car_drive,
     truth_of,
 )
-from netpos.bags.recording import write_bag
+from netpos.bags.recording import write_values
 from netpos.messages.values import RsuInfo
 from netpos.radio.measure import Observations
 from netpos.scenario.along_path import measurements_of, observe_along, stations_along
@@ -81,7 +81,7 @@ def import_car_drive(
     simulated = station_drive(drive, fewest=fewest, nearest=nearest, seed=seed)
     height_m = float(simulated.antenna[0, 2])
     source = f"car-imu-rtk {Path(path).name}, simulated stations {fewest}-{nearest}, seed {seed}"
-    return write_bag(
+    return write_values(
         bag,
         rsus=simulated.stations,
         measurements=measurements_of(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, Self
+import os
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -36,6 +38,9 @@ from netpos.world.motion import follow
 from netpos.world.quadratic import QuadraticMotion
 from netpos.world.routes import random_route, rectangle
 from netpos.world.wander import Wander
+
+if TYPE_CHECKING:
+    from netpos.scenario.recording import Recording
 
 Array = npt.NDArray[np.float64]
 
@@ -271,6 +276,40 @@ class Scenario(Section):
     networks: tuple[Network, ...] = ()
     tracker: dict[str, Any] = Field(default_factory=dict)
     fusion: dict[str, Any] = Field(default_factory=dict)
+
+    @classmethod
+    def load(
+        cls,
+        name_or_path: str,
+        seed: int | None = None,
+        changes: Mapping[str, object] | None = None,
+    ) -> Scenario:
+        """Read a scenario by its name (``netpos scenarios`` lists them) or from a YAML file.
+
+        ``seed`` replaces the file's seed. ``changes`` replaces single values before validation,
+        keys with dots and list indices: ``{"devices.0.beacon_interval_s": 0.01}``.
+
+        Raises ``ScenarioError`` (a ``ValueError``) for no such scenario, a text that is not YAML,
+        unknown or missing keys, and values out of range.
+        """
+        from netpos.scenario.load import load_scenario  # noqa: PLC0415 - it reads this schema
+
+        return load_scenario(name_or_path, seed, changes)
+
+    def simulate(
+        self, bag: os.PathLike[str] | str, *, progress: Callable[[int], None] | None = None
+    ) -> Recording:
+        """Simulate the run, without ROS, into a new bag: all that a live graph without its
+        tracker sends. The same scenario and seed give the same values.
+
+        ``progress`` is called with the number of messages done. Raises ``FileExistsError`` where
+        ``bag`` exists.
+        """
+        from netpos.scenario.offline import simulate_to_bag  # noqa: PLC0415 - needs the schema
+        from netpos.scenario.recording import Recording  # noqa: PLC0415
+
+        simulate_to_bag(self, os.fspath(bag), progress=progress)
+        return Recording(bag)
 
     @property
     def start_ns(self) -> int:

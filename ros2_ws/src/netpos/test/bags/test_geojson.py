@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from netpos.bags.errors import BagError
 from netpos.bags.geojson import geojson_of
-from netpos.bags.recording import read_bag, write_bag
+from netpos.bags.recording import RecordedValues, write_values
 from netpos.messages.values import Field, Odometry, RsuInfo, RsuMeasurement
 from pyproj import Geod
 
@@ -40,12 +40,12 @@ def bag(tmp_path: Path) -> Path:
         for k in range(6)
     ]
     rsus = [RsuInfo(rsu_id="a", position=np.array([1000.0, 0.0, 7.5]))]
-    write_bag(tmp_path / "bag", rsus=rsus, measurements=[measured], truth=truth)
+    write_values(tmp_path / "bag", rsus=rsus, measurements=[measured], truth=truth)
     return tmp_path / "bag"
 
 
 def test_places_are_where_geodesics_lead(bag: Path) -> None:
-    content = json.loads(json.dumps(geojson_of(read_bag(bag), DATUM)))
+    content = json.loads(json.dumps(geojson_of(RecordedValues(bag), DATUM)))
     rsu, line = content["features"]
     assert content["type"] == "FeatureCollection"
     assert rsu["properties"] == {"kind": "rsu", "name": "a"}
@@ -62,9 +62,9 @@ def test_places_are_where_geodesics_lead(bag: Path) -> None:
 
 def test_without_a_datum_it_says_what_to_give(bag: Path) -> None:
     with pytest.raises(BagError, match="--datum"):
-        geojson_of(read_bag(bag))
+        geojson_of(RecordedValues(bag))
     with pytest.raises(ValueError, match="latitude must be in"):
-        geojson_of(read_bag(bag), "95, 0")
+        geojson_of(RecordedValues(bag), "95, 0")
 
 
 @pytest.mark.parametrize("azimuth_deg", [0.0, 77.0, 180.0, 260.0])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from netpos.bags import BagError, BagReader, codec
 from netpos.bags.importers.own.rsus import read_rsus
-from netpos.bags.recording import write_bag
+from netpos.bags.recording import write_values
 from netpos.bags.rsus_file import load_rsus, save_rsus
 from netpos.cli.main import app
 from netpos.evaluation import evaluate_bag
@@ -58,7 +58,7 @@ def recorded(path: Path, seed: int, **tracker: object) -> Path:
         )
         truth.append(pose)
     tracker = {"accel_density_mps2_sqrthz": 0.3, **tracker}
-    write_bag(path, rsus=INFOS, measurements=measurements, truth=truth, tracker=tracker)
+    write_values(path, rsus=INFOS, measurements=measurements, truth=truth, tracker=tracker)
     return path
 
 
@@ -115,7 +115,7 @@ def test_every_field_of_an_rsu_is_kept(tmp_path: Path) -> None:
         )
         for info in odd
     ]
-    write_bag(tmp_path / "bag", rsus=odd, measurements=measured)
+    write_values(tmp_path / "bag", rsus=odd, measurements=measured)
     save_rsus(tmp_path / "bag", tmp_path / "rsus.yaml")
     read = {info.rsu_id: info for info in read_rsus(tmp_path / "rsus.yaml")}
     for info in odd:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from netpos.bags import BagWriter
-from netpos.bags.recording import write_bag
+from netpos.bags.recording import write_values
 from netpos.cli.main import app
 from netpos.evaluation import Survey, assess_bag, survey_bag
 from netpos.evaluation.residuals import correlation_s
@@ -81,7 +81,7 @@ def recorded(
             )
     source = folder / "source"
     parameters = {"accel_density_mps2_sqrthz": 0.3, "clock_offset_sd_s": 0.0, **tracker}
-    write_bag(source, rsus=infos, measurements=measurements, tracker=parameters)
+    write_values(source, rsus=infos, measurements=measurements, tracker=parameters)
     replay_bag(source, folder / "track")
     return folder / "track"
 

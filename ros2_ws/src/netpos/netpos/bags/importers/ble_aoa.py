@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from netpos.bags.errors import BagError
 from netpos.bags.importers.common import Row, read_rows, yaw_quaternion
-from netpos.bags.recording import write_bag
+from netpos.bags.recording import write_values
 from netpos.messages.values import AngleConvention, Array, Field, Odometry, RsuInfo, RsuMeasurement
 
 MS = 1_000_000
@@ -103,7 +103,7 @@ def import_ble_aoa(
     skipped: Counter[str] = Counter()
     measurements = _measurements(beacons, vue_id, errors, skipped)
     truth = _truth(_truth_file(beacons), vue_id, skipped)
-    counts = write_bag(
+    counts = write_values(
         bag,
         rsus=[_info(rsu_id, errors) for rsu_id in ARRAYS],
         measurements=measurements,

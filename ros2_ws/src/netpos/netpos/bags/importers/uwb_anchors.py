@@ -21,7 +21,7 @@ from netpos.bags.importers.common import (
     read_rows,
     truth_of_poses,
 )
-from netpos.bags.recording import write_bag
+from netpos.bags.recording import write_values
 from netpos.messages.values import Field, Odometry, RsuInfo, RsuMeasurement
 
 # The two anchors above each other (1.97 m and 0.5 m) tell the tag's height from the ranges alone;
@@ -65,7 +65,7 @@ def import_uwb_anchors(
         infos.append(info)
         measurements += ranges
     truth = _truth(path / "trajectory.csv", vue_id, skipped)
-    counts = write_bag(
+    counts = write_values(
         bag,
         rsus=infos,
         measurements=measurements,

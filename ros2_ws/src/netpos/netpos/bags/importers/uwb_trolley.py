@@ -23,7 +23,7 @@ from netpos.bags.importers.common import (
     read_rows,
     truth_of_poses,
 )
-from netpos.bags.recording import write_bag
+from netpos.bags.recording import write_values
 from netpos.messages.values import Field, Odometry, RsuInfo, RsuMeasurement
 
 ANCHORS_M = (
@@ -80,7 +80,7 @@ def import_uwb_trolley(
     skipped: Counter[str] = Counter()
     measurements = _ranges(_only(path, "UWB_*.csv"), vue_id, errors, skipped)
     truth = _truth(_only(path, "motion_capture_*.csv"), vue_id, skipped)
-    counts = write_bag(
+    counts = write_values(
         bag,
         rsus=_links(errors),
         measurements=measurements,

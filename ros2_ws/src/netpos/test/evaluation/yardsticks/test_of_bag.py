@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from corner_ranges import S
-from netpos.bags.recording import write_bag
+from netpos.bags.recording import write_values
 from netpos.evaluation.yardsticks import (
     Kind,
     observations_of_bag,
@@ -61,7 +61,7 @@ def bag_of(path: Path) -> Path:
         )
         for k in (1, 2)
     ]
-    write_bag(path, rsus=[array, anchor], measurements=measured, truth=truth)
+    write_values(path, rsus=[array, anchor], measurements=measured, truth=truth)
     return path
 
 

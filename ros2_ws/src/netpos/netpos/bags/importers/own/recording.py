@@ -14,7 +14,7 @@ from netpos.bags.importers.own.alignment import Way, align, plain_track
 from netpos.bags.importers.own.columns import Columns
 from netpos.bags.importers.own.records import Message, Record, Skipped, lines, messages
 from netpos.bags.importers.own.truth import Pose, Poses, TruthColumns, local, poses_of
-from netpos.bags.recording import SKIPPED, TRUTH_ALIGNMENT, write_bag
+from netpos.bags.recording import SKIPPED, TRUTH_ALIGNMENT, write_values
 from netpos.messages.values import Odometry, RsuInfo, RsuMeasurement
 
 CUT = "cut first or last lines"
@@ -288,7 +288,7 @@ def _write(
         metadata[TRUTH_ALIGNMENT] = sentence
     if skipped:
         metadata[SKIPPED] = ", ".join(f"{what} {n}" for what, n in sorted(skipped.items()))
-    counts = write_bag(
+    counts = write_values(
         bag,
         rsus=rsus,
         measurements=measurements,
