@@ -39,7 +39,7 @@ from scipy.spatial.transform import Rotation
 
 from netpos.world.body import BodyState, check_times
 from netpos.world.frames import wrap_angle
-from netpos.world.motion import Motion, follow
+from netpos.world.motion import Leg, Motion, follow, follow_legs
 
 Array = npt.NDArray[np.float64]
 
@@ -274,8 +274,35 @@ def walk(
             "a walk turns at its corners: give each a pause in pauses_s to turn in, or the "
             "route a corner_radius_m > 0"
         )
-    legs = [_Leg(way, model.step_length_m) for way in ways]
-    return _timetable(model, legs, [pauses[i] for i in stops])
+    return _gait(model, ways, [pauses[i] for i in stops])
+
+
+def walk_legs(
+    start: npt.ArrayLike,
+    heading_rad: float,
+    legs: Sequence[Leg],
+    model: GaitModel,
+    *,
+    pauses_s: Sequence[float] = (),
+) -> Gait:
+    """Walk along straight lines and arcs, from rest to rest between pauses.
+
+    The way is that of ``world.motion.follow_legs``, which describes the arguments and errors.
+    """
+    whole = follow_legs(start, heading_rad, legs, 1.0, pauses_s=pauses_s)
+    pauses = list(pauses_s) or [0.0] * (len(legs) + 1)
+    stops = [0, *(i for i in range(1, len(legs)) if pauses[i] > 0), len(legs)]
+    ways: list[Motion] = []
+    pose = whole.at(0.0)
+    for a, b in itertools.pairwise(stops):
+        ways.append(follow_legs(pose.position[0], float(pose.yaw[0]), legs[a:b], 1.0))
+        pose = ways[-1].at(ways[-1].duration_s)
+    return _gait(model, ways, [pauses[i] for i in stops])
+
+
+def _gait(model: GaitModel, ways: Sequence[Motion], pauses: Sequence[float]) -> Gait:
+    """The gait along ways at 1 m/s, with the pauses before, between and after them."""
+    return _timetable(model, [_Leg(way, model.step_length_m) for way in ways], pauses)
 
 
 def _timetable(model: GaitModel, legs: Sequence[_Leg], pauses: Sequence[float]) -> Gait:

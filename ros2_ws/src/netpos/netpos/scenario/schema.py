@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from netpos.inertial.gait import GaitModel, walk
+from netpos.inertial.gait import Gait, GaitModel, walk, walk_legs
 from netpos.inertial.imu import ImuModel, MagnetometerModel, interval_ns
 from netpos.inertial.pdr_config import PdrConfig
 from netpos.radio.clocks import ClockModel
@@ -34,7 +34,7 @@ from netpos.scenario.size import check_motion, check_size
 from netpos.world.body import BodyMotion
 from netpos.world.hills import Hills
 from netpos.world.maps import METIS_MADRID
-from netpos.world.motion import follow
+from netpos.world.motion import Leg, Motion, follow, follow_legs
 from netpos.world.quadratic import QuadraticMotion
 from netpos.world.routes import random_route, rectangle
 from netpos.world.wander import Wander
@@ -49,37 +49,60 @@ LEGS_MAX = 40_000  # of a route
 DEVICES_MAX = 100_000  # with the same settings
 
 
-class RandomRoute(Section):
+class _Points(Section):
+    """A route along way-points."""
+
+    corner_radius_m: NotNegative = 0.0
+    pauses_s: tuple[NotNegative, ...] = ()
+
+    def waypoints(self, rng: np.random.Generator) -> Array:
+        """(n, 2) m."""
+        raise NotImplementedError
+
+    def drive(
+        self, rng: np.random.Generator, speed_mps: float, ramp_mps2: float | None, hills: Hills
+    ) -> Motion:
+        """A vehicle on this route."""
+        return follow(
+            self.waypoints(rng),
+            speed_mps,
+            corner_radius_m=self.corner_radius_m,
+            acceleration_mps2=ramp_mps2,
+            pauses_s=self.pauses_s,
+            hills=hills,
+        )
+
+    def walk(self, rng: np.random.Generator, gait: GaitModel) -> Gait:
+        """A person on this route."""
+        points, radius = self.waypoints(rng), self.corner_radius_m
+        return walk(points, gait, corner_radius_m=radius, pauses_s=self.pauses_s)
+
+
+class RandomRoute(_Points):
     """fokin2020 section 2.4: random turns on the METIS grid."""
 
     kind: Literal["metis_random"]
     max_crossings: int = Field(default=6, ge=1, le=LEGS_MAX)
     corner_radius_m: NotNegative = Field(default=0.0, lt=METIS_MADRID.block_m / 2)
-
-    @property
-    def pauses_s(self) -> tuple[float, ...]:
-        """A random route never stops."""
-        return ()
+    pauses_s: tuple[()] = ()  # it never stops
 
     def waypoints(self, rng: np.random.Generator) -> Array:
         """(n, 2) m."""
         return random_route(METIS_MADRID, rng, self.max_crossings)
 
 
-class WaypointRoute(Section):
+class WaypointRoute(_Points):
     """Straight lines between way-points; ``pauses_s`` one per way-point."""
 
     kind: Literal["waypoints"]
     points: tuple[Point, ...] = Field(min_length=2)
-    corner_radius_m: NotNegative = 0.0
-    pauses_s: tuple[NotNegative, ...] = ()
 
     def waypoints(self, rng: np.random.Generator) -> Array:
         """(n, 2) m."""
         return np.array(self.points)
 
 
-class RectangleRoute(Section):
+class RectangleRoute(_Points):
     """Once or more round a rectangle, counter-clockwise from its lower left corner."""
 
     kind: Literal["rectangle"]
@@ -87,12 +110,74 @@ class RectangleRoute(Section):
     width_m: Positive
     height_m: Positive
     laps: int = Field(default=1, ge=1, le=LEGS_MAX // 4)
-    corner_radius_m: NotNegative = 0.0
-    pauses_s: tuple[NotNegative, ...] = ()
 
     def waypoints(self, rng: np.random.Generator) -> Array:
         """(n, 2) m."""
         return rectangle(self.corner, self.width_m, self.height_m, laps=self.laps)
+
+
+class PathLeg(Section):
+    """A straight line of ``straight_m``, or an arc of ``radius_m`` that turns by ``arc_deg``, to
+    the left if positive."""
+
+    straight_m: Positive | None = None
+    arc_deg: Finite | None = None
+    radius_m: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        line, arc = self.straight_m is not None, self.arc_deg is not None
+        if line == arc or arc != (self.radius_m is not None) or self.arc_deg == 0.0:
+            raise ValueError(
+                "a leg is either straight_m, or arc_deg (left > 0, not 0) with radius_m"
+            )
+        return self
+
+    @property
+    def leg(self) -> Leg:
+        """Length and turn."""
+        if self.straight_m is not None:
+            return Leg(self.straight_m)
+        assert self.arc_deg is not None
+        assert self.radius_m is not None
+        turn = math.radians(self.arc_deg)
+        return Leg(self.radius_m * abs(turn), turn)
+
+
+class PathRoute(Section):
+    """Straight lines and arcs, each of which goes on from the end of the one before in the same
+    direction; ``heading_deg`` is from east counter-clockwise. ``pauses_s``: at the start and at
+    the end of each leg."""
+
+    kind: Literal["path"]
+    start: Point
+    heading_deg: Finite
+    legs: tuple[PathLeg, ...] = Field(min_length=1, max_length=LEGS_MAX)
+    pauses_s: tuple[NotNegative, ...] = ()
+
+    @property
+    def length_m(self) -> float:
+        """Of all legs."""
+        return math.fsum(leg.leg.length_m for leg in self.legs)
+
+    def drive(
+        self, rng: np.random.Generator, speed_mps: float, ramp_mps2: float | None, hills: Hills
+    ) -> Motion:
+        """A vehicle on this route."""
+        return follow_legs(
+            self.start,
+            math.radians(self.heading_deg),
+            [leg.leg for leg in self.legs],
+            speed_mps,
+            acceleration_mps2=ramp_mps2,
+            pauses_s=self.pauses_s,
+            hills=hills,
+        )
+
+    def walk(self, rng: np.random.Generator, gait: GaitModel) -> Gait:
+        """A person on this route."""
+        legs, heading = [leg.leg for leg in self.legs], math.radians(self.heading_deg)
+        return walk_legs(self.start, heading, legs, gait, pauses_s=self.pauses_s)
 
 
 class Stretch(Section):
@@ -121,7 +206,8 @@ class QuadraticRoute(Section):
 
 
 Route = Annotated[
-    RandomRoute | WaypointRoute | RectangleRoute | QuadraticRoute, Field(discriminator="kind")
+    RandomRoute | WaypointRoute | RectangleRoute | PathRoute | QuadraticRoute,
+    Field(discriminator="kind"),
 ]
 
 
@@ -197,23 +283,12 @@ class Device(Section):
         """The true motion; a random route is drawn from the stream ``<vue>/route``."""
         if isinstance(self.route, QuadraticRoute):
             return self.route.motion()
-        points = self.route.waypoints(generator(seed, f"{vue_id}/route"))
+        rng = generator(seed, f"{vue_id}/route")
         if self.gait is not None:
-            return walk(
-                points,
-                self.gait,
-                corner_radius_m=self.route.corner_radius_m,
-                pauses_s=self.route.pauses_s,
-            )
+            return self.route.walk(rng, self.gait)
         assert self.speed_mps is not None
-        drive = follow(
-            points,
-            self.speed_mps,
-            corner_radius_m=self.route.corner_radius_m,
-            acceleration_mps2=self.acceleration_mps2,
-            pauses_s=self.route.pauses_s,
-            hills=Hills(amplitude_m=self.hill_amplitude_m, period_s=self.hill_period_s),
-        )
+        hills = Hills(amplitude_m=self.hill_amplitude_m, period_s=self.hill_period_s)
+        drive = self.route.drive(rng, self.speed_mps, self.acceleration_mps2, hills)
         if self.wander_density_mps2_sqrthz is None:
             return drive
         rng = generator(seed, f"{vue_id}/wander")

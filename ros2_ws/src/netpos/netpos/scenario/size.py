@@ -27,6 +27,8 @@ def route_duration_s(device: Device) -> float:
         speed_mps = device.gait.step_length_m * device.gait.cadence_hz
     if route.kind == "metis_random":
         length_m = (route.max_crossings + 1) * METIS_MADRID.block_m
+    elif route.kind == "path":
+        length_m = route.length_m
     elif route.kind == "rectangle":
         length_m = route.laps * 2.0 * (route.width_m + route.height_m)
     else:

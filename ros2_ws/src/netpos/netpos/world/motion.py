@@ -1,4 +1,4 @@
-"""Exact plane motion along way-points: straight lines, circular corners, speed ramps, pauses.
+"""Exact plane motion: straight lines, arcs, speed ramps, pauses.
 
 A motion is a list of pieces. Within one piece curvature and tangential acceleration are constant,
 so that position, velocity, acceleration, heading and yaw rate have closed forms and no step of any
@@ -47,8 +47,16 @@ class _Piece:
     spin: float
 
 
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """A straight line, or an arc that turns by ``turn_rad`` on its length, left if positive."""
+
+    length_m: float
+    turn_rad: float = 0.0
+
+
 class Motion:
-    """Motion along way-points, built by ``follow``."""
+    """Motion along way-points or legs, built by ``follow`` and ``follow_legs``."""
 
     def __init__(
         self, pieces: Sequence[_Piece], duration_s: float, *, smooth: bool, hills: Hills = FLAT
@@ -139,11 +147,72 @@ def follow(
     _check(xy, speed_mps, corner_radius_m, acceleration_mps2, pauses_s)
     pauses = list(pauses_s) or [0.0] * len(xy)
     runs, bends = _geometry(xy, corner_radius_m, pauses)
-    stops = [i for i in range(len(xy)) if pauses[i] > 0]
-    breaks = sorted({0, len(xy) - 1, *stops})
-    pieces, clock = _walk(runs, bends, breaks, pauses, speed_mps, acceleration_mps2)
-    sharp = any(abs(bends[i]) > _STRAIGHT_RAD and pauses[i] == 0 for i in range(len(xy)))
-    abrupt = bool(stops) and acceleration_mps2 is None
+    return _motion(runs, bends, pauses, speed_mps, acceleration_mps2, hills)
+
+
+def follow_legs(
+    start: npt.ArrayLike,
+    heading_rad: float,
+    legs: Sequence[Leg],
+    speed_mps: float,
+    *,
+    acceleration_mps2: float | None = None,
+    pauses_s: Sequence[float] = (),
+    hills: Hills = FLAT,
+) -> Motion:
+    """Motion at constant speed along straight lines and arcs, each of which goes on where and in
+    the direction in which the one before ends.
+
+    Parameters
+    ----------
+    start : (2,)  where the first leg begins in map [m]
+    heading_rad : direction there, from east counter-clockwise
+    legs : n >= 1
+    pauses_s : (n + 1,) standing time at the start and at the end of each leg, or empty
+
+    The others, and pauses, are as in ``follow``.
+
+    Raises
+    ------
+    ValueError  a way is too short for its ramps, a value is out of range
+    """
+    if hills.amplitude_m > 0 and any(pauses_s):
+        raise ValueError("a road with hills allows no pauses; set their amplitude to 0")
+    xy = np.asarray(start, dtype=np.float64)
+    if xy.shape != (2,) or not np.isfinite([*xy, heading_rad]).all():
+        raise ValueError(
+            f"a way needs a finite start (x, y) and heading, got {xy.tolist()}, {heading_rad}"
+        )
+    if not legs:
+        raise ValueError("a way needs at least one leg")
+    for i, leg in enumerate(legs):
+        if not (0 < leg.length_m < math.inf and math.isfinite(leg.turn_rad)):
+            raise ValueError(f"leg {i} needs a finite length > 0 and a finite turn, got {leg}")
+    _check_run(speed_mps, acceleration_mps2, pauses_s, len(legs) + 1)
+    runs: list[list[_Segment]] = []
+    pose = float(xy[0]), float(xy[1]), heading_rad
+    for leg in legs:
+        segment = _Segment(*pose, leg.turn_rad / leg.length_m, leg.length_m)
+        runs.append([segment])
+        pose = _end(segment)
+    pauses = list(pauses_s) or [0.0] * (len(legs) + 1)
+    return _motion(runs, [0.0] * len(pauses), pauses, speed_mps, acceleration_mps2, hills)
+
+
+def _motion(
+    runs: list[list[_Segment]],
+    bends: list[float],
+    pauses: list[float],
+    speed: float,
+    acceleration: float | None,
+    hills: Hills,
+) -> Motion:
+    """Motion along the runs between points with a bend and a pause each."""
+    stops = [i for i, pause in enumerate(pauses) if pause > 0]
+    breaks = sorted({0, len(runs), *stops})
+    pieces, clock = _walk(runs, bends, breaks, pauses, speed, acceleration)
+    sharp = any(abs(bends[i]) > _STRAIGHT_RAD and pauses[i] == 0 for i in range(len(pauses)))
+    abrupt = bool(stops) and acceleration is None
     return Motion(pieces, clock, smooth=not (sharp or abrupt), hills=hills)
 
 
@@ -183,22 +252,28 @@ def _check(
         raise ValueError(
             f"a route needs at least two finite way-points (x, y), got shape {xy.shape}"
         )
-    if not 0 < speed < math.inf:
-        raise ValueError(f"speed_mps must be finite and > 0, got {speed}")
     if not 0 <= radius < math.inf:
         raise ValueError(f"corner_radius_m must be finite and >= 0, got {radius}")
-    if acceleration is not None and not 0 < acceleration < math.inf:
-        raise ValueError(f"acceleration_mps2 must be finite and > 0, got {acceleration}")
-    if pauses and len(pauses) != len(xy):
-        raise ValueError(f"pauses_s needs one value per way-point ({len(xy)}), got {len(pauses)}")
-    if not all(0 <= p < math.inf for p in pauses):
-        raise ValueError(f"pauses_s must be finite and >= 0, got {list(pauses)}")
+    _check_run(speed, acceleration, pauses, len(xy))
     repeated = np.flatnonzero((np.diff(xy, axis=0) == 0).all(axis=1))
     if repeated.size:
         raise ValueError(
             f"way-points {repeated[0]} and {repeated[0] + 1} are the same point; "
             "remove one, or set pauses_s to wait there"
         )
+
+
+def _check_run(
+    speed: float, acceleration: float | None, pauses: Sequence[float], points: int
+) -> None:
+    if not 0 < speed < math.inf:
+        raise ValueError(f"speed_mps must be finite and > 0, got {speed}")
+    if acceleration is not None and not 0 < acceleration < math.inf:
+        raise ValueError(f"acceleration_mps2 must be finite and > 0, got {acceleration}")
+    if pauses and len(pauses) != points:
+        raise ValueError(f"pauses_s needs one value per way-point ({points}), got {len(pauses)}")
+    if not all(0 <= p < math.inf for p in pauses):
+        raise ValueError(f"pauses_s must be finite and >= 0, got {list(pauses)}")
 
 
 def _geometry(

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from netpos.inertial.gait import Gait, GaitModel, walk
+from netpos.inertial.gait import Gait, GaitModel, walk, walk_legs
 from netpos.inertial.imu import (
     ImuModel,
     MagneticDisturbance,
@@ -14,6 +14,7 @@ from netpos.inertial.imu import (
     simulate_imu,
     simulate_magnetometer,
 )
+from netpos.world.motion import Leg
 from netpos.world.routes import rectangle
 from scipy.spatial.transform import Rotation
 
@@ -37,10 +38,12 @@ PERFECT = ImuModel(
     gyro_bias_sd_radps=0.0,
     accel_bias_sd_mps2=0.0,
 )
+ARCS = [Leg(3.0), Leg(3.0 * np.pi / 2, np.pi / 2), Leg(2.0 * np.pi, -np.pi)]
 GAITS = [
     walk(rectangle((1.0, 2.0), 5.7, 4.5), PAPER, pauses_s=[0.5] * 5),
     walk([[0, 0], [6, 0], [6, -5]], GaitModel(), corner_radius_m=1.0),
     walk([[0, 0], [0, 2.0]], GaitModel(stance_pause_s=0.3, lean_deg=-12.0), pauses_s=[1, 2]),
+    walk_legs([1, 2], 0.5, ARCS, GaitModel(), pauses_s=[1, 0, 2, 0]),
 ]
 
 
@@ -247,3 +250,12 @@ def test_magnetometer_turns_with_the_body_and_meets_iron_and_disturbances() -> N
     )
     expected = np.array(disturbance.field_t) * math.exp(-(away[near] ** 2) / 0.5)
     np.testing.assert_allclose(extra, expected, atol=1e-8)
+
+
+def test_a_walk_of_lines_and_arcs_ends_where_they_do() -> None:
+    """3 m along +x, a quarter of 3 m to the left, half a circle of 2 m to the right."""
+    gait = walk_legs([0, 0], 0.0, ARCS, GaitModel(), pauses_s=[1, 0, 2, 0])
+    np.testing.assert_allclose(
+        gait.body_at(gait.duration_s).position[0, :2], [10.0, 3.0], atol=1e-9
+    )
+    assert gait.step_length_m.sum() == pytest.approx(3.0 + 3.5 * np.pi)

@@ -15,7 +15,7 @@ from netpos.inertial.imu import (
     simulate_imu,
     simulate_magnetometer,
 )
-from netpos.world.motion import Motion, follow
+from netpos.world.motion import Leg, Motion, follow, follow_legs
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
@@ -88,6 +88,24 @@ def test_specific_force_at_rest_points_up_and_left_in_a_left_turn() -> None:
     assert turning.any()
     np.testing.assert_allclose(imu.specific_force[0], [0, 0, 9.80665], atol=1e-12)
     np.testing.assert_allclose(imu.specific_force[turning][5], [0, 4 / 5, 9.80665], atol=1e-4)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_an_arc_is_felt_as_v_squared_over_r_and_turned_at_v_over_r(side: float) -> None:
+    """A sample is a mean over dt, in which the force turns by w dt: shorter by sinc(w dt / 2)."""
+    speed, radius = 5.0, 8.0
+    legs = [Leg(10.0), Leg(2 * np.pi * radius, side * 2 * np.pi), Leg(10.0)]
+    imu = simulate_imu(PERFECT, follow_legs([0, 0], 0.3, legs, speed), START_NS, 1, "v")
+    t = (imu.stamp_ns - START_NS) * 1e-9
+    inside = (t > 2.0 + 0.011) & (t < 2.0 + 2 * np.pi * radius / speed - 0.001)
+    assert inside.sum() == pytest.approx(2 * np.pi * radius / speed * 100, abs=3)
+    half = speed / radius * 0.01 / 2
+    force = [0.0, side * speed**2 / radius * np.sin(half) / half, 9.80665]
+    np.testing.assert_allclose(imu.specific_force[inside], [force] * inside.sum(), atol=1e-9)
+    rates = imu.angular_velocity[inside]
+    np.testing.assert_allclose(rates, [[0.0, 0.0, side * speed / radius]] * len(rates), atol=1e-9)
+    straight = t < 2.0
+    np.testing.assert_allclose(imu.specific_force[straight][:, 1], 0.0, atol=1e-12)
 
 
 def test_noise_and_biases_have_the_stated_size() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from netpos.messages.values import Odometry
 from netpos.scenario import ScenarioError, Simulation, load_scenario, scenario_names
 from netpos.scenario.load import scenario_of_text, scenario_text
+from netpos.scenario.size import route_duration_s
 from scipy.spatial.transform import Rotation
 
 GOOD = """\
@@ -204,3 +206,52 @@ def test_complaints_about_a_walker(tmp_path: Path, old: str, new: str, complaint
     assert old in WALKER
     with pytest.raises(ScenarioError, match=complaint):
         load_scenario(_walker(tmp_path, WALKER.replace(old, new)))
+
+
+PATH = {
+    "kind": "path",
+    "start": [1.0, 2.0],
+    "heading_deg": 90.0,
+    "legs": [{"straight_m": 5.0}, {"arc_deg": -90.0, "radius_m": 4.0}],
+}
+
+
+def test_a_path_of_lines_and_arcs(tmp_path: Path) -> None:
+    """Northwards 5 m, a quarter of 4 m to the right; an IMU may be on it."""
+    path = _write(tmp_path, GOOD)
+    changes: dict[str, object] = {"devices.0.route": PATH, "devices.0.speed_mps": 2.0}
+    device = load_scenario(path, changes=changes | {"devices.0.imu": {}}).devices[0]
+    motion = device.motion(1, "vue_1")
+    assert motion.duration_s == pytest.approx((5.0 + 2.0 * math.pi) / 2.0)
+    end = motion.body_at(motion.duration_s)
+    np.testing.assert_allclose(end.position[0], [5.0, 11.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(end.velocity[0], [2.0, 0.0, 0.0], atol=1e-9)
+    assert route_duration_s(device) == pytest.approx(motion.duration_s)
+    walker = {"devices.0.speed_mps": None, "devices.0.gait": {"step_length_m": 0.6}}
+    person = load_scenario(path, changes=changes | walker).devices[0]
+    gait = person.motion(1, "vue_1")
+    np.testing.assert_allclose(gait.body_at(gait.duration_s).position[0, :2], [5, 11], atol=1e-9)
+    assert route_duration_s(person) == pytest.approx(gait.duration_s, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("leg", "words"),
+    [  # as in YAML
+        ("straight_m: 1.0, radius_m: 2.0", "either straight_m, or arc_deg"),
+        ("arc_deg: 10.0", "either straight_m, or arc_deg"),
+        ("arc_deg: 0.0, radius_m: 2.0", "either straight_m, or arc_deg"),
+        (
+            "straight_m: -1.0",
+            r"line 12: devices\.0\.route\.legs\.2\.straight_m.*greater than 0, got -1",
+        ),
+        ("length_m: 1.0", r"line 12: devices\.0\.route\.legs\.2\.length_m: unknown key"),
+    ],
+)
+def test_a_leg_is_a_line_or_an_arc(leg: str, words: str, tmp_path: Path) -> None:
+    route = (
+        "{kind: path, start: [0.0, 5.0], heading_deg: 0.0, legs: [\n"
+        f"        {{straight_m: 1.0}},\n        {{arc_deg: 9, radius_m: 1}},\n        {{{leg}}}]}}"
+    )
+    text = GOOD.replace("{kind: waypoints, points: [[0.0, 5.0], [10.0, 5.0]]}", route)
+    with pytest.raises(ScenarioError, match=words):
+        load_scenario(_write(tmp_path, text))
