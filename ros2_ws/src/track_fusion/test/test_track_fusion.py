@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from netpos.messages.network_tracks import network_track_to_msg
 from netpos.messages.values import NetworkTrack
@@ -148,3 +149,40 @@ def test_services(make: Any) -> None:
 def test_bad_parameters(make: Any, overrides: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make(**overrides)
+
+
+def test_frames_have_the_names_they_are_given(make: Any) -> None:
+    node = make(**AT_ONCE, map_frame="site", base_frame="{vue}_body")
+    odometry, _, _ = keep(node)
+    node._tf_pub = Kept(TFMessage)
+    arrive(node, "wimax", 0.0, 0.0)
+    assert not odometry.messages
+    assert node._fusion.rejected() == {"wimax: frame": 1}
+    arrive(node, "wimax", 1.0, 0.0, frame_id="site")
+    arrive(node, "wifi", 1.0, 2.0, frame_id="site")
+    fused = odometry.messages[-1]
+    assert (fused.header.frame_id, fused.child_frame_id) == ("site", "vue_1_body")
+    sent = node._tf_pub.messages[-1].transforms[0]
+    assert (sent.header.frame_id, sent.child_frame_id) == ("site", "vue_1_body")
+
+
+def test_odom_frame_listens_to_dead_reckoning(make: Any) -> None:
+    """/tf is joined as the tracker joins it (its tests); without a transform nothing is sent."""
+    node = make(**AT_ONCE, odom_frame="{vue}/odom")
+    keep(node)
+    node._tf_pub = Kept(TFMessage)
+    arrive(node, "wimax", 0.0, 0.0)
+    arrive(node, "wifi", 0.0, 2.0)
+    assert not node._tf_pub.messages
+    for t_s, x in ((0.9, 4.0), (1.1, 6.0)):
+        message = TransformStamped()
+        message.header.frame_id, message.child_frame_id = "vue_1/odom", "vue_1/base_link"
+        message.header.stamp = CODEC.time(T0 + round(t_s * 1e9))
+        message.transform.translation.x = x
+        message.transform.rotation.w = 1.0
+        node._on_transforms(TFMessage(transforms=[message]))
+    arrive(node, "wimax", 1.0, 5.0)
+    arrive(node, "wifi", 1.0, 7.0)
+    (sent,) = node._tf_pub.messages[-1].transforms
+    assert (sent.header.frame_id, sent.child_frame_id) == ("map", "vue_1/odom")
+    assert sent.transform.translation.x == pytest.approx(1.0)  # the device at 6, 5 in odom

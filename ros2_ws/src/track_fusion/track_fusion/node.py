@@ -28,7 +28,8 @@ class TrackFusionNode(EstimatingNode):
     def _configure(self) -> None:
         parameters = self._chosen
         self._fusion = TrackFusion(parameters.networks, parameters.config)
-        self._begin(self._fusion, publish_tf=parameters.publish_tf)
+        frames = parameters.config.frames
+        self._begin(self._fusion, publish_tf=parameters.publish_tf, frames=frames)
         self._diagnostics_pub = self._offer(DiagnosticArray, topics.DIAGNOSTICS, 10)
         for vue_id in parameters.vue_ids:
             self._add_outputs(vue_id)

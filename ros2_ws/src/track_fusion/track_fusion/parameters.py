@@ -44,7 +44,7 @@ def declare_parameters(node: Node) -> FusionParameters:
         config=config,
         networks=networks,
         vue_ids=vue_ids,
-        publish_tf=declare(node, "publish_tf", True, "publish map -> base_link on /tf"),
+        publish_tf=declare(node, "publish_tf", True, "publish map_frame -> base_frame on /tf"),
         subscribers=declare(
             node,
             "subscribers",

@@ -86,9 +86,11 @@ def replay_bag(
                 f"{bag_in} has no {topics.RSU_MEASUREMENTS}: record that topic to replay"
             )
         metadata = source.metadata | tracker_fact(config, settings.rsus)
+        frames = config.frames
         if settings.networks:
             fusion = FusionConfig.from_mapping(settings.fusion)
             metadata |= fusion_fact(settings.networks, fusion)
+            frames = fusion.frames
         tracker = tracker_of(config, settings, smooth=smooth)
         epochs = estimates = 0
         with whole_bag(bag_out, metadata=metadata) as out:
@@ -100,7 +102,7 @@ def replay_bag(
                 epochs += len(batch)
                 estimates += sum(output.odometry is not None for output in batch)
                 for output in batch:
-                    write_output(out, output, config.frames)
+                    write_output(out, output, config.frames if output.network else frames)
                 if progress is not None:
                     progress(done)
             for vue_id, odometry in tracker.smoothed().items() if smooth else ():

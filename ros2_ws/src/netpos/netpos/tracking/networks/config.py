@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from netpos.common.parameters import check_fields, choice, from_mapping, real
+from netpos.common.parameters import check_fields, choice, described, from_mapping, real
 from netpos.estimation.intersection import METHODS
+from netpos.messages.fields import Frames
 
 ASSOCIATIONS = ("motion", "names")
 
@@ -53,13 +54,28 @@ class FusionConfig:
     integrity_risk: float = real(
         1e-4, 1e-12, 0.5, "probability with which the error may exceed the protection level"
     )
+    map_frame: str = described("map", "frame of tracks and estimates, that of the trackers")
+    odom_frame: str = described(
+        "",
+        "with a name, such as {vue}/odom: /tf gets map_frame -> odom_frame, by the transform from"
+        " there to base_frame that dead reckoning gives on /tf; empty: map_frame -> base_frame",
+    )
+    base_frame: str = described(
+        "{vue}/base_link", "body frame of a device; {vue} stands for its name"
+    )
 
     def __post_init__(self) -> None:
         check_fields(self)
+        self.frames.check()
         if self.forget_s < self.stale_s:
             raise ValueError(
                 f"forget_s must be at least stale_s ({self.stale_s:g}), got {self.forget_s:g}"
             )
+
+    @property
+    def frames(self) -> Frames:
+        """Names of the frames."""
+        return Frames(self.map_frame, self.odom_frame, self.base_frame)
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> FusionConfig:

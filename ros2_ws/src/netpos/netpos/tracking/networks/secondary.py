@@ -96,6 +96,7 @@ class Secondary:
             network=self._config.network,
             vue_id=self._vue_id,
             segment=segment,
+            frame_id=self._config.map_frame,
             mean=self._mean(estimate.mean),
             cov=self._matrix(estimate.cov, self._config.accel_state_sd_mps2**2),
             own_cov=np.zeros((6, 6)) if share is None else self._matrix(share, 0.0),

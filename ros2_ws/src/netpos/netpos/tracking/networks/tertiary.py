@@ -147,7 +147,7 @@ class TrackFusion:
             return "disabled"
         if track.network not in self._order:
             return "unknown_network"
-        return network_track_fault(track)
+        return network_track_fault(track, self._config.map_frame)
 
     def process(self) -> list[TrackOutput]:
         """Fuse at every instant that is complete, oldest first."""

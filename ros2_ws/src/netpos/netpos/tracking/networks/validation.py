@@ -16,13 +16,13 @@ _ASYMMETRY_MAX = 1e-6
 _OWN_EXCESS_MAX = 1e-6  # of own noise over the whole, relative to the whole
 
 
-def network_track_fault(track: NetworkTrack) -> str | None:
+def network_track_fault(track: NetworkTrack, map_frame: str = MAP_FRAME) -> str | None:
     """Reason to refuse a network's track whatever the other networks say, or None."""
     if not (is_vue_id(track.network) and is_vue_id(track.vue_id)):
         return "name"
     if track.stamp_ns <= 0:
         return stamp_fault(track.stamp_ns)
-    if track.frame_id != MAP_FRAME:
+    if track.frame_id != map_frame:
         return "frame"
     if track.mean.shape != (6,) or track.cov.shape != (6, 6) or track.own_cov.shape != (6, 6):
         return "shape"

@@ -88,3 +88,29 @@ def test_a_single_network_has_no_fusion_to_set(tmp_path: Path) -> None:
     simulate_to_bag(load_scenario("fast_pass"), bag)
     with pytest.raises(ValueError, match=r"no fusion\.method to set"):
         replay_bag(bag, tmp_path / "out", {"fusion.method": "ci"})
+
+
+def test_every_stage_has_the_frames_it_is_given(simulated: Path, tmp_path: Path) -> None:
+    """The fused track has a name of its own for the body."""
+    out = tmp_path / "out"
+    replay_bag(
+        simulated, out, {"base_frame": "{vue}_of_network", "fusion.base_frame": "{vue}_body"}
+    )
+    for topic, child in (
+        ("/vue_1/odometry", "vue_1_body"),
+        ("/networks/wimax/vue_1/odometry", "vue_1_of_network"),
+    ):
+        found = {(m.header.frame_id, m.child_frame_id) for m in messages(out, topic)}
+        assert found == {("map", child)}
+    sent = [t for m in messages(out, "/tf") for t in m.transforms]
+    assert {(t.header.frame_id, t.child_frame_id) for t in sent} == {
+        ("map", "vue_1_body"),
+        ("map", "vue_2_body"),
+    }
+
+
+def test_tracks_of_another_map_are_refused(simulated: Path, tmp_path: Path) -> None:
+    summary = replay_bag(simulated, tmp_path / "odd", {"fusion.map_frame": "site"})
+    counts = summary.rejected["fusion"]
+    assert set(counts) == {"wifi: frame", "wimax: frame"}
+    assert min(counts.values()) > 20

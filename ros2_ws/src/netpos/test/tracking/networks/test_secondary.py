@@ -122,3 +122,15 @@ def test_late_fixes_revise_the_share() -> None:
                     last[name] = out.track
     np.testing.assert_array_equal(last["late"].own_cov, last["orderly"].own_cov)
     np.testing.assert_array_equal(last["late"].mean, last["orderly"].mean)
+
+
+def test_a_track_is_in_the_frame_of_its_map() -> None:
+    made = Tracker(TrackerConfig(network="wifi", hold_s=0.0, map_frame="site"))
+    made.add_rsu(RsuInfo(rsu_id="ap", position=np.zeros(3), network="wifi", frame_id="site"))
+    found = []
+    for k in range(6):
+        measured = fix(k, np.zeros(2))
+        measured.frame_id = "site"
+        assert made.add(measured) is None
+        found += [out.track for out in made.process() if out.track is not None]
+    assert {track.frame_id for track in found} == {"site"}

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from netpos.messages.values import Array, NetworkTrack
+from netpos.tracking.networks.config import FusionConfig
 from netpos.tracking.networks.validation import network_track_fault
 
 Maker = Callable[..., NetworkTrack]
@@ -56,3 +57,13 @@ def test_sound_tracks(track: Maker) -> None:
     assert network_track_fault(track("wifi", 0.0, own_cov=np.zeros((6, 6)))) is None
     tight = np.diag([1e-6, 1e6, 1.0, 1.0, 1.0, 1e-3])
     assert network_track_fault(track("wifi", 0.0, cov=tight, own_cov=0.5 * tight)) is None
+
+
+def test_tracks_are_in_the_frame_of_the_map(track: Maker) -> None:
+    assert network_track_fault(track("wifi", 0.0, frame_id="site"), "site") is None
+    assert network_track_fault(track("wifi", 0.0), "site") == "frame"
+
+
+def test_two_names_of_one_frame_are_refused() -> None:
+    with pytest.raises(ValueError, match="must differ"):
+        FusionConfig(map_frame="world", odom_frame="world")
