@@ -187,7 +187,8 @@ def commands_page() -> str:
             "# Commands",
             "This page is written from the code; `netpos COMMAND -h` shows the same. "
             "Exit status: 0 done, 1 the work failed, 2 bad usage, 130 interrupted. "
-            "`netpos --install-completion` completes commands and options in your shell.",
+            "`netpos --install-completion` completes commands, options and names of scenarios in "
+            "your shell.",
             *(_command(name, command) for name, command in commands),
             "## ros2 run netpos_bag",
             _help(record_flags),

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from netpos.cli.completion import complete_scenario
 from netpos.cli.errors import WorkFailedError
 from netpos.cli.interrupts import INTERRUPTED
 from netpos.cli.progress import Bars, doing
@@ -40,7 +41,12 @@ def scenarios() -> None:
 
 
 def run(
-    scenario: Annotated[str, typer.Argument(help="Name of a scenario, or path of a YAML file.")],
+    scenario: Annotated[
+        str,
+        typer.Argument(
+            help="Name of a scenario, or path of a YAML file.", autocompletion=complete_scenario
+        ),
+    ],
     bag: Annotated[
         Path | None,
         typer.Option(help="Bag to write; it must not exist. Default: out/SCENARIO_TIME."),

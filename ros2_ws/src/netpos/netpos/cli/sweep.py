@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from netpos.cli.completion import complete_scenario
 from netpos.cli.progress import Bars
 from netpos.cli.results import refuse_recording
 from netpos.cli.runs import parse_setting
@@ -20,7 +21,10 @@ if TYPE_CHECKING:
 
 
 def sweep(
-    scenario: Annotated[str, typer.Argument(help="Scenario, by name or YAML file.")],
+    scenario: Annotated[
+        str,
+        typer.Argument(help="Scenario, by name or YAML file.", autocompletion=complete_scenario),
+    ],
     vary: Annotated[
         list[str],
         typer.Option(
