@@ -10,10 +10,13 @@
 from __future__ import annotations
 
 import io
+import os
 import re
+import signal
 import subprocess
+import tempfile
 from collections.abc import Mapping
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from doctest import ELLIPSIS, NORMALIZE_WHITESPACE, OutputChecker
 from pathlib import Path
 from typing import Any
@@ -66,20 +69,29 @@ class Page:
         self._printed = printed.getvalue()
 
     def _bash(self, example: Example) -> None:
+        """What a failed block has started in the background is ended with it."""
         self.ran += 1
-        done = subprocess.run(
-            ["bash", "-e"],
-            input=example.parsed,
-            cwd=self._folder,
-            env=self._environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            timeout=BLOCK_S,
-            check=False,
-        )
-        self._printed = done.stdout
-        assert done.returncode == 0, f"{self._path.name}:{example.line}: {done.stdout}"
+        with tempfile.TemporaryFile("w+", encoding="utf-8") as output:
+            bash = subprocess.Popen(
+                ["bash", "-ec", example.parsed],
+                cwd=self._folder,
+                env=self._environment,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                process_group=0,
+            )
+            try:
+                bash.wait(BLOCK_S)
+            except subprocess.TimeoutExpired:
+                pass  # it has no return code then
+            finally:
+                if bash.poll() != 0:
+                    with suppress(ProcessLookupError):
+                        os.killpg(bash.pid, signal.SIGTERM)
+            output.seek(0)
+            self._printed = output.read()
+        assert bash.returncode == 0, f"{self._path.name}:{example.line}: {self._printed}"
 
     def _compare(self, example: Example) -> None:
         self.compared += 1

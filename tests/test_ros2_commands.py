@@ -100,8 +100,8 @@ def test_echo(ros2: Answer) -> None:
     message = yaml.safe_load(told.partition("---\n")[0])
     assert message["pose"]["position"] == {"x": 1.0, "y": 2.0, "z": 3.5}
     assert message["header"]["frame_id"] == "map"
-    ros2("topic", "echo", "--once", "/rsu/info", "--field", "pose.position.z",
-         has=("3.5\n---\n",))  # fmt: skip
+    typed = ("/rsu/info", "netpos_msgs/msg/RsuInfo", "--field", "pose.position.z")
+    ros2("topic", "echo", "--once", *typed, has=("3.5\n---\n",))
 
 
 def test_nodes(ros2: Answer) -> None:

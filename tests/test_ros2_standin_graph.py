@@ -127,6 +127,12 @@ def test_pub_and_echo_of_a_field(graph: Graph) -> None:
     assert ros2(graph, *echo, "pose.position.z") == "3.5\n---\n"
     assert ros2(graph, *echo, "rsu_id") == "a0\n---\n"
     assert "no field 'pose.q'" in ros2(graph, *echo, "pose.q", code=1)
+    other = ros2(graph, "topic", "echo", "--once", "/other/info", "std_msgs/msg/String", code=1)
+    assert "/other/info has the type netpos_msgs/msg/RsuInfo, not std_msgs/msg/String" in other
+    unread = f"{STANDIN} topic echo --once /other/info | true; echo ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", unread], env=graph.environment, capture_output=True,
+                          text=True, timeout=60, check=True)  # fmt: skip
+    assert (done.stdout, done.stderr) == ("1\n", "")
 
 
 def test_bandwidth(graph: Graph) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 
@@ -20,7 +21,10 @@ def main() -> int:
             arguments = parser.parse_args()
             return int(arguments.read(arguments))
         return in_graph(parser, commands)
-    except (CommandError, BrokenPipeError) as error:
+    except BrokenPipeError:  # who read our output has enough of it, such as `head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except CommandError as error:
         print(f"ros2: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

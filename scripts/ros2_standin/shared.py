@@ -163,8 +163,13 @@ def type_of(node: Node, topic: str) -> str:
     raise CommandError(f"Unknown topic {topic!r}; 'ros2 topic list' names what there is")
 
 
-def subscribe(node: Node, topic: str, callback: Any, *, raw: bool = False) -> None:
-    """Subscribe as the topic's publishers offer it (type, quality of service); wait for one."""
+def subscribe(
+    node: Node, topic: str, callback: Any, *, wanted: str | None = None, raw: bool = False
+) -> None:
+    """Subscribe as the topic's publishers offer it (type, quality of service); wait for one.
+
+    Raises ``CommandError`` where their type is not the ``wanted`` one.
+    """
     name = full_name(topic)
     publishers = node.get_publishers_info_by_topic(name)
     warned = time.monotonic() + DISCOVERY_S
@@ -182,7 +187,10 @@ def subscribe(node: Node, topic: str, callback: Any, *, raw: bool = False) -> No
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )
-    kind = interface_class(publishers[0].topic_type)
+    offered = publishers[0].topic_type
+    kind = interface_class(offered)
+    if wanted is not None and interface_class(wanted) is not kind:
+        raise CommandError(f"{name} has the type {offered}, not {wanted}")
     node.create_subscription(kind, name, callback, qos, raw=raw)
 
 

@@ -35,6 +35,7 @@ def add_parsers(commands: Any) -> None:
     listing.set_defaults(run=list_topics)
     echo = topic.add_parser("echo")
     echo.add_argument("topic")
+    echo.add_argument("type", nargs="?", help="package/msg/Type; default: the publishers' one")
     echo.add_argument("--once", action="store_true", help="print one message and exit")
     echo.add_argument("--field", help="print only this part, such as pose.pose.position.x")
     echo.set_defaults(run=echo_topic)
@@ -74,7 +75,7 @@ def list_topics(node: Node, arguments: argparse.Namespace) -> int:
 def echo_topic(node: Node, arguments: argparse.Namespace) -> int:
     """Print messages as YAML documents until interrupted, or one with --once."""
     received: list[Any] = []
-    subscribe(node, arguments.topic, received.append)
+    subscribe(node, arguments.topic, received.append, wanted=arguments.type)
     while True:
         rclpy.spin_once(node)
         while received:
