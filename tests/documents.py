@@ -4,7 +4,7 @@
 - ``bash``: runs with ``bash -e``
 - any language with ``title="NAME"``: is written to the file NAME
 - ``text``: the output of the block before it, with ``...`` for what may differ
-- ``console`` and other languages: are only shown
+- ``sh`` and other languages: are only shown
 """
 
 from __future__ import annotations

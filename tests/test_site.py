@@ -78,10 +78,20 @@ def test_the_reference_has_every_parameter_command_message_and_name(site: Path) 
     files = (ROOT / "ros2_ws/src/netpos_msgs/msg").glob("*.msg")
     assert [path.stem for path in files if f'id="{path.stem.lower()}"' not in messages] == []
     api = page(site, "reference/api")
-    headings = set(re.findall(r"netpos\.(\w+)</h3>|>netpos\.(\w+)<", api))
-    assert {a or b for a, b in headings} == set(netpos.__all__)
+    headings = re.findall(r'<h3 id="[^"]+" class="doc doc-heading">\s*netpos\.(\w+)', api)
+    assert headings == netpos.__all__
     ids = [f'id="netpos.messages.values.{name}"' for name in values.__all__]
     assert [text for text in ids if text not in api] == []
+
+
+def test_meanings_and_choices_are_shown_as_they_are_written(site: Path) -> None:
+    """The meaning of an argument is no type, and a bar in code has no backslash."""
+    api = page(site, "reference/api")
+    assert "name, as in its measurements" in re.sub(r"<[^>]+>", "", api)
+    assert "<code>name, as" not in api
+    commands = page(site, "reference/commands")
+    assert "SECONDS|auto" in commands
+    assert "\\|" not in commands
 
 
 def test_every_decision_is_listed(site: Path) -> None:

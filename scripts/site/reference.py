@@ -33,7 +33,10 @@ def table(head: Sequence[str], rows: Rows) -> str:
 
 
 def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("<", "&lt;").replace("\n", " ")
+    """Text of a cell; a bar in code is one already."""
+    pieces = text.replace("\n", " ").split("`")
+    pieces[::2] = [piece.replace("|", "\\|").replace("<", "&lt;") for piece in pieces[::2]]
+    return "`".join(pieces)
 
 
 def _code(value: object) -> str:
@@ -168,7 +171,7 @@ def _command(name: str, command: Any) -> str:
     if rows:
         parts.append(table(["argument or option", "meaning"], rows))
     if name in EXAMPLES:
-        parts.append("\n".join(["```console", *EXAMPLES[name], "```"]))
+        parts.append("\n".join(["```sh", *EXAMPLES[name], "```"]))
     return "\n\n".join(parts)
 
 

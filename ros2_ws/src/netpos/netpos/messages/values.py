@@ -48,16 +48,31 @@ class TrackState(IntEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RsuInfo:
-    """A roadside unit: position, orientation, slow errors.
+    """A roadside unit: where it is, and its slow errors. 0 means that there is no such error.
 
-    position : (3,) m in ``frame_id``; quaternion : (4,) x y z w, RSU axes (x boresight, y left, z
-        up) to it.
-    Biases are first-order Gauss-Markov with ``bias_correlation_time_s``, the common one is shared
-    by a network; 0 means none.
-    ``noise_correlation_time_s``: power spectral density at 0 of the remaining noise over its
-    variance; 0 means white.
-    ``angle_convention``: ``RsuInfo.SPHERICAL``, azimuth is atan2(y, x) in RSU axes, or
-    ``RsuInfo.CONE``, its sine is the direction cosine y / distance of a linear array.
+    Biases are first-order Gauss-Markov processes with the given sd and correlation time.
+
+    Parameters
+    ----------
+    rsu_id : name, as in its measurements
+    frame_id : frame of the pose
+    position : (3,) m
+    quaternion : (4,) x y z w, from the axes of the RSU (x boresight, y left, z up) to the frame
+    network : of several networks the one it belongs to
+    azimuth_bias_sd_rad : sd of the bias of its azimuths (CONE: of the direction cosine)
+    elevation_bias_sd_rad : sd of the bias of its elevations
+    range_bias_sd_m : sd of the bias of its ranges and arrival times
+    bias_correlation_time_s : of these three
+    common_range_bias_sd_m : sd of a range bias that all RSUs of the network share, such as the
+        delay of the device's antenna
+    common_bias_correlation_time_s : of that one
+    noise_correlation_time_s : power spectral density at 0 of the other noise over its variance;
+        0 is white noise
+    angle_convention : ``RsuInfo.SPHERICAL``, azimuth is atan2(y, x) in the axes of the RSU, or
+        ``RsuInfo.CONE``, its sine is y / distance, what a linear array measures
+    baseline_m : distance of two antennas whose phases are compared
+    wavelength_m : of the carrier of these phases
+    stamp_ns : when it was described
     """
 
     SPHERICAL: ClassVar[AngleConvention] = AngleConvention.SPHERICAL
@@ -83,9 +98,29 @@ class RsuInfo:
 
 @dataclass(slots=True, kw_only=True)
 class RsuMeasurement:
-    """What one RSU measured of one device at one instant; ``fields`` names the quantities that
-    count, such as ``RsuMeasurement.RANGE | RsuMeasurement.AZIMUTH``. ``lever_arm`` [m]: antenna
-    that was measured, in the device's base_link; ``position`` is one in ``frame_id``."""
+    """What one RSU measured of one device at one instant, each value with its variance.
+
+    Parameters
+    ----------
+    stamp_ns : network time of the instant, > 0
+    rsu_id : the RSU
+    vue_id : the device
+    sequence : number of the beacon, the same for all RSUs
+    expected : how many RSUs report this instant; 0: unknown
+    fields : the quantities that count: ``RsuMeasurement.AZIMUTH``, ``ELEVATION``, ``TOA``,
+        ``TDOA``, ``RANGE``, ``PHASE``, ``POSITION``; several are joined by ``|``
+    line_of_sight : whether the path is free, as far as the RSU knows
+    rssi_dbm : received power, for people
+    azimuth_rad : direction to the device in the axes of the RSU, counter-clockwise
+    elevation_rad : direction to the device, up
+    toa_s : distance / c + offset of the device's clock
+    range_m : two-way range, free of the device's clock
+    phase_difference_rad : of two antennas, in [-pi, pi)
+    tdoa_s : time of arrival minus that at ``reference_rsu_id``
+    lever_arm : m, the antenna that was measured in base_link of the device
+    frame_id : frame of ``position``
+    position : (3,) m, a fix of the network, with covariance ``position_cov`` (3, 3) m^2
+    """
 
     AZIMUTH: ClassVar[Field] = Field.AZIMUTH
     ELEVATION: ClassVar[Field] = Field.ELEVATION
