@@ -76,7 +76,7 @@ def own_recordings(data: Path) -> Iterator[Source]:
     used = {"space": Space()}
     yield "range_beacons Plaza1", data / "range_beacons", readers.import_plaza, used
     used = {"space": Space(dimensions=3, height_m=1.0), "range_sd_m": readers.UWB_SD_M}
-    yield "uwb_tdoa (planar)", data / "uwb_tdoa", readers.import_uwb_tdoa, used
+    yield "uwb_tdoa", data / "uwb_tdoa", readers.import_uwb_tdoa, used
 
 
 def _ble(folder: Path, run: str, _: Path, bag: Path) -> None:
