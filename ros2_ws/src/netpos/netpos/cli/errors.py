@@ -44,7 +44,7 @@ def _tell(error: BaseException) -> None:
 
 
 def _is_interrupt(error: BaseException) -> bool:
-    """Ctrl-C, also one that came while compiled code was called, which Python tells of as a
+    """Ctrl-C, also one that came while compiled code was called, which Python reports as a
     ``SystemError``."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
@@ -54,7 +54,7 @@ def _is_interrupt(error: BaseException) -> bool:
 
 class Commands(TyperGroup):
     """Turns errors of bad input and failed work into one sentence and an exit status; errors of
-    the program itself stay loud.
+    the program itself keep their traceback.
     """
 
     def invoke(self, ctx: Any) -> Any:

@@ -55,6 +55,6 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
 
 
 def epilog(command: str) -> str:
-    """What stands below the help of a command; nothing without an example."""
+    """The examples as text below the help of a command."""
     examples = EXAMPLES.get(command, ())
     return "\n\n".join(["Examples:", *examples]) if examples else ""

@@ -14,25 +14,25 @@ _PATIENCE_S = 0.3
 
 
 class _CtrlC:
-    """A request to stop: taken where the work asks (``check``), else raised as Python does.
+    """A request to stop by Ctrl-C.
 
     An exception that comes while compiled code is called, or the compiler works, may end in a
-    ``SystemError`` or a segmentation fault. So work that counts asks after every message; other
-    work is interrupted after ``_PATIENCE_S``, outside of the compiler. A second Ctrl-C ends the
-    process at once.
+    ``SystemError`` or a segmentation fault. So work that counts its messages calls ``check`` after
+    each; other work is interrupted after ``_PATIENCE_S``, outside of the compiler. A second Ctrl-C
+    ends the process at once.
     """
 
     wanted = False
 
     def check(self) -> None:
-        """Raises ``KeyboardInterrupt`` where it is wanted."""
+        """Raise ``KeyboardInterrupt`` if Ctrl-C was pressed."""
         if self.wanted:
             self.wanted = False
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             raise KeyboardInterrupt
 
     def ask(self, *_: object) -> None:
-        """SIGINT has come."""
+        """Handle SIGINT."""
         if self.wanted:
             sys.stderr.write("netpos: interrupted\n")
             leave()
@@ -40,18 +40,18 @@ class _CtrlC:
         self.later()
 
     def later(self) -> None:
-        """Raise it, if nobody has taken it until then."""
+        """Interrupt in a moment, unless ``check`` does so before."""
         signal.setitimer(signal.ITIMER_REAL, _PATIENCE_S)
 
     def insist(self, _: int, frame: FrameType | None) -> None:
-        """Nobody has."""
+        """Handle SIGALRM: ``check`` was not called in time."""
         if _is_in_compiler(frame):
             self.later()
         else:
             self.check()
 
     def thrown_away(self, error: sys.UnraisableHookArgs) -> None:
-        """Python throws exceptions away in ``__del__`` and around a fork."""
+        """Keep a Ctrl-C that came in ``__del__`` or around a fork, where Python ignores it."""
         if issubclass(error.exc_type, KeyboardInterrupt):
             self.wanted = True
             self.later()
@@ -63,8 +63,8 @@ CTRL_C = _CtrlC()
 
 
 def answer_ctrl_c() -> None:
-    """Answer SIGINT with care. Where it is ignored, as in background jobs of a shell, it stays
-    so."""
+    """Handle SIGINT as ``_CtrlC`` describes. Where it is ignored, as in background jobs of a
+    shell, it stays ignored."""
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         return
     sys.unraisablehook = CTRL_C.thrown_away
@@ -73,7 +73,7 @@ def answer_ctrl_c() -> None:
 
 
 def leave() -> None:
-    """End without waiting for threads whose partners may be gone."""
+    """End the process without waiting for its threads, which may wait for ever."""
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     os._exit(INTERRUPTED)

@@ -38,7 +38,7 @@ Sd = Annotated[
     str,
     typer.Option(
         metavar="NAME=VALUE,...",
-        help="Standard deviation as the data sheet says it, in the unit of the quantity.",
+        help="Standard deviation, as in the data sheet, in the unit of the quantity.",
     ),
 ]
 Rsus = Annotated[
@@ -63,36 +63,50 @@ TruthOrigin = Annotated[
     str | None,
     typer.Option(
         metavar="LATITUDE,LONGITUDE,HEIGHT",
-        help="Where on earth the origin of map is, for a truth of latitudes.",
+        help="Where on earth the origin of map is, for a truth in latitude and longitude.",
     ),
 ]
 TruthUnits = Annotated[
-    str, typer.Option(metavar="NAME=UNIT,...", help="Of time, position and yaw of the truth.")
+    str,
+    typer.Option(metavar="NAME=UNIT,...", help="Units of time, position and yaw of the truth."),
 ]
 Offset = Annotated[
-    str, typer.Option(metavar="SECONDS|auto", help="Added to the times of the truth, or found.")
+    str,
+    typer.Option(
+        metavar="SECONDS|auto", help="Seconds to add to the times of the truth; auto finds them."
+    ),
 ]
 Align = Annotated[
     str,
     typer.Option(
         metavar="none|shift|rigid",
-        help="Move, or turn and move, the truth onto the measurements; said in the figures.",
+        help="Move (shift), or turn and move (rigid), the truth onto the measurements; the "
+        "figures say so.",
     ),
 ]
 Settings = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="KEY=VALUE", help="Parameter of the tracker, kept in the bag; may repeat."
+        "--set",
+        metavar="KEY=VALUE",
+        help="Parameter of the tracker, kept in the bag; may be repeated.",
     ),
 ]
 AnyOrder = Annotated[
-    bool, typer.Option("--any-order", help="Lines need not be in the order of time.")
+    bool, typer.Option("--any-order", help="Accept lines that are not in the order of time.")
 ]
-Skip = Annotated[bool, typer.Option("--skip-bad-lines", help="Skip and count what is not valid.")]
+Skip = Annotated[
+    bool, typer.Option("--skip-bad-lines", help="Skip and count what cannot be understood.")
+]
 
 
 def import_csv(
-    file: Annotated[Path, typer.Argument(help="CSV, TSV or blanks between columns; .gz too.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="Text file with columns between commas, tabs, semicolons or blanks; .gz too."
+        ),
+    ],
     bag: Bag,
     mapping: Map,
     units: Units = "",
@@ -102,7 +116,7 @@ def import_csv(
     device_height: Height = None,
     lever_arm: Lever = None,
     delimiter: Annotated[
-        str | None, typer.Option(help="comma, tab, semicolon or blank. Default: found.")
+        str | None, typer.Option(help="comma, tab, semicolon or blank. Default: detected.")
     ] = None,
     truth: Annotated[
         Path | None, typer.Option(help="Text file with the truth; TUM needs no --truth-map.")
@@ -212,7 +226,7 @@ def three(text: str, option: str) -> tuple[float, float, float]:
 
 
 def tell(bag: Path, counts: Mapping[str, int]) -> None:
-    """What was written and skipped, and what to do next."""
+    """Print what was written and skipped, and what to do next."""
     from netpos.bags import BagReader  # noqa: PLC0415
     from netpos.bags.recording import TRUTH_ALIGNMENT  # noqa: PLC0415
 
@@ -257,14 +271,14 @@ def truth_option(
     height_m: float | None,
     origin: str | None = None,
 ) -> Truth | None:
-    """What the options say of a truth: ``source`` a text file (Path) or a topic."""
+    """The truth that the options describe; ``source``: a text file (Path) or a topic."""
     from netpos.bags.importers.own import Truth  # noqa: PLC0415
     from netpos.bags.importers.own.alignment import Way  # noqa: PLC0415
     from netpos.bags.importers.own.truth import TUM, TruthColumns  # noqa: PLC0415
 
     if source is None:
         if mapping is not None or way != "none":
-            raise ValueError("there is no truth to map or align; name its file or topic")
+            raise ValueError("options of the ground truth need one: name its file or topic")
         return None
     if mapping is None:
         if isinstance(source, Path) and source.suffix not in {".tum", ".txt"}:

@@ -14,7 +14,9 @@ _WIDTH = 78
 
 
 def params(
-    search: Annotated[str, typer.Argument(help="Only those with this word.")] = "",
+    search: Annotated[
+        str, typer.Argument(help="Show only parameters with this word in name or meaning.")
+    ] = "",
     dump: Annotated[
         Path | None,
         typer.Option(
@@ -23,7 +25,7 @@ def params(
     ] = None,
     source: Annotated[
         str,
-        typer.Option("--from", metavar="SOURCE", help="A scenario or bag whose values to take."),
+        typer.Option("--from", metavar="SOURCE", help="Take the values of this scenario or bag."),
     ] = "",
 ) -> None:
     """Show the parameters of the tracker: default, range and meaning."""

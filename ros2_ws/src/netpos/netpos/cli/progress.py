@@ -1,5 +1,5 @@
-"""How far the work is, on stderr: a line that moves on a terminal, now and then a sentence in a
-log or a pipe."""
+"""Progress on stderr: a moving line on a terminal, a sentence every ten seconds in a log or a
+pipe."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ SENTENCE_EVERY_S = 10.0
 _SHOWN_EVERY_S = 0.1
 
 Counted = Callable[[int], None]
-"""Called with the number of what is done; raises ``KeyboardInterrupt`` where that is wanted."""
+"""Called with the number of parts done; raises ``KeyboardInterrupt`` after Ctrl-C."""
 
 
 @contextmanager
 def doing(text: str, of: str = "messages") -> Iterator[Counted]:
-    """Tell of work without a known end; ``of`` is what is counted, where something is."""
+    """Show the progress of work whose end is not known; ``of``: what is counted."""
     from rich.console import Console  # noqa: PLC0415
 
     console = Console(stderr=True)
@@ -49,7 +49,7 @@ def doing(text: str, of: str = "messages") -> Iterator[Counted]:
 
 @contextmanager
 def _sentences(text: str, of: str) -> Iterator[Counted]:
-    """One every ``SENTENCE_EVERY_S``, whatever the work does meanwhile."""
+    """A sentence every ``SENTENCE_EVERY_S``, even if the work does not report."""
     count, over, start_s = [0], threading.Event(), time.monotonic()
 
     def tell() -> None:

@@ -17,7 +17,9 @@ importers.command("csv", epilog=epilog("import csv"))(import_csv)
 importers.command("ros", epilog=epilog("import ros"))(import_ros)
 
 
-def recover(bag: Annotated[Path, typer.Argument(help="Bag that was cut off.")]) -> None:
+def recover(
+    bag: Annotated[Path, typer.Argument(help="Bag whose recorder did not finish.")],
+) -> None:
     """Save what a killed recorder left."""
     from netpos.bags.recover import recover as recover_bag  # noqa: PLC0415
 
@@ -78,12 +80,15 @@ def car_imu_rtk(
         str | None,
         typer.Option(
             metavar="ROLL,PITCH,YAW",
-            help="Of the IMU against forward-right-down, deg. Default: the car of run 1934.",
+            help="Attitude of the IMU against forward-right-down, deg. Default: the car of run "
+            "1934.",
         ),
     ] = None,
     antenna: Annotated[
         str | None,
-        typer.Option(metavar="X,Y,Z", help="From the IMU, forward-left-up, m. Default: as above."),
+        typer.Option(
+            metavar="X,Y,Z", help="Antenna from the IMU, forward-left-up, m. Default: as above."
+        ),
     ] = None,
     clock_offset: Annotated[
         float | None, typer.Option(help="Added to the time of the IMU, s. Default: as above.")

@@ -29,7 +29,7 @@ _HEAD_WIDTH = 13
 
 
 def evaluate(
-    bag: Annotated[Path, typer.Argument(help="Bag with estimates, with or without a truth.")],
+    bag: Annotated[Path, typer.Argument(help="Bag with estimates.")],
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write the figures as JSON.")
     ] = None,
@@ -70,7 +70,7 @@ def evaluate(
     truth_align: Align = "none",
     truth_origin: TruthOrigin = None,
 ) -> None:
-    """Score a recording against its ground truth; without one, say what it tells of itself."""
+    """Score a recording against its ground truth; without one, show what it says of itself."""
     from rich.console import Console  # noqa: PLC0415
 
     from netpos.evaluation import Evaluation, assess_bag  # noqa: PLC0415
@@ -85,7 +85,7 @@ def evaluate(
     )  # fmt: skip
     elsewhere = None if truth is None else _truth_from(bag, truth, *options)
     if truth is None and options != (None, None, "", "0", "none", None):
-        raise ValueError("there is no truth to map or align; name it with --truth")
+        raise ValueError("options of the ground truth need --truth: name its file or bag")
     with doing("reading") as tell:
         evaluation = assess_bag(bag, skip=skip, vue=vue, truth=elsewhere, progress=tell)
     if json_file is not None:
@@ -112,7 +112,7 @@ def _truth_from(
     way: str,
     origin: str | None,
 ) -> TruthOf:
-    """What reads a truth and brings it to the measurements of a bag."""
+    """A function that reads a truth and aligns it with the measurements of a bag."""
     from netpos.bags import BagReader  # noqa: PLC0415
     from netpos.bags.importers.own import truth_of  # noqa: PLC0415
     from netpos.cli.own_recordings import truth_option  # noqa: PLC0415
@@ -136,7 +136,7 @@ def _truth_from(
 
 
 def _print_survey(console: Console, survey: Survey) -> None:
-    """What a recording without ground truth tells of itself; what to look at comes first."""
+    """Print what a recording without ground truth shows; what needs attention comes first."""
     from rich.box import SIMPLE  # noqa: PLC0415
     from rich.markup import escape  # noqa: PLC0415
     from rich.table import Table  # noqa: PLC0415
@@ -147,7 +147,9 @@ def _print_survey(console: Console, survey: Survey) -> None:
         survey_rows,
     )
 
-    console.print("No ground truth: no errors, but what the recording tells of itself.")
+    console.print(
+        "No ground truth: the errors are unknown. This is what the recording itself shows."
+    )
     for name, vue in survey.vues.items():
         for text in vue.figures.suggestions:
             console.print(f"{name}: {text}", markup=False, highlight=False)
@@ -176,7 +178,7 @@ def _draw(evaluation: Evaluation | Survey, files: dict[str, Path]) -> None:
     if not isinstance(evaluation, Evaluation):
         for kind, path in files.items():
             if kind != "map":
-                raise ValueError(f"--{kind} {path} needs ground truth, which the bag has not")
+                raise ValueError(f"--{kind} {path} needs ground truth, and the bag has none")
         from netpos.evaluation.pictures import draw_survey, save  # noqa: PLC0415
 
         save(draw_survey(evaluation), files["map"])
@@ -219,8 +221,10 @@ def compare(
         Path | None, typer.Option("--json", metavar="FILE", help="Write the differences as JSON.")
     ] = None,
 ) -> None:
-    """Say which of several estimates of a run is better, each against the first, with an interval
-    that takes the correlation of the errors into account."""
+    """Compare several estimates of one run with the first one.
+
+    The interval of each difference takes into account that errors are correlated over time.
+    """
     from rich.console import Console  # noqa: PLC0415
     from rich.markup import escape  # noqa: PLC0415
     from rich.table import Table  # noqa: PLC0415
@@ -249,7 +253,9 @@ def refuse_recording(path: Path) -> None:
     """``ValueError`` for a file inside a bag, which nothing but its writer changes."""
     folder = path.absolute().parent
     if (folder / "metadata.yaml").exists():
-        raise ValueError(f"{path} would lie in a recording, which is never changed; name another")
+        raise ValueError(
+            f"{path} is inside a recording, and recordings are never changed; choose another file"
+        )
 
 
 def check_json(path: Path) -> None:
@@ -260,7 +266,7 @@ def check_json(path: Path) -> None:
     """
     refuse_recording(path)
     if path.is_file() and path.suffix.lower() != ".json":
-        raise ValueError(f"{path} exists and is no .json file; name another")
+        raise ValueError(f"{path} exists and is no .json file; choose another name")
     if path.is_dir():
         raise IsADirectoryError(f"--json {path} is a folder; give a file")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -332,8 +338,8 @@ def bench(
         Path | None, typer.Option("--json", metavar="FILE", help="Write the ratios as JSON.")
     ] = None,
 ) -> None:
-    """Measure speed as ratios, side by side in one run. Two parts are measured only where they are
-    asked for: --only soak, a simulated day, and --only live_soak, an hour."""
+    """Measure speed as ratios, side by side in one run. Two parts are measured only if you ask
+    for them: --only soak, a simulated day, and --only live_soak, an hour."""
     from rich.console import Console  # noqa: PLC0415
 
     from netpos.bench import as_json, chosen, surroundings  # noqa: PLC0415

@@ -17,10 +17,12 @@ rsus = typer.Typer(
 
 @rsus.command(epilog=epilog("rsus save"))
 def save(
-    bag: Annotated[Path, typer.Argument(help="Bag with RSUs; with /rsu/learned, with that.")],
+    bag: Annotated[
+        Path, typer.Argument(help="Bag with RSUs, and /rsu/learned if their errors were learned.")
+    ],
     file: Annotated[Path, typer.Argument(help="YAML file to write; it must not exist.")],
 ) -> None:
-    """Write the RSUs of a bag as a file, with their errors as learned."""
+    """Write the RSUs of a bag, and what was learned of their errors, to a file."""
     from netpos.bags.rsus_file import save_rsus  # noqa: PLC0415
 
     with doing("reading"):
@@ -34,7 +36,7 @@ def load(
     bag: Annotated[Path, typer.Argument(help="Bag to copy.")],
     out: Annotated[Path, typer.Argument(help="Bag to write; it must not exist.")],
 ) -> None:
-    """Copy a bag, its RSUs described as in the file; then track it with netpos replay."""
+    """Copy a bag, with its RSUs described as in the file. Then track it with netpos replay."""
     from netpos.bags.rsus_file import load_rsus  # noqa: PLC0415
     from netpos.cli.runs import refuse_existing  # noqa: PLC0415
 

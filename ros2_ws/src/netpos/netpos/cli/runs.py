@@ -52,10 +52,12 @@ def run(
         typer.Option(help="Bag to write; it must not exist. Default: out/SCENARIO_TIME."),
     ] = None,
     rate: Annotated[
-        float | None, typer.Option(help="Speed of the live graph against real time. Default: 1.")
+        float | None,
+        typer.Option(help="Speed of the live graph: 2 is twice real time. Default: 1."),
     ] = None,
     offline: Annotated[
-        bool, typer.Option("--offline", help="Without ROS, as fast as it goes.")
+        bool,
+        typer.Option("--offline", help="Simulate and track without ROS, as fast as possible."),
     ] = False,
     seed: Annotated[
         int | None, typer.Option(help="Seed of the noise. Default: the scenario's.")
@@ -80,7 +82,7 @@ def run(
 
 
 def _check_tracker(scenario: str, values: Mapping[str, object]) -> None:
-    """Refuse, before anything is simulated, what no tracker can be given; a line for each."""
+    """Check the tracker's parameters before the simulation starts; one line for each fault."""
     from netpos.common.parameters import FaultsError  # noqa: PLC0415
     from netpos.scenario.load import place_of  # noqa: PLC0415
     from netpos.tracking.config import TrackerConfig  # noqa: PLC0415
@@ -103,7 +105,9 @@ def replay(
     bags: Annotated[list[Path], typer.Argument(metavar="BAG...", help="Recorded bags.")],
     out: Annotated[
         Path,
-        typer.Option(help="Bag to write; it must not exist. Of several: the folder they go to."),
+        typer.Option(
+            help="Bag to write; it must not exist. For several bags: the folder to write them to."
+        ),
     ],
     settings: Annotated[
         list[str] | None,
@@ -113,13 +117,16 @@ def replay(
     ] = None,
     smooth: Annotated[
         bool,
-        typer.Option("--smooth", help="Add the odometry of every epoch given all measurements."),
+        typer.Option(
+            "--smooth",
+            help="Also estimate every epoch from all measurements, later ones included.",
+        ),
     ] = False,
     parameters: Annotated[
         str | None,
         typer.Option(
             metavar="SOURCE",
-            help="Whose tracker parameters: a scenario, another bag, or 'defaults'. "
+            help="Take the tracker's parameters from a scenario, another bag, or 'defaults'. "
             "Default: the bag's own.",
         ),
     ] = None,
@@ -128,8 +135,8 @@ def replay(
 ) -> None:
     """Estimate again from the recorded measurements, without ROS.
 
-    Several bags are tracked side by side; those whose track is there already, with the same
-    parameters, are left out.
+    Several bags are tracked in parallel. A bag is skipped if its track exists already, made with
+    the same parameters.
     """
     from netpos.scenario.settings import settings_from  # noqa: PLC0415
 
@@ -155,7 +162,9 @@ def _replay_all(bags: list[Path], plan: Replays, workers: int | None, cluster: s
     from netpos.evaluation.work import Work  # noqa: PLC0415
 
     if plan.out.is_file() or (plan.out / "metadata.yaml").exists():
-        raise NotADirectoryError(f"--out {plan.out}: several bags need a folder to go to")
+        raise NotADirectoryError(
+            f"--out {plan.out}: several bags need a folder; this is a file or a bag"
+        )
     bars, refused, done = Bars(), 0, 0
     try:
         with worked(), Work(1, 0, workers, bars.show, cluster=cluster, apart=True) as work:
@@ -169,13 +178,13 @@ def _replay_all(bags: list[Path], plan: Replays, workers: int | None, cluster: s
     finally:
         bars.stop()
     there = len(bags) - done - refused
-    typer.echo(f"{done} of {len(bags)} bags tracked, {there} were there, {refused} refused")
+    typer.echo(f"{done} of {len(bags)} bags tracked, {there} existed already, {refused} refused")
     if refused:
         raise WorkFailedError(f"{refused} bags were not tracked")
 
 
 def _tell_gain(bag: Path) -> None:
-    """What smoothing gained over the filter, where the recording has ground truth."""
+    """Print what smoothing gains over the filter, if the recording has ground truth."""
     from netpos.evaluation.smoothing import smoothing_gains  # noqa: PLC0415
 
     for vue, gain in smoothing_gains(bag).items():
@@ -204,7 +213,7 @@ def parse_setting(text: str) -> tuple[str, object]:
 
 
 def refuse_existing(path: Path) -> None:
-    """FileExistsError where a recording would be overwritten; said before the work starts."""
+    """Raise ``FileExistsError``, before the work starts, if a recording would be overwritten."""
     if path.exists():
         raise FileExistsError(
             f"{path} exists and recordings are never overwritten; choose another name"
@@ -220,7 +229,7 @@ def _track(
     settings: TrackerSettings | None = None,
     source: str,
 ) -> None:
-    """Replay ``bag`` with parameters of ``source``, and tell of it."""
+    """Replay ``bag`` with parameters of ``source``, and print a summary."""
     from netpos.bags import BagReader  # noqa: PLC0415
     from netpos.scenario.replay import replay_bag  # noqa: PLC0415
     from netpos.scenario.settings import bag_settings  # noqa: PLC0415
@@ -291,7 +300,7 @@ def _run_live(scenario: str, target: Path, rate: float, seed: int) -> None:
 
 
 def _tell_losses(bag: Path) -> None:
-    """What the recorder missed."""
+    """Print what the recorder missed."""
     from netpos.bags import BagReader  # noqa: PLC0415
     from netpos.evaluation.contents import lost_of  # noqa: PLC0415
 

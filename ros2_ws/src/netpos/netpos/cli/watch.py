@@ -34,17 +34,17 @@ def watch(
         ),
     ] = None,
     namespace: Annotated[
-        str, typer.Option(help="Of the nodes to show, such as /site_a; default: no namespace.")
+        str, typer.Option(help="Namespace of the nodes to show, such as /site_a. Default: none.")
     ] = "",
     once: Annotated[bool, typer.Option("--once", help="Print one frame and exit.")] = False,
     period: Annotated[float, typer.Option(help="Seconds between frames.")] = 1.0,
     wait: Annotated[
-        float, typer.Option(help="Of --once: seconds to wait for the graph at most.")
+        float, typer.Option(help="With --once: longest wait for the graph, in seconds.")
     ] = 10.0,
 ) -> None:
     """Show devices and RSUs of a running graph in this terminal.
 
-    Exit status 1 where --once hears no device.
+    Exit status 1 if --once hears no device.
     """
     from netpos.live.client import ViewError, full_url  # noqa: PLC0415
 
@@ -101,7 +101,7 @@ def _watch(url: str, period_s: float, once_within_s: float | None, namespace: st
 
 
 def _print_once(viewer: Viewer, board: Board, wait_s: float) -> None:
-    """One frame, when devices and diagnostics have been heard, or the time is over."""
+    """Print one frame as soon as devices and diagnostics have been heard, or the time is over."""
     from rich.console import Console  # noqa: PLC0415
 
     from netpos.live.screen import screen  # noqa: PLC0415
@@ -121,7 +121,7 @@ def _print_once(viewer: Viewer, board: Board, wait_s: float) -> None:
 
 
 def _show(viewer: Viewer, board: Board, period_s: float) -> None:
-    """Frame after frame until Ctrl-C: in place on a terminal, one below the other elsewhere."""
+    """Show frames until Ctrl-C: in place on a terminal, one below the other elsewhere."""
     from rich.console import Console  # noqa: PLC0415
     from rich.live import Live  # noqa: PLC0415
 
@@ -139,7 +139,7 @@ def _show(viewer: Viewer, board: Board, period_s: float) -> None:
 
 
 def _hear(viewer: Viewer, board: Board, seconds: float) -> None:
-    """Take what comes for so many seconds."""
+    """Take messages for so many seconds."""
     end_s = time.monotonic() + seconds
     while (left_s := end_s - time.monotonic()) > 0.0:
         CTRL_C.check()

@@ -1,4 +1,4 @@
-"""Options of commands that run many jobs, and how their failures are told."""
+"""Options of commands that run many jobs, and the message when a worker dies."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ Resume = Annotated[
     typer.Option(
         "--resume",
         metavar="FOLDER",
-        help="Keep finished parts there; those that are there already are not run again.",
+        help="Keep finished parts in this folder; parts found there are not run again.",
     ),
 ]
 
 
 @contextmanager
 def worked() -> Iterator[None]:
-    """Failed work where a worker has died, in words that say what to do."""
+    """If a worker dies the work has failed; the message says what to do."""
     from netpos.evaluation.work import WorkerDiedError  # noqa: PLC0415
 
     try:
         yield
     except WorkerDiedError as error:
         raise WorkFailedError(
-            f"{error}; try fewer --workers; with --resume what is finished is kept"
+            f"{error}; try fewer --workers; with --resume finished parts are kept"
         ) from error

@@ -15,12 +15,15 @@ _TYPES = {
     topics.TRACK_STATUS: "netpos_msgs/msg/TrackStatus",
     topics.CLOCK_STATE: "netpos_msgs/msg/ClockState",
 }
-_FORGET_S = 60.0  # a device of which nothing is said for so long leaves the board
+_FORGET_S = 60.0  # a device that was not heard for so long leaves the board
 
 
 @dataclass(slots=True)
 class DeviceLine:
-    """The newest of one device; ``heard_s``: when, by the viewer's clock, anything came."""
+    """The newest messages of one device.
+
+    ``heard_s``: when the last one came; ``estimated_s``: the last odometry; viewer's clock [s].
+    """
 
     name: str
     odometry: Odometry | None = None
@@ -46,13 +49,13 @@ class HealthLine:
 
     @property
     def age_s(self) -> float:
-        """Since the RSU was heard; 0 of a line that is of no RSU."""
+        """Seconds since the RSU was heard; 0 if the line is not about an RSU."""
         return number(self.values.get("age_s", "0"))
 
 
 class Board:
-    """Takes messages by topic; ``now_s`` is the viewer's steady clock. ``namespace``: that of the
-    nodes whose topics count."""
+    """Collects messages by topic. ``now_s``: the viewer's steady clock [s]; ``namespace``: only
+    topics of nodes in it count."""
 
     def __init__(self, namespace: str = "") -> None:
         self._namespace = namespace.strip("/")
@@ -61,10 +64,10 @@ class Board:
         self.rsus: set[str] = set()
         self.network_time_ns: int | None = None
         self.unread: dict[str, int] = {}
-        """Messages that have no meaning, by topic."""
+        """Number of messages that could not be understood, by topic."""
 
     def wants(self, topic: str, type_name: str) -> bool:
-        """Whether a topic says something for the board."""
+        """Whether the board shows messages of this topic."""
         topic = topics.below(topic, self._namespace)
         if topic == topics.DIAGNOSTICS:
             return type_name == "diagnostic_msgs/msg/DiagnosticArray"
@@ -74,7 +77,7 @@ class Board:
         return bool(device) and _TYPES.get(name) == type_name
 
     def add(self, topic: str, message: Any, log_time_ns: int, now_s: float) -> None:
-        """Take one message of a topic that is wanted; one without a meaning is counted."""
+        """Take a message of a wanted topic; ``unread`` counts those not understood."""
         self.network_time_ns = log_time_ns
         try:
             self._add(topics.below(topic, self._namespace), message, now_s)
@@ -90,14 +93,14 @@ class Board:
             self._add_of_device(*_device(topic), message, now_s)
 
     def devices(self, now_s: float) -> list[DeviceLine]:
-        """Devices by name; those of which nothing was said for a minute are left out."""
+        """Devices by name, without those that were not heard for a minute."""
         for name in [n for n, d in self._devices.items() if now_s - d.heard_s > _FORGET_S]:
             del self._devices[name]
         return [self._devices[name] for name in sorted(self._devices)]
 
     def health(self) -> list[HealthLine]:
-        """Lines of RSUs, networks and the input as a whole: the worst first, then those heard
-        last."""
+        """Lines of RSUs, networks and the input as a whole: the worst first; of equals the one
+        that was heard last."""
         return sorted(
             self._health.values(), key=lambda line: (-line.level, line.age_s, line.subject)
         )
@@ -132,7 +135,7 @@ class Board:
 
 
 def number(text: str) -> float:
-    """A figure of /diagnostics; infinite where it is none."""
+    """A number in /diagnostics; infinity if the text is not a finite number."""
     try:
         value = float(text)
     except ValueError:

@@ -56,7 +56,7 @@ def full_url(text: str) -> str:
 
     Raises
     ------
-    ValueError  it is none
+    ValueError  the text is not an address
     """
     if "://" not in text:
         text = f"ws://{text}"
@@ -67,11 +67,11 @@ def full_url(text: str) -> str:
 
 
 class Viewer:
-    """Connects, subscribes to the topics that are ``wanted``, and hands out what they bring.
+    """A connection to a server: it subscribes to the topics that are ``wanted``.
 
     Raises
     ------
-    ViewError  nothing answers there, or not what is asked
+    ViewError  there is no server at the address, or it is not a Foxglove WebSocket server
     """
 
     def __init__(self, url: str, wanted: Callable[[str, str], bool]) -> None:
@@ -99,7 +99,7 @@ class Viewer:
         self._connection.close()
 
     def receive(self, timeout_s: float) -> Received | None:
-        """The next message; None where none comes in time, or what comes is none.
+        """The next message; None if none came in time, or if it was not a message of a topic.
 
         Raises
         ------
@@ -111,9 +111,10 @@ class Viewer:
         except TimeoutError:
             return None
         except ConnectionClosed as error:
-            raise ViewError(f"{self.url} has ended the connection; is live still running?") from (
-                error
-            )
+            raise ViewError(
+                f"{self.url} has ended the connection; is 'ros2 run netpos_bringup live' still "
+                "running?"
+            ) from error
         if isinstance(frame, str):
             self._obey(frame)
             return None
@@ -144,7 +145,7 @@ class Viewer:
         self._connection.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
 
     def _ask_again(self) -> None:
-        """A server may tell of a channel before it knows it itself, and refuse who is quick."""
+        """Subscribe again where it was refused: a server may announce a channel too early."""
         now_s = time.monotonic()
         due = [number for number, due_s in self._again_s.items() if now_s >= due_s]
         for number in due:

@@ -50,7 +50,7 @@ SIGHT_COLOURS: dict[bool | None, Colour] = {
 }
 
 Device = tuple[str, str]
-"""Network, "" for what is fused or one of its kind, and device."""
+"""Network and device; the network is "" for a fused track, or where there is only one."""
 
 
 def _parameter(default: float, low: float, high: float, text: str) -> Any:
@@ -62,16 +62,19 @@ class SceneConfig:
     """How much of the past is shown, and how large things are drawn."""
 
     silent_s: float = _parameter(
-        10.0, 0.1, 3600.0, "a device without an estimate for so long vanishes [s]"
+        10.0, 0.1, 3600.0, "a device vanishes after this time without an estimate [s]"
     )
     sight_s: float = _parameter(
-        0.25, 0.0, 3600.0, "lines go to RSUs heard so long before a device's newest epoch [s]"
+        0.25,
+        0.0,
+        3600.0,
+        "lines go to RSUs heard up to this time before the device's newest epoch [s]",
     )
     path_points: int = field(
         default=1000, metadata={"low": 2, "high": 100_000, "text": "points of a path at most"}
     )
     path_step_m: float = _parameter(
-        0.5, 0.0, 1000.0, "distance of points of a path, the newest one left out [m]"
+        0.5, 0.0, 1000.0, "smallest distance between points of a path, except the newest [m]"
     )
     building_height_m: float = _parameter(
         10.0, 0.1, 1000.0, "height buildings are drawn with; scenarios do not give one [m]"
@@ -83,7 +86,8 @@ class SceneConfig:
 
 @dataclass(slots=True)
 class _Heard:
-    """The newest measurement of one device by one RSU; accepted: by the newest status about it."""
+    """The newest measurement of one device by one RSU; accepted: what the status of its epoch
+    says, None while that is not known."""
 
     stamp_ns: int
     accepted: bool | None = None
@@ -101,12 +105,12 @@ class _Track:
 
 
 class Scene:
-    """Takes what is published, gives shapes. ``now_s`` is the viewer's own steady clock."""
+    """Takes published messages, returns shapes. ``now_s``: the viewer's steady clock [s]."""
 
     def __init__(self, config: SceneConfig | None = None) -> None:
         self.config = config or SceneConfig()
         self.refused: dict[str, int] = {}
-        """What was not drawn, by reason."""
+        """Number of messages that were not drawn, by reason."""
         self._buildings: Array = np.zeros((0, 4))
         self._rsus: dict[str, RsuInfo] = {}
         self._tracks: dict[Device, _Track] = {}
@@ -116,7 +120,7 @@ class Scene:
         self._buildings = buildings
 
     def add_rsu(self, info: RsuInfo) -> None:
-        """An RSU, or its new place."""
+        """Add an RSU, or move it."""
         if info.frame_id != MAP_FRAME:
             self._refuse("RsuInfo not in map")
         elif not (np.isfinite(info.position).all() and np.isfinite(info.quaternion).all()):
@@ -131,7 +135,7 @@ class Scene:
             track.heard.clear()
 
     def add_measurement(self, measured: RsuMeasurement) -> None:
-        """An RSU has heard a device."""
+        """Note that an RSU has heard a device."""
         info = self._rsus.get(measured.rsu_id)
         if info is None:
             return
@@ -144,7 +148,7 @@ class Scene:
         heard.stamp_ns = measured.stamp_ns
 
     def add_odometry(self, odometry: Odometry, network: str, now_s: float) -> None:
-        """An estimate; one with the stamp of the last one replaces it."""
+        """Take an estimate; it replaces the last one if it has the same stamp."""
         if not (np.isfinite(odometry.position).all() and np.isfinite(odometry.pose_cov).all()):
             self._refuse("odometry not finite")
             return
@@ -153,7 +157,7 @@ class Scene:
         self._extend(track.path, odometry)
 
     def add_status(self, status: TrackStatus, network: str, now_s: float) -> None:
-        """How a track is; tells which RSUs of its epoch were fused."""
+        """Take a status, which says which RSUs of its epoch were fused."""
         figures = [status.position_sd_m, status.protection_level_m]
         figures += [value for mode in status.modes for value in (mode.weight, mode.x_m, mode.y_m)]
         if not all(map(math.isfinite, figures)):
@@ -166,11 +170,11 @@ class Scene:
                 heard.accepted = rsu_id in status.sources
 
     def map_shapes(self) -> list[Shape]:
-        """Buildings and RSUs: what seldom changes."""
+        """Buildings and RSUs, which seldom change."""
         return [*self._drawn_buildings(), *self._drawn_rsus()]
 
     def shapes(self, now_s: float) -> list[Shape]:
-        """Devices that are not silent, and all that belongs to them."""
+        """All shapes of the devices that are not silent."""
         return [
             shape
             for device, track in sorted(self._live(now_s))
@@ -186,8 +190,8 @@ class Scene:
         return self._tracks.setdefault((network, vue_id), _Track(self.config.path_points))
 
     def _live(self, now_s: float) -> Iterator[tuple[Device, _Track]]:
-        """Devices with an estimate; those silent for long are forgotten. A status alone, as one
-        of a silent device that goes on, places nothing on the map."""
+        """Devices with an estimate; those silent for long are forgotten. A status alone puts
+        nothing on the map: the device may be silent."""
         for device in list(self._tracks):
             track = self._tracks[device]
             if now_s - track.estimated_s <= self.config.silent_s:
@@ -202,8 +206,8 @@ class Scene:
         self.refused[reason] = self.refused.get(reason, 0) + 1
 
     def _extend(self, path: deque[tuple[int, Array]], odometry: Odometry) -> None:
-        """The newest position ends the path; the one before stays where it is far from its
-        predecessor."""
+        """Append the newest position. The one before it stays if it is ``path_step_m`` or more
+        from its predecessor."""
         if path and odometry.stamp_ns < path[-1][0]:
             path.clear()  # time was set back: a new run
         if path and path[-1][0] == odometry.stamp_ns:
@@ -283,7 +287,7 @@ class Scene:
         yield from self._sights(name, track)
 
     def _sights(self, name: str, track: _Track) -> Iterator[Shape]:
-        """From each RSU heard in the last epochs."""
+        """Lines from each RSU that was heard in the last epochs."""
         assert track.odometry is not None
         oldest_ns = track.odometry.stamp_ns - round(NS * self.config.sight_s)
         for rsu_id, heard in sorted(track.heard.items()):
@@ -300,8 +304,8 @@ class Scene:
 
 
 def _ellipse(name: str, odometry: Odometry, status: TrackStatus | None) -> Shape:
-    """Of 95 % probability. A status that is newer than the estimate has a standard deviation
-    only: of a device that was not heard since."""
+    """Where the device is with a probability of 95 %. If the status is newer than the estimate,
+    the device was not heard since, and only a standard deviation is known: a circle."""
     major, minor, angle = ellipse_axes(odometry.pose_cov[:2, :2], ELLIPSE_SCALE)
     if status is not None and status.stamp_ns > odometry.stamp_ns and status.position_sd_m > 0:
         major = minor = ELLIPSE_SCALE * status.position_sd_m
@@ -333,7 +337,7 @@ def _ring(
 
 
 def _mode(name: str, mode: TrackMode, z_m: float, size_m: float) -> Iterator[Shape]:
-    """A circle whose area goes with the probability, and the probability in words."""
+    """A disc whose area is proportional to the probability, and the probability as text."""
     red, green, blue, _ = STATE_COLOURS[TrackState.AMBIGUOUS]
     diameter = 2.0 * MODE_RADIUS * size_m * math.sqrt(max(mode.weight, 0.0))
     yield Shape(

@@ -1,4 +1,4 @@
-"""The board as a terminal shows it."""
+"""The board as tables for a terminal."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _NOTHING = "-"
 
 
 def plain(text: str) -> str:
-    """A text from the network without what a terminal would obey."""
+    """Text from the network without control characters, which a terminal would obey."""
     return "".join(char if char.isprintable() else "�" for char in text)
 
 
@@ -38,7 +38,7 @@ def screen(board: Board, title: str, now_s: float) -> RenderableType:
     when = "nothing heard yet" if time_ns is None else f"network time {time_ns / 1e9:.1f} s"
     head = Text(plain(f"netpos watch  {title}  {when}, {len(board.rsus)} RSUs"), style="bold")
     for topic, count in sorted(board.unread.items()):
-        head.append(plain(f"\n{count} messages of {topic} have no meaning"), style="red")
+        head.append(plain(f"\n{count} messages of {topic} could not be understood"), style="red")
     return Group(head, _devices(board, now_s), _health(board.health()))
 
 
@@ -78,7 +78,8 @@ def _cells(line: DeviceLine, now_s: float) -> list[Text]:
 
 
 def _horizontal_sd(line: DeviceLine) -> float:
-    """The largest one of the status where it is newer than the estimate: of a silent device."""
+    """The largest one. Of a silent device, whose status is newer than its estimate, that of the
+    status."""
     odometry, status = line.odometry, line.status
     assert odometry is not None
     if status is not None and status.stamp_ns > odometry.stamp_ns and status.position_sd_m > 0:
@@ -137,7 +138,7 @@ def _health(lines: list[HealthLine]) -> RenderableType:
 
 
 def _table(*names: str) -> Table:
-    """Columns of these names, in brackets too; the first three are words, others figures."""
+    """An empty table with these columns: the first three hold words, the others figures."""
     table = Table()
     for k, name in enumerate(names):
         table.add_column(Text(name), justify="left" if k < _WORDS else "right")

@@ -46,7 +46,7 @@ class Shape:
 
     @property
     def key(self) -> tuple[str, str]:
-        """What names it."""
+        """Group and name."""
         return self.group, self.name
 
 
@@ -70,7 +70,7 @@ def ellipse_axes(cov: Array, scale: float) -> tuple[float, float, float]:
 
 
 class Numbers:
-    """Small numbers of shapes: one keeps its number while it is there, and frees it when it goes.
+    """Gives each shape a small number, which it keeps while it exists; then the number is free.
 
     Viewers name a shape by its group and a number.
     """

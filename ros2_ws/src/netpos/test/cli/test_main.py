@@ -103,7 +103,7 @@ def test_a_picture_of_errors_needs_ground_truth(
 
 def test_a_picture_never_goes_into_a_recording(netpos: Netpos, bag: Path) -> None:
     result = netpos("evaluate", bag, "--map", bag / "map.png")
-    assert_refused(result, "would lie in a recording")
+    assert_refused(result, "is inside a recording")
     assert not (bag / "map.png").exists()
 
 

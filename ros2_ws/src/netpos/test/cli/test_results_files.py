@@ -23,7 +23,7 @@ def test_figures_never_replace_a_recording(netpos: Netpos, bag: Path) -> None:
     for place in (storage, bag / "metadata.yaml", bag / "new.json"):
         result = netpos("evaluate", bag, "--json", place)
         assert result.exit_code == 2
-        assert "would lie in a recording, which is never changed" in result.stderr
+        assert "is inside a recording, and recordings are never changed" in result.stderr
     assert netpos("report", bag, "--out", storage).exit_code == 2
     assert storage.read_bytes() == before
     assert sorted(p.name for p in bag.iterdir()) == ["metadata.yaml", storage.name]

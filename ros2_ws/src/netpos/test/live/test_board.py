@@ -193,7 +193,7 @@ def test_a_message_without_a_meaning_is_counted_and_told() -> None:
     strange = status(3.0, TrackState.TRACKING)
     strange.state = 77
     board.add("/vue_1/track_status", strange, 0, 0.0)
-    assert "1 messages of /vue_1/track_status have no meaning" in shown(board, 0.0)
+    assert "1 messages of /vue_1/track_status could not be understood" in shown(board, 0.0)
 
 
 def test_nothing_from_the_network_commands_the_terminal() -> None:
