@@ -11,6 +11,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from netpos.messages.network_tracks import network_track_to_msg
+from netpos.messages.policy import ENCLAVES, allows
 from netpos.messages.values import NetworkTrack
 from netpos_msgs.msg import ClockState, TrackStatus
 from netpos_node import CODEC
@@ -50,6 +51,22 @@ def keep(node: TrackFusionNode) -> tuple[Kept, Kept, Kept]:
     kept = Kept(Odometry), Kept(ClockState), Kept(TrackStatus)
     node._outputs["vue_1"] = kept  # type: ignore[assignment]
     return kept
+
+
+def test_the_security_policy_permits_what_the_node_does(make: Any) -> None:
+    """Also its life cycle: change_state, get_state and what else rclpy offers."""
+    node, rights = make(scenario="two_networks"), ENCLAVES["/netpos/fusion"]
+    published = dict(node.get_publisher_names_and_types_by_node("track_fusion", "/"))
+    heard = dict(node.get_subscriber_names_and_types_by_node("track_fusion", "/"))
+    served = dict(node.get_service_names_and_types_by_node("track_fusion", "/"))
+    assert {"/track_fusion/change_state", "/track_fusion/get_transition_graph"} <= served.keys()
+    assert "/track_fusion/transition_event" in published
+    assert [name for name in published if not allows(rights.published, name)] == []
+    assert [name for name in heard if not allows(rights.subscribed, name)] == []
+    assert [name for name in served if not allows(rights.replied, name)] == []
+    operator = ENCLAVES["/netpos/operator"].request
+    assert allows(operator, "/track_fusion/change_state")
+    assert not allows(operator, "/track_fusion/set_parameters")
 
 
 def test_topics_of_a_scenario(make: Any) -> None:
