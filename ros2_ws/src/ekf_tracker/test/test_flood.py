@@ -44,3 +44,22 @@ def test_a_flood_makes_no_device_known(make: Any) -> None:
         arrive(node, "/rsu/measurements", measurement("a", 0.1, f"device_{k // 10}"))
     assert {"device_0", "device_1"} <= set(node._outputs)
     assert not {"device_2", "device_3"} & set(node._outputs)
+
+
+def test_a_device_that_was_silent_makes_room_and_its_topics_go(make: Any) -> None:
+    node = make(max_devices=1, max_gap_s=1.0)
+    know_rsus(node)
+
+    def topics_of(device: str) -> set[str]:
+        published = dict(node.get_publisher_names_and_types_by_node("ekf_tracker", "/"))
+        heard = dict(node.get_subscriber_names_and_types_by_node("ekf_tracker", "/"))
+        return {name for name in (*published, *heard) if name.startswith(f"/{device}/")}
+
+    arrive(node, "/rsu/measurements", measurement("a", 0.0, "first"))
+    assert {"/first/odometry", "/first/track_status", "/first/initialpose"} <= topics_of("first")
+    arrive(node, "/rsu/measurements", measurement("a", 0.5, "second"))
+    assert not topics_of("second")
+    arrive(node, "/rsu/measurements", measurement("a", 2.0, "second"))
+    assert "/second/odometry" in topics_of("second")
+    assert not topics_of("first")
+    assert list(node.tracker._tracks) == ["second"]
