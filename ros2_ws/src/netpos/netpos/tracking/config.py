@@ -213,7 +213,9 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
         "learn scatter, bias and correlation of each RSU's errors; declared ones are a prior, and"
         " robust none is student_t with 5 unless nlos_probability is set",
     )
-    isolate_rsus: bool = described(True, "refuse an RSU that at least two others contradict")
+    isolate_rsus: bool = described(
+        True, "refuse an RSU that at least two others contradict, and a sensor that is stuck"
+    )
     manoeuvre_speed_sd_mps: float = real(
         5.0,
         0.0,

@@ -44,6 +44,8 @@ _SENTENCES = {
     "duplicate": "another one with the same stamp came before it",
     "conflict": "two of the same stamp differ, neither is used; does somebody else send in its"
     " name?",
+    "repeated": "its values stay the same to the last bit for longer than its noise and its past"
+    " allow; is it stuck? With the next other value it is taken again",
     "initialpose_off": "initial poses are refused; set accept_initialpose to true",
     "disabled": "the tracker is disabled; call its service enable with data: true",
     "not_finite": "a value is not finite, or beyond 1e9",

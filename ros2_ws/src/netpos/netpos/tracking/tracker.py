@@ -29,6 +29,7 @@ from netpos.tracking.live_parameters import LIVE_OF_ONE_MODEL, check_change
 from netpos.tracking.rate_limit import RATE, RateLimit
 from netpos.tracking.refusals import Refusals
 from netpos.tracking.register import Register
+from netpos.tracking.repeats import REPEATED, Repeats
 from netpos.tracking.report import TrackOutput
 from netpos.tracking.rsus import REFERENCED
 from netpos.tracking.sequencer import IMU, Epoch, Item, Sequencer
@@ -83,6 +84,7 @@ class Tracker:
         self._admission = Admission(*_admission_limits(self._config))
         self._left: list[str] = []
         self._rate = RateLimit(self._config.max_rate_hz, self._config.max_rsu_rate_hz)
+        self._repeats = Repeats()
 
     @property
     def config(self) -> TrackerConfig:
@@ -147,6 +149,7 @@ class Tracker:
         shut = self._admits(item, reason is None)
         if shut is not None:
             return shut
+        reason = reason or self._repeated(item)
         if reason is None:
             sequencer = self._sequencers.get(item.vue_id) or self._sequencer(item.vue_id)
             reason = sequencer.add(item)
@@ -221,8 +224,7 @@ class Tracker:
         if shut is not None:
             return shut
         track = self.track(sample.vue_id)
-        if reason is None:
-            reason = track.imu.add(sample)
+        reason = reason or self._repeated(sample) or track.imu.add(sample)
         self._touched.add(sample.vue_id)
         if reason is None:
             self._sequencer(sample.vue_id).mark(IMU, sample.stamp_ns)
@@ -382,6 +384,11 @@ class Tracker:
                 if not self._config.accept_initialpose:
                     return "initialpose_off"
                 return validation.pose_fault(item, self._config.map_frame)
+
+    def _repeated(self, item: Item | ImuSample) -> str | None:
+        if not (self._config.isolate_rsus and isinstance(item, RsuMeasurement | ImuSample)):
+            return None
+        return REPEATED if self._repeats.stuck(item) else None
 
     def _sequencer(self, vue_id: str) -> Sequencer:
         if vue_id not in self._sequencers:

@@ -177,6 +177,7 @@ def small() -> dict[str, Outcome]:
         Entry(fault="tracker_crash", lasts_s=3.0),
         Entry(fault="flood", size=20.0),
         Entry(fault="freeze", rsus="all"),
+        Entry(fault="creeping", size=30.0, rsus="all"),
         Entry(fault="device_silent"),
     )
     plan = Plan(faults=faults)
@@ -185,7 +186,7 @@ def small() -> dict[str, Outcome]:
 
 
 def test_nothing_ends_the_tracker_and_all_is_finite(small: dict[str, Outcome]) -> None:
-    assert len(small) == 10
+    assert len(small) == 11
     assert [o.fault for o in small.values() if o.failed] == []
 
 
@@ -212,12 +213,23 @@ def test_estimates_that_are_missing_are_counted(small: dict[str, Outcome]) -> No
 
 
 def test_a_lie_of_everybody_is_counted_as_a_miss(small: dict[str, Outcome]) -> None:
-    """Values of all RSUs stand still while the device moves 40 m: nothing contradicts them."""
+    """All RSUs tell of a device that goes another way: nothing contradicts them."""
+    lie = small["creeping 30 m, all RSUs"]
+    assert lie.missed
+    assert lie.max_m is not None
+    assert lie.max_m > 25.0
+    assert worst_first(list(small.values()))[0] is lie
+
+
+def test_rsus_that_are_stuck_are_noticed(small: dict[str, Outcome]) -> None:
+    """Their values stand still while the device moves 40 m. Each pair's are refused after half a
+    second."""
     frozen = small["freeze, all RSUs"]
-    assert frozen.missed
+    assert any("refused repeated" in words for words in frozen.detected)
+    assert any("COASTING" in words for words in frozen.detected)
     assert frozen.max_m is not None
-    assert frozen.max_m > 10.0
-    assert worst_first(list(small.values()))[0] is frozen
+    assert frozen.max_m < 4.0
+    assert frozen.beyond < 10
 
 
 def test_a_fault_of_what_the_scenario_has_not_is_left_out(small: dict[str, Outcome]) -> None:
@@ -225,7 +237,7 @@ def test_a_fault_of_what_the_scenario_has_not_is_left_out(small: dict[str, Outco
     text = markdown(list(small.values()), "netpos faults x")
     assert "device_silent" not in text
     rows = [line for line in text.splitlines() if line.startswith("| ")]
-    assert len(rows) == 1 + 9
+    assert len(rows) == 1 + 10
     assert all(line.count("|") == len(HEADS) + 1 for line in rows)
     assert "**" in rows[1]
 

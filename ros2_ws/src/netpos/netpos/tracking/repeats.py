@@ -1,0 +1,141 @@
+"""Whether a sensor is stuck: it goes on sending, with new stamps, the values it had.
+
+Values that a working sensor repeats exactly are no rarity: it rounds them, and where the device
+stands they hardly change. So a run of repeats is compared with two chances of one repeat, and the
+larger one counts:
+
+- What the noise allows. A value rounded to a grid of step q falls into one given cell with a
+  probability of at most erf(q / (2 sqrt(2) sd)), whatever is measured. q is not known; the
+  smallest difference between successive values among the first ones is no smaller.
+- What is usual. The share of repeats before this run, by Laplace's rule of succession.
+  An IMU declares no noise with its samples: for it this alone counts.
+
+A run of k repeats is too long from the first one on for which chance^k is below ``_RISK``. It
+ends with the next other value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache
+from operator import attrgetter
+
+from netpos.estimation.sensors.table import readings
+from netpos.messages.values import Field, ImuSample, RsuMeasurement
+
+REPEATED = "repeated"
+"""Reason for the refusal."""
+_LOG_RISK = math.log(1e-9)  # of a run that a working sensor makes, at every message
+_REMEMBERED = 1000  # messages behind what is usual: older ones fade
+_COMPARED = 200  # messages whose differences are looked at
+_SOURCES_MAX = 1000
+_POSITION = int(Field.POSITION)
+_READINGS = {int(reading.field): reading for _, reading in reversed(readings())}
+
+
+@dataclass(slots=True)
+class _Run:
+    """Values, the stamp they came with last, and how often they were repeated."""
+
+    values: tuple[float, ...]
+    stamp_ns: int
+    repeats: int = 0
+
+
+@dataclass(slots=True)
+class _Source:
+    """The present run by reference; of the measurements before, how many repeated the one before
+    them; the smallest difference of each value, none before two have differed."""
+
+    runs: dict[str, _Run] = field(default_factory=dict)
+    heard: float = 0.0
+    repeated: float = 0.0
+    smallest: tuple[float, ...] = ()
+
+    def hear(self, reference: str, values: tuple[float, ...], stamp_ns: int) -> int:
+        """Take values; how many repeats there are in a row now."""
+        run = self.runs.get(reference)
+        if run is None:
+            self.runs[reference] = _Run(values, stamp_ns)
+            return 0
+        if run.values == values:
+            run.repeats += run.stamp_ns != stamp_ns  # the same message twice is no measurement
+        else:
+            if self.heard < _COMPARED:
+                self._compare(run.values, values)
+            self.heard += run.repeats + 1
+            self.repeated += run.repeats
+            if self.heard > _REMEMBERED:
+                self.heard, self.repeated = 0.5 * self.heard, 0.5 * self.repeated
+            run.values, run.repeats = values, 0
+        run.stamp_ns = stamp_ns
+        return run.repeats
+
+    def _compare(self, one: tuple[float, ...], other: tuple[float, ...]) -> None:
+        known = self.smallest or (math.inf,) * len(one)
+        differences = [abs(a - b) for a, b in zip(one, other, strict=True)]
+        self.smallest = tuple(
+            [d if 0.0 < d < s else s for d, s in zip(differences, known, strict=True)]
+        )
+
+    def is_unusual(self, repeats: int) -> bool:
+        """Whether a run is too long by what was heard before; never while no two differed."""
+        usual = (self.repeated + 1.0) / (self.heard + 2.0)
+        return bool(repeats and self.smallest) and repeats * math.log(usual) < _LOG_RISK
+
+    def is_unlikely(self, repeats: int, sds: tuple[float, ...]) -> bool:
+        """Whether a run is too long for the noise of each value."""
+        steps = zip(self.smallest, sds, strict=True)
+        chance = min(math.erf(step / (math.sqrt(8.0) * sd)) for step, sd in steps)
+        return chance == 0.0 or repeats * math.log(chance) < _LOG_RISK
+
+
+class Repeats:
+    """The runs of repeats of every RSU and device, by the quantities measured, and of every IMU.
+    By the order of the messages of one source alone, which a recording keeps."""
+
+    def __init__(self) -> None:
+        self._sources: dict[tuple[str, str, int], _Source] = {}
+
+    def stuck(self, item: RsuMeasurement | ImuSample) -> bool:
+        """Take note of a sound measurement; whether it is one repeat too many."""
+        if isinstance(item, ImuSample):
+            values = (*item.angular_velocity.tolist(), *item.specific_force.tolist())
+            source = self._source(("", item.vue_id, 0))
+            repeats = source.hear("", values, item.stamp_ns)
+            return source.is_unusual(repeats)
+        fields = int(item.fields)
+        source = self._source((item.rsu_id, item.vue_id, fields))
+        repeats = source.hear(item.reference_rsu_id, _values(fields)(item), item.stamp_ns)
+        return source.is_unusual(repeats) and source.is_unlikely(repeats, _sds(item))
+
+    def _source(self, key: tuple[str, str, int]) -> _Source:
+        source = self._sources.get(key)
+        if source is None:
+            if len(self._sources) >= _SOURCES_MAX:
+                del self._sources[next(iter(self._sources))]
+            source = self._sources[key] = _Source()
+        return source
+
+
+@lru_cache(256)
+def _values(fields: int) -> Callable[[RsuMeasurement], tuple[float, ...]]:
+    """What reads the values of a measurement with these ``fields``."""
+    names = [reading.value for field, reading in _READINGS.items() if fields & field]
+    read = [attrgetter(name) for name in names]
+    if fields & _POSITION:
+        return lambda m: (*[value(m) for value in read], *m.position[:2].tolist())
+    if len(names) > 1:
+        return attrgetter(*names)
+    return lambda m: (read[0](m),)
+
+
+def _sds(m: RsuMeasurement) -> tuple[float, ...]:
+    """Standard deviation of each of the values."""
+    carried = [r for field, r in _READINGS.items() if int(m.fields) & field]
+    variances = [getattr(m, reading.variance) for reading in carried]
+    if int(m.fields) & _POSITION:
+        variances += [float(m.position_cov[0, 0]), float(m.position_cov[1, 1])]
+    return tuple(map(math.sqrt, variances))
