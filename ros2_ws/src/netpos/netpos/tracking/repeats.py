@@ -7,11 +7,13 @@ larger one counts:
 - What the noise allows. A value rounded to a grid of step q falls into one given cell with a
   probability of at most erf(q / (2 sqrt(2) sd)), whatever is measured. q is not known; the
   smallest difference between successive values among the first ones is no smaller.
-- What is usual. The share of repeats before this run, by Laplace's rule of succession.
-  An IMU declares no noise with its samples: for it this alone counts.
+- What is usual: the share of messages that were repeats before this run, by Laplace's rule of
+  succession, for the first repeat; the share of repeats that a repeat followed for the others.
+  Repeats of a device that stands come in runs. An IMU declares no noise with its samples: for it
+  this alone counts.
 
-A run of k repeats is too long from the first one on for which chance^k is below ``_RISK``. It
-ends with the next other value.
+A run of repeats is too long from the first one on for which the product of the chances is below
+1e-9. It ends with the next other value.
 """
 
 from __future__ import annotations
@@ -47,11 +49,13 @@ class _Run:
 @dataclass(slots=True)
 class _Source:
     """The present run by reference; of the measurements before, how many repeated the one before
-    them; the smallest difference of each value, none before two have differed."""
+    them, and of these how many repeated a repeat; the smallest difference of each value, none
+    before two have differed."""
 
     runs: dict[str, _Run] = field(default_factory=dict)
     heard: float = 0.0
     repeated: float = 0.0
+    again: float = 0.0
     smallest: tuple[float, ...] = ()
 
     def hear(self, reference: str, values: tuple[float, ...], stamp_ns: int) -> int:
@@ -65,13 +69,21 @@ class _Source:
         else:
             if self.heard < _COMPARED:
                 self._compare(run.values, values)
-            self.heard += run.repeats + 1
-            self.repeated += run.repeats
-            if self.heard > _REMEMBERED:
-                self.heard, self.repeated = 0.5 * self.heard, 0.5 * self.repeated
+            self._count(run.repeats)
             run.values, run.repeats = values, 0
         run.stamp_ns = stamp_ns
         return run.repeats
+
+    def _count(self, repeats: int) -> None:
+        self.heard += repeats + 1
+        self.repeated += repeats
+        self.again += max(repeats - 1, 0)
+        if self.heard > _REMEMBERED:
+            self.heard, self.repeated, self.again = (
+                0.5 * self.heard,
+                0.5 * self.repeated,
+                0.5 * self.again,
+            )
 
     def _compare(self, one: tuple[float, ...], other: tuple[float, ...]) -> None:
         known = self.smallest or (math.inf,) * len(one)
@@ -82,8 +94,12 @@ class _Source:
 
     def is_unusual(self, repeats: int) -> bool:
         """Whether a run is too long by what was heard before; never while no two differed."""
-        usual = (self.repeated + 1.0) / (self.heard + 2.0)
-        return bool(repeats and self.smallest) and repeats * math.log(usual) < _LOG_RISK
+        if not (repeats and self.smallest):
+            return False
+        first = (self.repeated + 1.0) / (self.heard + 2.0)
+        # As likely after a repeat as else, until more is known.
+        other = max(first, (self.again + 2.0 * first) / (self.repeated + 2.0))
+        return math.log(first) + (repeats - 1) * math.log(other) < _LOG_RISK
 
     def is_unlikely(self, repeats: int, sds: tuple[float, ...]) -> bool:
         """Whether a run is too long for the noise of each value."""

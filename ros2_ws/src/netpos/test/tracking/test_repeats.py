@@ -64,6 +64,21 @@ def test_a_sensor_quieter_than_it_says_is_believed_by_its_past() -> None:
     assert not any(said[2800:])
 
 
+def test_a_sensor_whose_repeats_come_in_runs_is_soon_believed() -> None:
+    """A person walks for ten seconds and stands for ten, again and again; one repeat in five
+    messages, but 40 in a row: as they were independent, a run of 14 would be less likely than the
+    risk."""
+    rng, values = np.random.default_rng(10), [0.0]
+    while len(values) < 20_000:
+        values += rng.standard_normal(160).tolist()
+        values += [values[-1]] * int(rng.geometric(1.0 / 40.0))
+    said = refused(Repeats(), values)
+    share = float(np.mean(np.diff(values) == 0.0))
+    assert first_refused(share) < 15
+    assert sum(said) < 0.01 * len(said)
+    assert sum(said[10_000:]) < 0.001 * len(said)
+
+
 def test_the_first_repeat_too_many_by_what_is_usual() -> None:
     """98 other values, by Laplace's rule one repeat in 100: the fifth in a row."""
     repeats = Repeats()
