@@ -11,7 +11,7 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Container, Iterator, Mapping
 from io import BytesIO
-from typing import Any
+from typing import Any, BinaryIO
 
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
@@ -23,6 +23,7 @@ from netpos.bags.scan import unpack
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")
 _INDEX = struct.Struct("<BQHI")
+_PART_BYTES = 1 << 20
 _FIXED = _MESSAGE.size - _HEAD.size  # bytes of a message's record between its length and its data
 
 StoredMessage = tuple[int, int, str, bytes]  # log time, position in the file, topic, payload
@@ -165,37 +166,41 @@ class _Chunk:
         return b"".join(self._parts)
 
 
-class _Packed:
-    """The index of a chunk as the bytes of its record: a recording has four of them each second,
-    and keeps them to its end."""
+class _Spool:
+    """The index of every chunk, which a file has at its end: a recording has four of them each
+    second, so they wait in a file of their own. Replaces a list of mcap's writer."""
 
-    __slots__ = ("_record",)
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
 
-    def __init__(self, index: Any) -> None:
+    def append(self, index: Any) -> None:
         records = RecordBuilder()
         index.write(records)
-        self._record = records.end()
+        self._file.write(records.end())
+
+    def __iter__(self) -> Iterator[_Spool]:
+        self._file.seek(0)
+        yield self
 
     def write(self, records: Any) -> None:
-        """As mcap's ChunkIndex."""
-        records.write(self._record)
-
-
-class _PackedList(list[_Packed]):
-    def append(self, index: Any) -> None:
-        super().append(_Packed(index))
+        """All of them, as mcap's ChunkIndex writes one."""
+        while part := self._file.read(_PART_BYTES):
+            records.write(part)
 
 
 class FastWriter(Writer):  # type: ignore[misc]  # mcap has no types
-    """mcap's Writer; a chunk is written when it exceeds ``chunk_size`` bytes."""
+    """mcap's Writer; a chunk is written when it exceeds ``chunk_size`` bytes. ``spool``: an empty
+    file, to write and read, in which the index waits for the end."""
 
-    def __init__(self, stream: Any, *, chunk_size: int, **options: Any) -> None:
+    def __init__(
+        self, stream: BinaryIO, spool: BinaryIO, *, chunk_size: int, **options: Any
+    ) -> None:
         super().__init__(stream, chunk_size=chunk_size, **options)
         self._size = chunk_size
         self._statistics = self._Writer__statistics
         self._chunk = _Chunk(self._statistics)
         self._Writer__chunk_builder = self._chunk
-        self._Writer__chunk_indices = _PackedList()
+        self._Writer__chunk_indices = _Spool(spool)
 
     def add_message(
         self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import IO, Any, Self
 
 from mcap.writer import CompressionType
 from rosbags.interfaces import Qos
@@ -20,7 +21,7 @@ from netpos.bags.errors import BagError
 from netpos.bags.qos import default_profile
 from netpos.bags.types import check_type_name, definition, require_type, type_hash
 
-CHUNK_BYTES = 1024 * 1024  # of uncompressed messages; its index stays in memory to the end
+CHUNK_BYTES = 1024 * 1024  # of uncompressed messages
 MAX_TIME_NS = 2**63 - 1
 
 
@@ -56,10 +57,12 @@ class BagWriter:
             ) from None
         file = layout.storage_file(self.path.absolute())
         self._file = file.open("xb")
-        self._mcap = FastWriter(
-            self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
-        )
         try:
+            # Without a name: what is killed leaves nothing behind.
+            self._spool: IO[bytes] = tempfile.TemporaryFile(dir=self.path)  # noqa: SIM115
+            self._mcap = FastWriter(
+                self._file, self._spool, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
+            )
             self._mcap.start(profile="ros2", library=f"{layout.LIBRARY} {netpos.__version__}")
             if self._run:
                 self._say_of_run(self._run)
@@ -220,8 +223,9 @@ class BagWriter:
     def abandon(self) -> None:
         """Close the file as it is, without an index: ``recover`` saves its whole chunks."""
         self._abandoned = True
-        with suppress(OSError):  # what waits in the buffer of the file does not fit either
-            self._file.close()
+        for file in (self._file, self._spool):
+            with suppress(OSError):  # what waits in the buffer of the file does not fit either
+                file.close()
 
     def close(self) -> None:
         """Write the index and metadata.yaml; may be called twice."""
@@ -241,8 +245,9 @@ class BagWriter:
         except OSError as error:
             raise self._not_written(error) from error
         finally:
-            with suppress(OSError):
-                self._file.close()
+            for file in (self._file, self._spool):
+                with suppress(OSError):
+                    file.close()
         layout.write_metadata(self.path, information)
 
 
