@@ -42,8 +42,8 @@ def opened() -> Iterator[list[str]]:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("paths")
-    library.simulate(library.load_scenario("fast_pass", seed=1), folder / "run")
-    library.track(folder / "run", folder / "tracked")
+    run = library.Scenario.load("fast_pass", seed=1).simulate(folder / "run")
+    run.track(folder / "tracked")
     return folder / "tracked"
 
 
