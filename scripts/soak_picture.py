@@ -42,7 +42,7 @@ def draw(found: list[tuple[str, dict[str, Any]]], out: Path) -> None:
         latency.set_ylabel("[ms]")
         latency.set_xlabel("time [h]")
         for panel in (memory, latency):
-            panel.set_ylim(bottom=0.0)
+            panel.set_ylim(0.0, 1.1 * panel.dataLim.y1)
             panel.legend()
     picture.savefig(out)
 
