@@ -36,8 +36,7 @@ TESTS_OF = {
     "../test_bearing.py ../test_ekf_wide_prior.py",
     "error_state": "test_error_state_rules.py test_error_state_chunks.py test_error_state.py",
     "factor": "test_factor.py",
-    "fit": "test_fit.py test_gate.py "
-    "test_interacting.py::test_likelihood_of_what_says_the_same_twice",
+    "fit": "test_fit.py test_gate.py test_mixing.py::test_likelihood_of_what_says_the_same_twice",
     "fusion": "test_ekf.py",
     "gate": "test_gate.py test_kf.py",
     "iteration": "test_ekf_iteration.py test_ekf_bending.py test_ekf_wide_prior.py",
@@ -75,11 +74,11 @@ TESTS_OF = {
     "tracking/phase_fix": "test_phase_fix.py",
     "protection": "test_protection.py",
     "report": "test_report.py",
-    "estimation/mixture/interacting": "../test_interacting.py -knot+stop_straight_turn",
+    "estimation/mixture/mixing": "../test_mixing.py -knot+stop_straight_turn",
     **{
         f"estimation/mixture/{name}": "../test_components.py"
         for name in (
-            *("candidates", "cuts", "epoch", "gaussians", "paths", "reduction"),
+            *("candidates", "epoch", "gaussians", "paths", "reduction"),
             *("ring", "turns"),
         )
     },

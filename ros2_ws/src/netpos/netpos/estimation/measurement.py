@@ -70,9 +70,6 @@ __all__ = [
 ]
 
 
-_STRAIGHT = 0.03  # of the squared distance: a narrower device sees an azimuth as it bends
-
-
 @inlined
 def _no_value(
     _row: Array, _dx: float, _dy: float, _dz: float
@@ -240,9 +237,9 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
     n).
 
     Half the trace of (h'' P)^2 of the second-order extended Kalman filter (Bar-Shalom, Li and
-    Kirubarajan 2001, eq. 10.3.3-12): exact for ranges and times, and for azimuths of a device that
-    is narrow beside its distance; with the largest curvature of the quantity for other angles and
-    phases. It keeps a device that may be anywhere around an RSU from being placed on top of it.
+    Kirubarajan 2001, eq. 10.3.3-12): exact for ranges and times, with the largest curvature of the
+    quantity for angles and phases. It keeps a device that may be anywhere around an RSU from being
+    placed on top of it.
     """
     kind = int(row[KIND])
     if _has_state_model(kind):
@@ -251,13 +248,8 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
     dx = mean[X.PX] + lx - row[ORIGIN]
     dy = mean[X.PY] + ly - row[ORIGIN + 1]
     dz = offset_up(row, mean, height_m)
-    width2 = cov[X.PX, X.PX] + cov[X.PY, X.PY]
-    straight = width2 <= _STRAIGHT * (dx * dx + dy * dy) and row[HEADING] < 0.0
-    exact = 1 if straight and _has_exact_second_order(kind) else 0
     if row[HEIGHT] > 0.0:
-        return float(_second_order_in_3d(exact, kind, row, (dx, dy, dz), cov))
-    if exact == 1:
-        return float(_exact_second_order(kind, row, dx, dy, dz, cov, 2))
+        return float(_second_order_in_3d(0, kind, row, (dx, dy, dz), cov))
     return float(second_order_of_offset(kind, row, dx, dy, dz, cov, 2))
 
 

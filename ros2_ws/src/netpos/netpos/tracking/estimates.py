@@ -14,7 +14,6 @@ from netpos.estimation.mixture import epoch as mixtures
 from netpos.estimation.mixture.epoch import Dynamics
 from netpos.estimation.mixture.gaussians import Mixture, mode_of, moments, one_component
 from netpos.estimation.mixture.paths import paths_are_open
-from netpos.estimation.mixture.ring import NARROW_M
 from netpos.estimation.motion import NO_BIAS, Parameter
 from netpos.estimation.protection import mixture_radius
 from netpos.estimation.state import N_CORE, X
@@ -233,7 +232,6 @@ class KalmanEstimate(OneModel):
             self.stamp_ns, self._prior = stamp_ns, None
             before = self._prior_of_one()
             if self._explains(result, raw, epoch, since_turn_s):
-                self._cut(rows)
                 return result.nis, result.used, accepted[:groups]
             prior = one_component(*before)
             rows[:] = raw
@@ -261,16 +259,6 @@ class KalmanEstimate(OneModel):
         if not self._paths_may_be_blocked:
             return True
         return not paths_are_open(*self._prior_of_one(), raw, options)
-
-    def _cut(self, rows: Array) -> None:
-        """Cut the one component where ``rows`` bend over it."""
-        if self._options.models > 1:
-            return
-        cov = self.cov
-        if cov.item(0, 0) + cov.item(1, 1) >= NARROW_M**2:
-            cut = mixtures.cut_where_bent(self.mean, cov, rows, self._options)
-            if cut.log_weights.size > 1:
-                self._set(cut)
 
     def copy(self) -> KalmanEstimate:
         twin = KalmanEstimate.__new__(KalmanEstimate)

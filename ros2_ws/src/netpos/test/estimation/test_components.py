@@ -12,7 +12,6 @@ from netpos.estimation.engine import EpochInput
 from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import GROUP, VARIANCE, Kind
 from netpos.estimation.mixture import epoch as epochs
-from netpos.estimation.mixture.cuts import cut, cut_length
 from netpos.estimation.mixture.gaussians import Mixture, mode_of, moments, one_component
 from netpos.estimation.mixture.reduction import reduced
 from netpos.estimation.mixture.ring import RING_MERGE_COST, is_wide, split_along_ring
@@ -400,44 +399,6 @@ def test_rows_are_reweighted_by_the_most_probable_component(name: str) -> None:
     epochs.moved_to_epoch(two, epoch, dynamics, options_of(config))
     distance = np.sqrt(off @ np.linalg.solve(H @ P @ H.T + R, off) / 2.0)
     np.testing.assert_allclose(rows[:, VARIANCE] / variance, distance / 1.5, rtol=1e-9)
-
-
-@pytest.mark.parametrize("share", [0.9, 0.5, 0.2])
-def test_a_cut_gaussian_is_still_the_same(share: float) -> None:
-    """Weights, mean and covariance are kept; each part is shorter along the widest axis only."""
-    x, P = prior((30.0, 4.0), (6.0, 1.0), rho=0.5)
-    P[0, 1] = P[1, 0] = 3.0
-    values, vectors = np.linalg.eigh(P[:2, :2])
-    parts = cut(x, P, share)
-    assert np.exp(parts.log_weights).sum() == pytest.approx(1.0, abs=1e-3)
-    parts = parts._replace(log_weights=parts.log_weights - np.log(np.exp(parts.log_weights).sum()))
-    mean, cov = moments(parts)
-    np.testing.assert_allclose(mean, x, atol=1e-6)
-    np.testing.assert_allclose(cov, P, rtol=1e-3, atol=1e-3)
-    for part in parts.covs:
-        along = vectors.T @ part[:2, :2] @ vectors
-        assert along[1, 1] == pytest.approx(share**2 * values[1], rel=1e-9)
-        assert along[0, 0] == pytest.approx(values[0], rel=1e-9)
-
-
-@pytest.mark.parametrize(("across_m", "is_cut"), [(0.19, True), (0.21, False)])
-def test_a_component_is_cut_where_a_range_bends_over_its_width(
-    across_m: float, is_cut: bool
-) -> None:
-    """25 m away and so long that the second-order sd l^2 / (sqrt(2) 25 m) is 0.1 m: half of the
-    width across must be more."""
-    x, P = prior((25.0, 0.0), (across_m, np.sqrt(0.1 * np.sqrt(2.0) * 25.0)))
-    share = cut_length(np.array([row(Kind.RANGE, 25.0, 0.04)]), x, P, 0.0)
-    assert (share < 1.0) is is_cut
-
-
-@pytest.mark.parametrize(("along_m", "share"), [(2.7, 1.0), (2.9, 2.0 / 2.9), (4.0, 0.5)])
-def test_a_component_is_cut_to_a_tenth_of_the_distance_along_a_ray(
-    along_m: float, share: float
-) -> None:
-    x, P = prior((20.0, 0.0), (along_m, 0.4))
-    bearing = np.array([row(Kind.AZIMUTH, 0.0, 0.02**2)])
-    assert cut_length(bearing, x, P, 0.0) == pytest.approx(share, rel=1e-3)
 
 
 def blocked_on_grid(

@@ -8,8 +8,7 @@ Each reason to have more than one component is a module:
 
 ``turns``        a measurement fails the gate, or one RSU alone is heard: the device has turned
 ``ring``         the likelihood of a range is a ring over a wide component
-``cuts``         a measurement bends over the width of a component
 ``paths``        the path of a range is direct or blocked
 ``ridge``        a first fix is a bent arc, or several places (``window``: what it is made of)
-``interacting``  the device changes between several motion models: each has a component
+``mixing``       the device changes between several motion models: each has a component
 """

@@ -26,16 +26,14 @@ from netpos.estimation.engine import (
 )
 from netpos.estimation.forms.choice import write_cov, write_cov_or_sqrt
 from netpos.estimation.measurement import GROUP
-from netpos.estimation.mixture import interacting
+from netpos.estimation.mixture import mixing
 from netpos.estimation.mixture.candidates import Update, apply, candidates, first_of
-from netpos.estimation.mixture.cuts import is_bent, straightened
 from netpos.estimation.mixture.gaussians import Mixture, moments, one_component
 from netpos.estimation.mixture.paths import along_paths, paths_are_open, reweight_by_best
 from netpos.estimation.mixture.reduction import reduced
-from netpos.estimation.mixture.ring import NARROW_M, any_splits, one_by_one
-from netpos.estimation.mixture.turns import add_explanations, add_turns, may_turn
+from netpos.estimation.mixture.ring import any_splits, one_by_one
+from netpos.estimation.mixture.turns import add_explanations, may_turn, turn
 from netpos.estimation.protection import mixture_radius
-from netpos.estimation.state import X
 from netpos.messages.values import Array
 
 _MERGE_SHARE = 0.1  # of the integrity risk: what merging two components may cost
@@ -72,8 +70,8 @@ def move(components: Mixture, dt_s: float, dynamics: Dynamics, options: FilterOp
     log_weights, models = components.log_weights, dynamics.motions.shape[0]
     if models > 1 and dt_s > 0.0:
         weights = np.exp(log_weights)
-        passing = interacting.transition_matrix(dynamics.sojourn_s, dt_s)
-        interacting.mix(means, covs, weights, passing)
+        passing = mixing.transition_matrix(dynamics.sojourn_s, dt_s)
+        mixing.mix(means, covs, weights, passing)
         log_weights = np.log(weights)
     for k in range(means.shape[0]):
         cov_or_sqrt = cov_or_sqrt_of(covs[k], options)
@@ -108,12 +106,12 @@ def _at_once(
     """All measurements of the epoch, for every component of ``prior``."""
     rows = epoch.rows
     count, groups = prior.log_weights.size, int(rows[rows.shape[0] - 1, GROUP]) + 1
-    found = candidates(4 * count, prior.means.shape[1], groups)
+    found = candidates(3 * count + 1, prior.means.shape[1], groups)
     end = count
     for k in range(count):
         found.means[k], found.covs[k] = prior.means[k], prior.covs[k]
         if options.models > 1:
-            interacting.open_velocity(k, epoch, options, found)
+            mixing.open_velocity(k, epoch, options, found)
         apply(k, prior.log_weights[k], rows, options, found)
         if options.models > 1 and found.used[k] == 0:
             found.covs[k] = prior.covs[k]
@@ -125,7 +123,8 @@ def _at_once(
         prior.means[best], rows, since_turn_s, options
     )
     if turns:
-        end = add_turns(end, prior, max(since_turn_s, epoch.unheard_s), rows, options, found)
+        turn(end, prior, best, max(since_turn_s, epoch.unheard_s), rows, options, found)
+        end += 1
     best = int(np.argmax(found.log_weights[:end]))
     top = found.log_weights[best]
     if not math.isfinite(top):
@@ -135,7 +134,7 @@ def _at_once(
     weights = np.exp(found.log_weights[:end] - top)
     turned = weights[found.within_s[:end] > 0.0].sum() / weights.sum()
     if options.models > 1:
-        components = interacting.one_of_each(first_of(found, end))
+        components = mixing.one_of_each(first_of(found, end))
     else:
         components = reduced(first_of(found, end), _MERGE_SHARE * options.integrity_risk)
     nis, used = found.nis[best], int(found.used[best])
@@ -183,8 +182,6 @@ def apply_epoch(
     """The components, moved to the epoch already, after it; ``accepted`` (groups,) is filled with
     0 or 1. ``since_turn_s``: since the last component "it has turned" began."""
     rows, blocked = epoch.rows, options.robust.nlos_probability > 0.0
-    if options.models == 1 and components.log_weights.size > 1:
-        components = straightened(components, rows, options.height_m)
     if options.models == 1 and any_splits(components, rows, options.height_m):
         if blocked:
             reweight_by_best(components, rows, options.height_m, options.robust)
@@ -199,19 +196,6 @@ def apply_epoch(
 
 
 @kernel
-def cut_where_bent(mean: Array, cov: Array, rows: Array, options: FilterOptions) -> Mixture:
-    """The Gaussian mean (n,), cov (n, n) that an epoch ``rows`` left: cut where these bend over
-    it."""
-    parts: Mixture = one_component(mean, cov)
-    narrow = cov[X.PX, X.PX] + cov[X.PY, X.PY] < NARROW_M * NARROW_M
-    if narrow or options.models > 1 or not is_bent(rows, mean, cov, options.height_m):
-        return parts
-    merge_cost = _MERGE_SHARE * options.integrity_risk
-    parts = reduced(straightened(parts, rows, options.height_m), merge_cost)
-    return parts  # noqa: RET504
-
-
-@kernel
 def note_turn(found: Update, motion: Array, options: FilterOptions) -> None:
     """Leave in ``motion`` the velocity step that the components of an epoch allow for, each by its
     weight (``set_velocity_step_noise``)."""
@@ -223,14 +207,15 @@ def note_turn(found: Update, motion: Array, options: FilterOptions) -> None:
 def _by_one(
     x: Array,
     S: Array,
+    components: Mixture,
     epoch: EpochInput,
     since_turn_s: float,
     dynamics: Dynamics,
     options: FilterOptions,
     memory: Scratch,
 ) -> tuple[bool, Update]:
-    """One epoch of one component ``x`` (n,), ``S`` (n, n), in place: whether it does not explain
-    the epoch, and then its prediction, else what came of it."""
+    """One epoch of the one component ``x`` (n,), ``S`` (n, n), in place: whether it does not
+    explain the epoch, and then its prediction, else what came of it."""
     rows, nothing = epoch.rows, 0.0
     blocked = options.models == 1 and options.robust.nlos_probability > 0.0
     raw = rows.copy() if blocked else rows
@@ -243,7 +228,6 @@ def _by_one(
         rows[:] = raw
         before = one_component(memory.prior_mean, cov_of(memory.prior_cov_or_sqrt, options))
         return True, Update(before, nothing, 0, nothing, nothing, False)
-    components = cut_where_bent(x, cov_of(S, options), rows, options)
     return False, Update(components, result.nis, result.used, nothing, nothing, False)
 
 
@@ -272,14 +256,14 @@ def _advance(
         predict(x, S, epoch.dt_s, dynamics.motions[0], dynamics.bias, options)
         return found
     if not several:
-        moved, found = _by_one(x, S, epoch, since_turn_s, dynamics, options, memory)
-        components = found.components
-        if not moved and components.log_weights.size == 1:
+        moved, found = _by_one(x, S, components, epoch, since_turn_s, dynamics, options, memory)
+        if not moved:
             return found
+        components = found.components
     else:
         components = moved_to_epoch(components, epoch, dynamics, options)
         found = Update(components, 0.0, 0, 0.0, 0.0, False)
-    if rows.shape[0] > 0 and (several or moved):
+    if rows.shape[0] > 0:
         found = apply_epoch(components, epoch, options, since_turn_s, memory.accepted)
     mean, cov = moments(found.components)
     x[:] = mean

@@ -23,7 +23,7 @@ from netpos.estimation.mixture.candidates import Candidates, Update, apply, cand
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.mixture.reduction import reduced
 from netpos.estimation.mixture.ring import RING_MERGE_COST
-from netpos.estimation.mixture.turns import add_explanations, add_turns, may_turn
+from netpos.estimation.mixture.turns import add_explanations, may_turn, turn
 from netpos.estimation.robust import blocked_excess, matching_cost
 from netpos.estimation.sensors.row import group_end
 from netpos.messages.values import Array
@@ -186,8 +186,8 @@ def along_paths(
         late = _late_row(alone)
         single = EpochInput(epoch.dt_s, epoch.unheard_s, epoch.rejected_in_row, alone)
         count, n = components.means.shape
-        found = candidates(5 * count, n, 1)
-        blocked, end = np.zeros(5 * count), np.int64(0)
+        found = candidates(4 * count + 1, n, 1)
+        blocked, end = np.zeros(4 * count + 1), np.int64(0)
         for k in range(count):
             first = end
             if late >= 0:
@@ -203,7 +203,8 @@ def along_paths(
             turns = may_turn(components.means[best], raw, since_turn_s, options)
         if turns:
             within_s = max(since_turn_s, epoch.unheard_s)
-            end = add_turns(end, components, within_s, alone, options, found)
+            turn(end, components, best, within_s, alone, options, found)
+            end += 1
         best = int(np.argmax(found.log_weights[:end]))
         top = found.log_weights[best]
         accepted[group] = found.accepted[best, 0] if math.isfinite(top) else 0.0

@@ -14,7 +14,6 @@ from netpos.messages.values import Array
 
 TURN_PERIOD_S = 0.25  # a component "it has turned" begins so long after the last, with one RSU
 _TURNS_HZ = 1.0 / 30.0  # how often a device turns
-_TURNS_FROM = 0.01  # of the largest weight: turns from components of less are less than turns
 
 
 @kernel
@@ -59,25 +58,6 @@ def add_explanations(
     found.means[end + 1], found.covs[end + 1] = mean, cov
     apply_all(end + 1, prior.log_weights[parent], epoch.rows, options, found)
     return end + 2
-
-
-@kernel
-def add_turns(
-    end: int,
-    prior: Mixture,
-    within_s: float,
-    rows: Array,
-    options: FilterOptions,
-    found: Candidates,
-) -> int:
-    """Add that the device turned in the last ``within_s`` seconds, from each component of
-    ``prior`` that weighs something; the number of candidates then."""
-    least = prior.log_weights.max() + math.log(_TURNS_FROM)
-    for k in range(prior.log_weights.size):
-        if prior.log_weights[k] >= least:
-            turn(end, prior, k, within_s, rows, options, found)
-            end += 1
-    return end
 
 
 @kernel

@@ -14,7 +14,7 @@ from netpos.estimation.fit import neg2_log_likelihood
 from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import Kind
 from netpos.estimation.mixture import epoch as epochs
-from netpos.estimation.mixture import interacting
+from netpos.estimation.mixture import mixing
 from netpos.estimation.mixture.candidates import Update
 from netpos.estimation.mixture.epoch import Dynamics
 from netpos.estimation.mixture.gaussians import Mixture, combine, moments
@@ -78,14 +78,14 @@ def test_transition_matrix(sojourn: list[float], dt: float) -> None:
     count = sojourn_s.size
     rates = np.repeat(1.0 / sojourn_s / (count - 1), count).reshape(count, count)
     rates[np.diag_indices(count)] = -1.0 / sojourn_s
-    result = interacting.transition_matrix(sojourn_s, dt)
+    result = mixing.transition_matrix(sojourn_s, dt)
     np.testing.assert_allclose(result, expm(rates * dt), rtol=1e-9, atol=1e-10)
     np.testing.assert_allclose(result.sum(axis=1), 1.0, rtol=1e-9)
     assert (result >= 0.0).all()
 
 
 def test_one_model_stays() -> None:
-    assert interacting.transition_matrix(np.array([3.0]), 1.0).tolist() == [[1.0]]
+    assert mixing.transition_matrix(np.array([3.0]), 1.0).tolist() == [[1.0]]
 
 
 def test_linear_track_equals_filterpy(row: Maker, random_cov: Maker) -> None:
@@ -177,10 +177,10 @@ def test_likelihood_counts_the_curvature(row: Maker) -> None:
 def test_weights_never_die() -> None:
     weights = np.array([0.0, 0.3, 0.6])
     for _ in range(3):
-        interacting.keep_alive(weights)
+        mixing.keep_alive(weights)
     np.testing.assert_allclose(weights, [1e-12, 1.0 / 3.0, 2.0 / 3.0], rtol=1e-9)
     assert weights.sum() == pytest.approx(1.0, abs=1e-15)
-    interacting.mix(np.zeros((3, 1)), np.ones((3, 1, 1)), weights, np.eye(3))
+    mixing.mix(np.zeros((3, 1)), np.ones((3, 1, 1)), weights, np.eye(3))
     assert (weights >= 0.999e-12).all()
 
 
@@ -189,7 +189,7 @@ def test_a_model_left_for_long_comes_back() -> None:
     means, covs = np.array([[0.0], [8.0]]), np.ones((2, 1, 1))
     weights, transition = np.array([0.5, 0.5]), np.array([[1.0, 0.0], [0.5, 0.5]])
     for _ in range(2000):
-        interacting.mix(means, covs, weights, transition)
+        mixing.mix(means, covs, weights, transition)
     assert weights[1] == pytest.approx(1e-12, rel=1e-9)
     assert weights.sum() == pytest.approx(1.0, abs=1e-15)
     assert means[1, X.PX] == 8.0
