@@ -50,7 +50,7 @@ def test_it_goes_on_where_it_stopped(bags: list[Path], tmp_path: Path) -> None:
     assert first.exit_code == 0, first.output
     written = (tmp_path / "run_1" / "run_1_0.mcap").stat().st_mtime_ns
     second = replay(*bags, "--out", tmp_path, "--workers", 1)
-    assert "1 of 3 bags tracked, 2 were there" in second.stdout
+    assert "1 of 3 bags tracked, 2 existed already" in second.stdout
     assert (tmp_path / "run_1" / "run_1_0.mcap").stat().st_mtime_ns == written
     other = replay(*bags, "--out", tmp_path, "--workers", 1, "--set", "hold_s=0.5")
     assert other.exit_code == 2
@@ -63,7 +63,7 @@ def test_one_that_cannot_be_tracked_leaves_the_others(bags: list[Path], tmp_path
     (broken / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
     result = replay(*bags[:2], broken, "--out", tmp_path / "tracks", "--workers", 1)
     assert result.exit_code == 1
-    assert "2 of 3 bags tracked, 0 were there, 1 refused" in result.stdout
+    assert "2 of 3 bags tracked, 0 existed already, 1 refused" in result.stdout
     assert "broken" in result.stderr
 
 

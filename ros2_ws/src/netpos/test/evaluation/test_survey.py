@@ -332,7 +332,7 @@ def test_a_truth_that_cannot_be_used_is_one_sentence(tmp_path: Path) -> None:
     code, output = netpos("evaluate", bag, "--truth-align", "rigid")
     assert (code, output) == (
         2,
-        "netpos: there is no truth to map or align; name it with --truth\n",
+        "netpos: options of the ground truth need --truth: name its file or bag\n",
     )
     code, output = netpos("evaluate", bag, "--truth", tmp_path / "none.tum")
     assert code == 2
