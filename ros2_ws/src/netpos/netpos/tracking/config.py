@@ -14,6 +14,7 @@ from netpos.estimation.motion import ProcessNoise
 from netpos.estimation.motion import table as motion
 from netpos.estimation.motion.model import MotionModel
 from netpos.messages.fields import Frames
+from netpos.tracking import shared_parameters as shared
 from netpos.tracking.learning import TAIL
 from netpos.tracking.rsus import StepErrors
 from netpos.world.geodesy import datum_of_text
@@ -242,24 +243,14 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
     history_s: float = real(
         1.0, 0.0, 60.0, "how late a measurement may come and still be applied in order"
     )
-    max_future_s: float = real(
-        60.0, 0.1, 1e9, "a stamp this far ahead counts only once a second one confirms it"
-    )
+    max_future_s: float = shared.max_future_s()
     fixed_lag_s: float = real(
         0.0, 0.0, 60.0, "smoothed odometry is given out this long after the epoch; 0: none"
     )
-    integrity_risk: float = real(
-        1e-4, 1e-12, 0.5, "probability with which the error may exceed the protection level"
-    )
+    integrity_risk: float = shared.integrity_risk()
     map_frame: str = described("map", "frame of RSUs, poses and estimates (REP-105)")
-    odom_frame: str = described(
-        "",
-        "with a name, such as {vue}/odom: /tf gets map_frame -> odom_frame, by the transform from"
-        " there to base_frame that dead reckoning gives on /tf; empty: map_frame -> base_frame",
-    )
-    base_frame: str = described(
-        "{vue}/base_link", "body frame of a device; {vue} stands for its name"
-    )
+    odom_frame: str = shared.odom_frame()
+    base_frame: str = shared.base_frame()
     datum: str = described(
         "",
         "latitude, longitude [deg] and height [m] on WGS 84 of the origin of map_frame: places"

@@ -10,6 +10,7 @@ from typing import Any
 from netpos.common.parameters import check_fields, choice, described, from_mapping, real
 from netpos.estimation.intersection import METHODS
 from netpos.messages.fields import Frames
+from netpos.tracking import shared_parameters as shared
 
 ASSOCIATIONS = ("motion", "names")
 
@@ -48,21 +49,11 @@ class FusionConfig:
         12.0, 0.0, 1e3, "how much better [-2 ln likelihood] than any rival a pair has to fit"
     )
     confirm_s: float = real(1.0, 0.0, 1e3, "a pair has to be watched so long before it is fused")
-    max_future_s: float = real(
-        60.0, 0.1, 1e9, "a stamp this far ahead counts only once a second one confirms it"
-    )
-    integrity_risk: float = real(
-        1e-4, 1e-12, 0.5, "probability with which the error may exceed the protection level"
-    )
+    max_future_s: float = shared.max_future_s()
+    integrity_risk: float = shared.integrity_risk()
     map_frame: str = described("map", "frame of tracks and estimates, that of the trackers")
-    odom_frame: str = described(
-        "",
-        "with a name, such as {vue}/odom: /tf gets map_frame -> odom_frame, by the transform from"
-        " there to base_frame that dead reckoning gives on /tf; empty: map_frame -> base_frame",
-    )
-    base_frame: str = described(
-        "{vue}/base_link", "body frame of a device; {vue} stands for its name"
-    )
+    odom_frame: str = shared.odom_frame()
+    base_frame: str = shared.base_frame()
 
     def __post_init__(self) -> None:
         check_fields(self)
