@@ -10,10 +10,10 @@ cached on disk.
                  makes them of messages
 ``fusion``, ``iteration``  rows into the estimate; again where the model bends (``fit``)
 ``sigma``        what unscented forms take from sigma points; ``dispatch``: the compiled choice
-``imm``          interacting multiple models
 ``gate``         acceptance by group; ``conditioning``, ``robust``: what fits badly counts less
 ``intersection``  two estimates of one state into one, whatever they have in common
-``engine``       one epoch of one component; ``components`` of a mixture (``mixture``)
+``engine``       one epoch of one component
+``mixture``      one epoch of several components, and a module for each reason to have them
 ``protection``   the radius that holds the error
 ``smooth``       Rauch-Tung-Striebel smoothing
 """
