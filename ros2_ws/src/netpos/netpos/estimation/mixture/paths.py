@@ -67,6 +67,7 @@ class _Path(NamedTuple):
 
 @kernel
 def _path(mean: Array, cov: Array, row: Array, options: FilterOptions) -> _Path:
+    """What the component mean (n,), cov (n, n) says of a late row."""
     robust, h = options.robust, np.empty(mean.size)
     innovation = innovation_row(row, mean, options.height_m, h)
     variance = innovation_variance(row, mean, cov, options.height_m, row[VARIANCE], h)
@@ -111,6 +112,7 @@ def paths_are_open(mean: Array, cov: Array, rows: Array, options: FilterOptions)
 
 @kernel
 def _ungated(mean: Array, cov: Array, rows: Array, options: FilterOptions) -> float:
+    """Log density of ``rows`` as mean (n,), cov (n, n) predict them, whatever the gate says."""
     distance, size = neg2_log_likelihood(mean, cov, rows, options.height_m, False)
     return float(-0.5 * (distance + size))
 
@@ -166,6 +168,32 @@ def _both_paths(
 
 
 @kernel
+def _add_paths(
+    components: Mixture,
+    epoch: EpochInput,
+    late: int,
+    options: FilterOptions,
+    found: Candidates,
+    blocked: Array,
+) -> int:
+    """Fill ``found``, and the probabilities of a ``blocked`` path, with the candidates of all
+    components for one measurement, of which the row ``late`` may be late (-1: none): the number of
+    candidates."""
+    end = np.int64(0)  # no literal: it would make another version of each kernel below
+    for k in range(components.log_weights.size):
+        first = end
+        if late >= 0:
+            end = _both_paths(k, end, late, components, epoch.rows, options, found, blocked)
+        else:
+            found.means[end], found.covs[end] = components.means[k], components.covs[k]
+            apply(end, components.log_weights[k], epoch.rows, options, found)
+            end += 1
+        if found.accepted[first, 0] == 0.0 and options.manoeuvre_speed_sd > 0.0:
+            end = add_explanations(k, first, end, components, epoch, options, found)
+    return int(end)
+
+
+@kernel
 def along_paths(
     components: Mixture,
     epoch: EpochInput,
@@ -187,17 +215,8 @@ def along_paths(
         single = EpochInput(epoch.dt_s, epoch.unheard_s, epoch.rejected_in_row, alone)
         count, n = components.means.shape
         found = candidates(4 * count + 1, n, 1)
-        blocked, end = np.zeros(4 * count + 1), np.int64(0)
-        for k in range(count):
-            first = end
-            if late >= 0:
-                end = _both_paths(k, end, late, components, alone, options, found, blocked)
-            else:
-                found.means[end], found.covs[end] = components.means[k], components.covs[k]
-                apply(end, components.log_weights[k], alone, options, found)
-                end += 1
-            if found.accepted[first, 0] == 0.0 and options.manoeuvre_speed_sd > 0.0:
-                end = add_explanations(k, first, end, components, single, options, found)
+        blocked = np.zeros(4 * count + 1)
+        end = _add_paths(components, single, late, options, found, blocked)
         best = int(np.argmax(components.log_weights))
         if stop - start == raw.shape[0]:
             turns = may_turn(components.means[best], raw, since_turn_s, options)

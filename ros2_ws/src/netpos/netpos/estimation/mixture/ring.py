@@ -35,10 +35,10 @@ from netpos.messages.values import Array
 
 _VELOCITY_END = 4  # position and velocity come first
 # A component is split where the second-order variance exceeds this share of the row's,
-WIDE = 0.25
-# or where it reaches the RSU within so many sd; narrower components (m) never are, nor cut.
-_REACH_SD, NARROW_M = 3.0, 1.0
-SPACING_SD = 1.2  # of Gaussians along a ring: their sum is flat to 1e-3 there
+_WIDE = 0.25
+# or where it reaches the RSU within so many sd; narrower components (m) never are.
+_REACH_SD, _NARROW_M = 3.0, 1.0
+_SPACING_SD = 1.2  # of Gaussians along a ring: their sum is flat to 1e-3 there
 _RING_MIN, RING_MAX = 12, 128
 RING_MERGE_COST = 2e-4  # divergence (Runnalls' bound) that merging parts of a ring may cost
 
@@ -58,14 +58,14 @@ def is_wide(row: Array, mean: Array, cov: Array, height_m: float) -> bool:
     """Whether a component is to be split for a row: a range or time of arrival that narrows the
     position, but whose tangent does not hold over the component's width."""
     width2 = cov[0, 0] + cov[1, 1]
-    if not is_range(row) or width2 < NARROW_M * NARROW_M:
+    if not is_range(row) or width2 < _NARROW_M * _NARROW_M:
         return False
     h = np.empty(mean.size)
     innovation_row(row, mean, height_m, h)
     own = _own_variance(row, cov, h)
     if own > width2:
         return False
-    if curvature_variance(row, mean, cov, height_m) > WIDE * own:
+    if curvature_variance(row, mean, cov, height_m) > _WIDE * own:
         return True
     dx, dy = mean[0] - row[ORIGIN], mean[1] - row[ORIGIN + 1]
     return bool(_REACH_SD * _REACH_SD * width2 > dx * dx + dy * dy)
@@ -90,11 +90,11 @@ def split_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Mi
     slant = math.sqrt(dx * dx + dy * dy + dz * dz) + residual  # measured, less clock and biases
     own = _own_variance(row, cov, h)
     radius = math.sqrt(max(slant * slant - dz * dz, 0.25 * own, 1e-4))
-    sd = math.sqrt(radius * math.sqrt(2.0 * WIDE * own))  # whose second-order variance is own
-    wanted = math.ceil(2.0 * math.pi * radius / (SPACING_SD * sd))
+    sd = math.sqrt(radius * math.sqrt(2.0 * _WIDE * own))  # whose second-order variance is own
+    wanted = math.ceil(2.0 * math.pi * radius / (_SPACING_SD * sd))
     count = int(min(max(wanted, _RING_MIN), RING_MAX))
     arc = 2.0 * math.pi * radius / count
-    sd = arc / SPACING_SD
+    sd = arc / _SPACING_SD
     means, covs, logs = np.empty((count, n)), np.empty((count, n, n)), np.empty(count)
     for k in range(count):
         angle = 2.0 * math.pi * (k + 0.5) / count
