@@ -11,7 +11,6 @@ import numpy as np
 from netpos.estimation.compile import kernel
 from netpos.estimation.conditioning import RobustOptions, may_be_late, reweight
 from netpos.estimation.engine import EpochInput, FilterOptions, is_sound
-from netpos.estimation.fit import neg2_log_likelihood
 from netpos.estimation.measurement import (
     BLOCKED,
     GROUP,
@@ -19,7 +18,14 @@ from netpos.estimation.measurement import (
     innovation_row,
     innovation_variance,
 )
-from netpos.estimation.mixture.candidates import Candidates, Update, apply, candidates, first_of
+from netpos.estimation.mixture.candidates import (
+    Candidates,
+    Update,
+    apply,
+    candidates,
+    first_of,
+    log_likelihood,
+)
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.mixture.reduction import reduced
 from netpos.estimation.mixture.ring import RING_MERGE_COST
@@ -111,13 +117,6 @@ def paths_are_open(mean: Array, cov: Array, rows: Array, options: FilterOptions)
 
 
 @kernel
-def _ungated(mean: Array, cov: Array, rows: Array, options: FilterOptions) -> float:
-    """Log density of ``rows`` as mean (n,), cov (n, n) predict them, whatever the gate says."""
-    distance, size = neg2_log_likelihood(mean, cov, rows, options.height_m, False)
-    return float(-0.5 * (distance + size))
-
-
-@kernel
 def _both_paths(
     k: int,
     end: int,
@@ -136,7 +135,8 @@ def _both_paths(
     read = rows.copy()
     several = math.exp(log_weight) * path.cost > RING_MERGE_COST
     found.means[end], found.covs[end] = mean, cov
-    likelihood = log_weight + _ungated(mean, cov, rows, options)
+    everything = np.ones(1)  # of the one measurement, whatever the gate says
+    likelihood = log_weight + log_likelihood(mean, cov, rows, options.height_m, everything)
     if not several:
         reweight(mean, cov, read, options.height_m, options.robust, np.empty(mean.size))
         apply(end, log_weight, read, options, found)
