@@ -71,7 +71,7 @@ TESTS_OF = {
     "tracking/fit": "test_protection.py -kinnovations_and_level+or+is_not_sound",
     "estimation/mixture/window": "../../tracking/test_initialise_fit.py",
     "tracking/output": "test_output.py",
-    "tracking/phase_fix": "test_phase_fix.py",
+    "phase_fix": "test_phase_fix.py",
     "protection": "test_protection.py",
     "report": "test_report.py",
     "estimation/mixture/mixing": "../test_mixing.py -knot+stop_straight_turn",
@@ -82,8 +82,7 @@ TESTS_OF = {
             *("ring", "turns"),
         )
     },
-    "tracking/sectors": "test_sector_bank.py -kwhere_a_phase",
-    "tracking/sector_bank": "test_sector_bank_rules.py test_sector_bank.py",
+    "estimation/mixture/sectors": "../test_phase_sectors.py",
     "estimation/forms/ukf": "../test_ukf.py ../test_gate.py",
 }
 # Newton's method gets there from anywhere.
@@ -127,7 +126,8 @@ EQUIVALENT = {
     ("protection", "gaussian_radius", "operator swapped: 1e-06 * u"),
     ("protection", "gaussian_radius", "operator swapped: u + 2.0 * _NEGLIGIBLE"),
     ("protection", "radius_of", "operator swapped: xx + yy"),  # finite where both are
-    ("tracking/sector_bank", "_gains", "operator swapped: _WIDE_RAD * _WIDE_RAD"),  # is 1
+    # is 1
+    ("estimation/mixture/sectors", "_take_turns", "operator swapped: _WIDE_RAD * _WIDE_RAD"),
     *(  # memory for more rows than there are
         ("engine", "run_epochs", f"operator swapped: {size}")
         for size in ("row_start[k + 1] - row_start[k] (2)", "k + 1 (3)")

@@ -23,15 +23,9 @@ sys.path.insert(0, str(ROOT / "ros2_ws/src/netpos/test/support"))
 from oracle_problems import PROBLEMS  # noqa: E402
 from oracle_scores import Check, Moment, compare, doubled, summarise  # noqa: E402
 from oracle_table import tables, write_between_marks  # noqa: E402
+from script_parts import positive  # noqa: E402
 
 CHECKED = 4  # seeds that are run again with twice the particles
-
-
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, got {value}")
-    return value
 
 
 def _share(text: str) -> float:
@@ -44,9 +38,9 @@ def _share(text: str) -> float:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--problem", type=int, choices=sorted(PROBLEMS), help="only this one")
-    parser.add_argument("--seeds", type=_positive, default=50, help="runs a problem")
+    parser.add_argument("--seeds", type=positive, default=50, help="runs a problem")
     parser.add_argument("--first-seed", type=int, default=0, help="seed of the first run")
-    parser.add_argument("--particles", type=_positive, default=10_000)
+    parser.add_argument("--particles", type=positive, default=10_000)
     parser.add_argument("--share", type=_share, default=1.0, help="end every run earlier")
     parser.add_argument("--json", type=Path, help="write all figures to this file")
     parser.add_argument("--document", type=Path, help="write the tables between its marks")

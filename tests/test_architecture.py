@@ -148,7 +148,7 @@ def test_nodes_do_not_import_one_another(package: str) -> None:
 
 
 CORE = ("estimation/engine", "estimation/mixture/epoch", "tracking/estimates", "tracking/models")
-CORE += ("tracking/config", "tracking/smoothing", "tracking/sector_bank")
+CORE += ("tracking/config", "tracking/smoothing", "estimation/mixture/sectors")
 
 
 @pytest.mark.parametrize("name", CORE)

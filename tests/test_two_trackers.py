@@ -14,8 +14,8 @@ from graph import LATCHED, Graph, wait_until
 from nav_msgs.msg import Odometry
 from netpos.bags import BagReader
 from netpos.messages.values import RsuInfo
+from netpos_msgs.msg import ClockState, RsuMeasurement, TrackStatus
 from netpos_msgs.msg import RsuInfo as RsuInfoMessage
-from netpos_msgs.msg import RsuMeasurement
 from netpos_node import CODEC
 from runs import ESTIMATES, assert_same, graphs, netpos
 
@@ -43,10 +43,13 @@ def test_two_trackers_of_one_name_of_a_device(graph: Graph, tmp_path: Path) -> N
     found = {
         site: graph.collect(f"/{site}/vue_1/odometry", Odometry) for site in ("site_a", "site_b")
     }
+    for topic, kind in (("clock_state", ClockState), ("track_status", TrackStatus)):
+        graph.collect(f"/site_b/vue_1/{topic}", kind)  # as the recorder does at site_a
     trackers = [
         start(graph, "ekf_tracker", "ekf_tracker", *ns, "-p", "subscribers:=1"),
         start(graph, "ekf_tracker", "ekf_tracker", "--ros-args", "-r", "__ns:=/site_b",
-              "-r", "rsu/measurements:=uwb/ranges", "-p", "base_frame:='b/{vue}'"),
+              "-r", "rsu/measurements:=uwb/ranges", "-p", "base_frame:='b/{vue}'",
+              "-p", "subscribers:=1"),
     ]  # fmt: skip
     told = graph.collect("/diagnostics", DiagnosticArray)
     measured = {}

@@ -14,7 +14,7 @@ from netpos.estimation.compile import kernel, leaf, spliced
 from netpos.estimation.conditioning import Robust, RobustOptions
 from netpos.estimation.forms import choice
 from netpos.estimation.forms.table import FORMS
-from netpos.estimation.manoeuvre import detection_delay_s, manoeuvre_moments
+from netpos.estimation.manoeuvre import detection_delay_s
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS, Parameter
 from netpos.estimation.state import X
@@ -41,6 +41,7 @@ class FilterOptions(NamedTuple):
     integrity_risk: float  # share of errors that may exceed the protection level
     robust: RobustOptions
     models: int  # motion models that interact; 1: none
+    sector_slip: float  # least probability of a sector of a phase; 0: they are no components
     of_form: Array  # what the form has of its own (``FilterForm.parameters``)
     gate_nis: Array  # (GATE_SIZE,) largest accepted NIS for 0, 1, ... degrees of freedom
 
@@ -198,15 +199,6 @@ def manoeuvre_s(
         return unheard_s
     typical_s, _ = detection_delay_s(mean, cov, rows, height_m, gate, speed, h)
     return max(unheard_s, typical_s if math.isfinite(typical_s) else 0.0)
-
-
-@kernel
-def inflate_for_manoeuvre(cov_or_sqrt: Array, within_s: float, options: FilterOptions) -> None:
-    """Add, in place, a velocity step of the manoeuvre speed at any time of the last ``within_s``
-    seconds."""
-    speed = options.manoeuvre_speed_sd
-    time_s, position_sd = manoeuvre_moments(speed, within_s)
-    choice.add_velocity_step(options.filter, speed, time_s, position_sd, cov_or_sqrt)
 
 
 @leaf

@@ -2,18 +2,16 @@
 it.
 
 The Gaussian part is exact (``protection_level``). What the covariance cannot know comes on top:
-an optimistic filter (``NisWindow``) and a manoeuvre not yet noticed (``manoeuvre_level``).
+an optimistic filter (``nis_window``) and a manoeuvre not yet noticed (``manoeuvre_level``).
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import NamedTuple
 
 import numpy as np
 
-from netpos.estimation.chi_square import chi_square_bound
 from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.engine import FilterOptions
 from netpos.estimation.factor import eigenvalues
@@ -29,7 +27,6 @@ _COS2 = np.cos(np.linspace(0.0, np.pi / 2, _ANGLES + 1)) ** 2
 _WEIGHT = np.append(np.append(0.5, np.ones(_ANGLES - 1)), 0.5) / _ANGLES
 _ITERATIONS = 20
 _NEGLIGIBLE = 40.0  # exponent of a term too small for the sum's digits
-_WINDOW, _CONFIDENCE = 50, 0.999  # of the NIS: epochs, and that the covariance stands
 RISK_MIN, RISK_MAX = 1e-15, 0.5
 
 
@@ -149,66 +146,6 @@ def radius_of(cov2: Array, risk: float) -> float:
     if math.isfinite(xx + yy) and min(xx, yy) >= 0.0 and xy * xy <= xx * yy * (1.0 + 1e-9):
         return float(gaussian_radius(xx, xy, yy, risk))
     return math.nan
-
-
-class NisWindow:
-    """Factor on the sd from the NIS of the last epochs.
-
-    While their sum is below its chi-square bound the covariance stands and the factor is 1. Above
-    it the covariance is called too small, and the factor is sqrt(sum of NIS / sum of dof), the
-    scale factor of Birge (1932) as used by the Particle Data Group. The NIS of accepted groups is
-    cut off by the gate: pass the NIS of all groups, refused ones capped at the gate's threshold,
-    or the factor sees nothing of what matters.
-    """
-
-    def __init__(self, epochs: int = _WINDOW, confidence: float = _CONFIDENCE) -> None:
-        if epochs < 1:
-            raise ValueError(f"epochs must be >= 1, got {epochs}")
-        if not 0.5 <= confidence < 1.0:
-            raise ValueError(f"confidence must be in [0.5, 1), got {confidence}")
-        self._tail = 1.0 - confidence
-        self._nis: deque[float] = deque(maxlen=epochs)
-        self._dofs: deque[int] = deque(maxlen=epochs)
-        self._dof = 0
-
-    def add(self, nis: float, dof: int) -> None:
-        """Take the NIS of one epoch; one without measurements (``dof`` 0) says nothing."""
-        if dof > 0:
-            if len(self._dofs) == self._dofs.maxlen:
-                self._dof -= self._dofs[0]
-            self._dof += dof
-            self._nis.append(nis)
-            self._dofs.append(dof)
-
-    def inflation(self) -> float:
-        """Factor on the sd, >= 1."""
-        dof, nis = self._dof, sum(self._nis)
-        if dof == 0 or nis <= chi_square_bound(dof, self._tail):
-            return 1.0
-        return math.sqrt(nis / dof)
-
-    @staticmethod
-    def of_run(nis: Array, dof: Array) -> Array:
-        """Factor on the sd (N,) after each of the epochs of a run, of their NIS (N,) and its
-        degrees of freedom (N,)."""
-        heard = dof > 0
-        sums = np.cumsum([nis[heard], dof[heard]], axis=1)
-        sums[:, _WINDOW:] = sums[:, _WINDOW:] - sums[:, :-_WINDOW]
-        total, rows = sums[0], np.rint(sums[1]).astype(int)
-        numbers, index = np.unique(rows, return_inverse=True)
-        tail = 1.0 - _CONFIDENCE
-        bounds = np.array([chi_square_bound(int(n), tail) for n in numbers])
-        factor = np.ones(total.size)
-        large = total > bounds[index]
-        factor[large] = np.sqrt(total[large] / rows[large])
-        return np.append(1.0, factor)[np.cumsum(heard)]
-
-    def copy(self) -> NisWindow:
-        """An independent copy: a track that goes back in time goes back to it."""
-        twin = NisWindow.__new__(NisWindow)
-        twin._tail, twin._dof = self._tail, self._dof
-        twin._nis, twin._dofs = self._nis.copy(), self._dofs.copy()
-        return twin
 
 
 Scratch = tuple[Array, Array, Array, Array]

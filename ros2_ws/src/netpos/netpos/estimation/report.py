@@ -10,9 +10,9 @@ from netpos.estimation.engine import GATE_SIZE, Epochs, FilterOptions, Run
 from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.motion import Parameter
+from netpos.estimation.nis_window import NisWindow
 from netpos.estimation.protection import (
     FusedEpoch,
-    NisWindow,
     gaussian_radius,
     level_in,
     level_scratch,

@@ -15,7 +15,6 @@ SLOT_S = 0.2
 NS = 1e9
 LOSSES = ("track_lost", "diverged")
 STAYS = (TrackState.INITIALISING, TrackState.COASTING, TrackState.AMBIGUOUS)
-EVENTS = (*LOSSES, "sector_corrected")  # counted among the rejections, but no measurements
 
 
 def ready_stamps(estimate: Trajectory, statuses: Iterable[TrackStatus]) -> Stamps:
@@ -87,7 +86,7 @@ def refusals(last: TrackStatus) -> tuple[int, int]:
     refused = sum(
         number
         for reason, number in last.rejected.items()
-        if reason not in EVENTS and not reason.startswith("imu_")
+        if reason not in LOSSES and not reason.startswith("imu_")
     )
     return refused, last.accepted + refused
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from netpos.evaluation.availability import EVENTS
+from netpos.evaluation.availability import LOSSES
 from netpos.evaluation.consistency import MeanTest, nis_test
 from netpos.evaluation.pairing import ClockOffsets, Trajectory
 from netpos.evaluation.residuals import Residuals, Series, newest, series_of, summary
@@ -192,9 +192,9 @@ def _suggestions(
         yield f"no RsuInfo of {', '.join(unknown)}: what they measured was not used"
     if not figures.estimates:
         yield "no estimate at all: see what is rejected, and track_status.reason"
-    total = figures.accepted + sum(n for r, n in figures.rejected.items() if r not in EVENTS)
+    total = figures.accepted + sum(n for r, n in figures.rejected.items() if r not in LOSSES)
     for reason, count in sorted(figures.rejected.items(), key=lambda item: -item[1]):
-        if reason not in EVENTS and total and count / total > _TOO_FAR:
+        if reason not in LOSSES and total and count / total > _TOO_FAR:
             yield f"{100 * count / total:.0f} % of the measurements rejected: {reason}"
     remedy = "" if learns else ": correct it, declare its bias sd, or set learn_errors"
     for quantity in sorted({row.quantity for row in figures.residuals}):

@@ -31,7 +31,7 @@ FUSION_FACT = "fusion"
 
 
 # Parameters of earlier versions, and the value at which a tracker did what it does now.
-_REMOVED = {"backend": "compiled"}
+_REMOVED = {"backend": "compiled", "sector_probability": 0.999}
 
 
 @dataclass(frozen=True, slots=True)

@@ -176,11 +176,8 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
     ambiguity: str = choice(
         "hypotheses",
         AMBIGUITY,
-        "how the sector of a phase difference is found: hypotheses (a weighted filter per sector)"
+        "how the sector of a phase difference is found: hypotheses (a component per sector)"
         " | step_heading (petukhov:eq.16-18, once per first fix)",
-    )
-    sector_probability: float = real(
-        0.999, 0.5, 1.0 - 1e-9, "hypotheses: TRACKING once a sector is this probable"
     )
     sector_slip_probability: float = real(
         1e-6, 1e-12, 1e-2, "hypotheses: least probability of a sector, so that a rival can return"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
 from netpos.estimation import engine
@@ -14,6 +12,7 @@ from netpos.estimation.mixture import epoch as mixtures
 from netpos.estimation.mixture.epoch import Dynamics
 from netpos.estimation.mixture.gaussians import Mixture, mode_of, moments, one_component
 from netpos.estimation.mixture.paths import paths_are_open
+from netpos.estimation.mixture.sectors import phase_place
 from netpos.estimation.motion import NO_BIAS, Parameter
 from netpos.estimation.protection import mixture_radius
 from netpos.estimation.state import N_CORE, X
@@ -29,90 +28,20 @@ from netpos.tracking.models import (
 )
 
 
-class Estimate(Protocol):
-    """What a track needs of a filter. ``bias`` (2, k): sd and time constant of the bias states."""
-
-    stamp_ns: int
-
-    @property
-    def mean(self) -> Array:
-        """State (n,)."""
-
-    @property
-    def cov(self) -> Array:
-        """Covariance (n, n)."""
-
-    def augment(self, sd: Array) -> None:
-        """Append independent states of mean 0 until there are 6 + len(sd)."""
-
-    def set_imu_increment(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
-        """Set what the IMU integrated since ``stamp_ns``, and how good its yaw rate was."""
-
-    def set_process_noise(self, accel_density: float) -> None:
-        """Set the density of the white acceleration [m/s^2/sqrt(Hz)] from ``stamp_ns`` on."""
-
-    def change_prior(self, index: int, before: float, after: float) -> None:
-        """Take the bias state ``index``, whose prior had the sd ``before``, for one of sd
-        ``after``; nothing happens to several mixtures."""
-
-    def predict(self, stamp_ns: int, bias: Array) -> None:
-        """Move to ``stamp_ns``."""
-
-    def step(
-        self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
-    ) -> tuple[float, int, Array]:
-        """Move to ``stamp_ns`` and apply one epoch: NIS, its degrees of freedom and, per group,
-        whether it was accepted. ``prior`` holds the prediction afterwards."""
-
-    @property
-    def prior(self) -> tuple[Array, Array]:
-        """Mean and covariance predicted in the last ``step``."""
-
-    @property
-    def modes(self) -> tuple[TrackMode, ...]:
-        """Where the device may be while that is not decided, the most probable place first; none
-        where it is."""
-
-    def radius(self, level_m: float) -> float:
-        """Radius [m] round ``mean`` that holds ``level_m``, the level of the Gaussian, and all
-        other places where the device may be."""
-
-    @property
-    def motion(self) -> Array:
-        """(Parameter,) of the last step; of no use to a smoother for interacting models."""
-
-    def copy(self) -> Estimate:
-        """An independent copy."""
-
-
-class OneModel:
-    """The motion model of a filter that has one."""
-
-    _motion: Array  # (Parameter,)
-
-    @property
-    def motion(self) -> Array:
-        return self._motion
-
-    def set_imu_increment(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
-        self._motion[Parameter.YAW_INCREMENT] = yaw_rad
-        self._motion[Parameter.SPEED_INCREMENT] = speed_mps
-        self._motion[Parameter.GYRO] = gyro_density
-
-    def set_process_noise(self, accel_density: float) -> None:
-        self._motion[Parameter.ACCEL] = accel_density
-
-
-class KalmanEstimate(OneModel):
+class Estimate:
     """One component in the compiled engine, or a mixture of them: while one does not explain the
-    measurements, or where several motion models interact (``estimation.mixture``)."""
+    measurements, or where several motion models interact (``estimation.mixture``). It moves and is
+    updated in the order of stamps; ``bias`` (2, k): sd and time constant of the bias states."""
+
+    mean: Array
+    """State (n,)."""
 
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
         self.stamp_ns = self._turn_ns = stamp_ns
         self._options = options_of(config)
         self._factored = not form_of(config.filter).carries_cov
         self._dynamics = dynamics_of(config, NO_BIAS)
-        self._motion = self._dynamics.motions[0]
+        self._motion: Array = self._dynamics.motions[0]
         self._components: Mixture | None = None  # replaced, never changed; None: one component
         self._prior: tuple[Array, Array] | None = None  # of a mixture
         self._modes: tuple[TrackMode, ...] | None = ()  # None: not yet asked for
@@ -122,6 +51,21 @@ class KalmanEstimate(OneModel):
             self._components = mixtures.a_component_each(mean, cov, self._dynamics)
         self._rows = 0
         self._make_room(4)
+
+    @property
+    def motion(self) -> Array:
+        """(Parameter,) of the last step; of no use to a smoother for interacting models."""
+        return self._motion
+
+    def set_imu_increment(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
+        """Set what the IMU integrated since ``stamp_ns``, and how good its yaw rate was."""
+        self._motion[Parameter.YAW_INCREMENT] = yaw_rad
+        self._motion[Parameter.SPEED_INCREMENT] = speed_mps
+        self._motion[Parameter.GYRO] = gyro_density
+
+    def set_process_noise(self, accel_density: float) -> None:
+        """Set the density of the white acceleration [m/s^2/sqrt(Hz)] from ``stamp_ns`` on."""
+        self._motion[Parameter.ACCEL] = accel_density
 
     def set_config(self, config: TrackerConfig) -> None:
         """Go on with other live parameters (``live_parameters``)."""
@@ -143,6 +87,7 @@ class KalmanEstimate(OneModel):
 
     @property
     def cov(self) -> Array:
+        """Covariance (n, n)."""
         return (
             engine.to_cov(self._cov_or_sqrt, self._options)
             if self._factored
@@ -151,6 +96,7 @@ class KalmanEstimate(OneModel):
 
     @property
     def prior(self) -> tuple[Array, Array]:
+        """Mean and covariance predicted in the last ``step``."""
         return self._prior or self._prior_of_one()
 
     def _prior_of_one(self) -> tuple[Array, Array]:
@@ -166,15 +112,22 @@ class KalmanEstimate(OneModel):
         self._modes = () if self._components is None else None
 
     @property
+    def components(self) -> Mixture:
+        """The components that the estimate has."""
+        return self._components or one_component(self.mean, self.cov)
+
+    @property
     def modes(self) -> tuple[TrackMode, ...]:
-        """Modes that carry more than the integrity risk, the most probable first; none where it is
-        only one."""
+        """Where the device may be while that is not decided: modes that carry more than the
+        integrity risk, the most probable first; none where it is only one."""
         if self._modes is None:
             assert self._components is not None
             self._modes = modes_of(self._components, self._options.integrity_risk)
         return self._modes
 
     def radius(self, level_m: float) -> float:
+        """Radius [m] round ``mean`` that holds ``level_m``, the level of the Gaussian, and all
+        other places where the device may be."""
         if self._components is None:
             return level_m
         risk = self._options.integrity_risk
@@ -186,6 +139,7 @@ class KalmanEstimate(OneModel):
         self._set(mixture)
 
     def augment(self, sd: Array) -> None:
+        """Append independent states of mean 0 until there are 6 + len(sd)."""
         if self.mean.size >= N_CORE + sd.size:
             return
         if self._components is not None:
@@ -196,12 +150,15 @@ class KalmanEstimate(OneModel):
         self._make_room(self._rows)
 
     def change_prior(self, index: int, before: float, after: float) -> None:
+        """Take the bias state ``index``, whose prior had the sd ``before``, for one of sd
+        ``after``; nothing happens to several components."""
         if self._components is None:
             cov = self.cov.copy()
             change_prior(self.mean, cov, index, before, after)
             self._cov_or_sqrt = engine.to_cov_or_sqrt(cov, self._options)
 
     def predict(self, stamp_ns: int, bias: Array) -> None:
+        """Move to ``stamp_ns``."""
         dt = (stamp_ns - self.stamp_ns) * 1e-9
         self.stamp_ns = stamp_ns
         if self._components is None:
@@ -212,6 +169,8 @@ class KalmanEstimate(OneModel):
     def step(
         self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
     ) -> tuple[float, int, Array]:
+        """Move to ``stamp_ns`` and apply one epoch: NIS, its degrees of freedom and, per group,
+        whether it was accepted. ``prior`` holds the prediction afterwards."""
         if len(rows) > self._rows:
             self._make_room(len(rows))
         dt_s = (stamp_ns - self.stamp_ns) * 1e-9
@@ -221,8 +180,7 @@ class KalmanEstimate(OneModel):
         )
         motion, options, groups = self._motion, self._options, int(rows.item(-1, GROUP)) + 1
         since_turn_s = (stamp_ns - self._turn_ns) * 1e-9
-        coasted = self._components is None and dt_s > options.coast_after_s
-        if coasted and mixtures.is_too_wide(self.mean, self.cov, epoch, self._with(bias), options):
+        if self._components is None and self._is_split_by(epoch, bias):
             self._components = one_component(self.mean, self.cov)
         if self._components is None:
             raw = rows.copy() if self._paths_may_be_blocked else rows
@@ -246,6 +204,17 @@ class KalmanEstimate(OneModel):
             self._turn_ns = stamp_ns
         return found.nis, found.used, accepted[:groups]
 
+    def _is_split_by(self, epoch: EpochInput, bias: Array) -> bool:
+        """Whether an epoch makes several components of the one: it has an ambiguous phase, or a
+        range after a silence."""
+        options = self._options
+        if options.sector_slip > 0.0 and phase_place(epoch.rows) >= 0:
+            return True
+        if epoch.dt_s <= options.coast_after_s:
+            return False
+        split: bool = mixtures.is_too_wide(self.mean, self.cov, epoch, self._with(bias), options)
+        return split
+
     def _explains(
         self, result: StepResult, raw: Array, epoch: EpochInput, since_turn_s: float
     ) -> bool:
@@ -260,8 +229,9 @@ class KalmanEstimate(OneModel):
             return True
         return not paths_are_open(*self._prior_of_one(), raw, options)
 
-    def copy(self) -> KalmanEstimate:
-        twin = KalmanEstimate.__new__(KalmanEstimate)
+    def copy(self) -> Estimate:
+        """An independent copy."""
+        twin = Estimate.__new__(Estimate)
         twin.__dict__.update(self.__dict__)
         twin.mean, twin._cov_or_sqrt = self.mean.copy(), self._cov_or_sqrt.copy()
         twin._dynamics = self._dynamics._replace(motions=self._dynamics.motions.copy())
@@ -293,7 +263,10 @@ def change_prior(mean: Array, cov: Array, index: int, before: float, after: floa
 def modes_of(mixture: Mixture, risk: float) -> tuple[TrackMode, ...]:
     """Modes of a mixture that carry more than ``risk``, the most probable first; none where it is
     only one."""
-    weights, mode = np.exp(mixture.log_weights), mode_of(mixture)
+    weights = np.exp(mixture.log_weights)
+    if weights.max() >= 1.0 - risk:
+        return ()
+    mode = mode_of(mixture)
     sums = np.bincount(mode, weights)
     x, y = (np.bincount(mode, weights * mixture.means[:, a]) / sums for a in (X.PX, X.PY))
     modes = tuple(
@@ -307,14 +280,14 @@ def modes_of(mixture: Mixture, risk: float) -> tuple[TrackMode, ...]:
 def start(config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> Estimate:
     """Estimate of the chosen filter from mean and covariance at ``stamp_ns``, as ``start_state``
     takes them."""
-    return KalmanEstimate(config, stamp_ns, mean, cov)
+    return Estimate(config, stamp_ns, mean, cov)
 
 
 def start_from(config: TrackerConfig, stamp_ns: int, mixture: Mixture) -> Estimate:
     """As ``start``, from the components of a first fix; from their moments where the estimate is
     one Gaussian."""
     estimate = start(config, stamp_ns, *moments(mixture))
-    if isinstance(estimate, KalmanEstimate) and carries_modes(config):
+    if mixture.log_weights.size > 1 and carries_modes(config):
         pairs = zip(mixture.means, mixture.covs, strict=True)
         states = [start_state(config, mean, cov) for mean, cov in pairs]
         means, covs = np.array([mean for mean, _ in states]), np.array([cov for _, cov in states])

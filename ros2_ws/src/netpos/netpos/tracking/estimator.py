@@ -70,7 +70,6 @@ class UpdateResult(NamedTuple):
     undetected_m : how far [m] a manoeuvre that nothing has shown may have taken the device
     sound : whether the posterior can be that of a device
     breaks : times a smoother cannot reach across this epoch
-    sectors_corrected : decisions about the sector of a phase that were replaced
     """
 
     nis: float
@@ -80,7 +79,6 @@ class UpdateResult(NamedTuple):
     undetected_m: float = 0.0
     sound: bool = True
     breaks: int = 0
-    sectors_corrected: int = 0
 
 
 class Description(NamedTuple):
@@ -144,11 +142,6 @@ class Estimator(ABC):
     def set_config(self, config: TrackerConfig) -> None:
         """Go on with other live parameters; a first fix under way keeps those it began with."""
         self._config = config
-
-    @property
-    def is_by_sectors(self) -> bool:
-        """Whether the estimate is a bank of filters, one for each sector of a phase."""
-        return False
 
     @property
     @abstractmethod

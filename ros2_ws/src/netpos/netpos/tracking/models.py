@@ -40,6 +40,7 @@ def options_of(config: TrackerConfig) -> FilterOptions:
         integrity_risk=float(config.integrity_risk),
         robust=robust_options_of(config),
         models=max(len(config.motion_models), 1),
+        sector_slip=float(config.sector_slip_probability) if by_sectors(config) else 0.0,
         of_form=np.array([float(getattr(config, name)) for name in form.parameters]),
         gate_nis=gate_thresholds(config.gate_probability),
     )
@@ -105,7 +106,7 @@ def carries_modes(config: TrackerConfig) -> bool:
 
 
 def by_sectors(config: TrackerConfig) -> bool:
-    """Whether phase differences are resolved by a bank of filters."""
+    """Whether every sector of a phase difference is a component."""
     single = len(config.motion_models) == 1 and heading_index(config) < 0
     return config.ambiguity == "hypotheses" and single
 

@@ -8,15 +8,22 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from netpos.estimation.measurement import AXES, ORIGIN, VALUE, VARIANCE
+from netpos.estimation.measurement import AXES, BIAS, COMMON, GROUP, ORIGIN, VALUE, VARIANCE
+from netpos.estimation.mixture.sectors import phase_place, sectors_of_fix
+from netpos.estimation.motion import NO_BIAS
+from netpos.estimation.phase_fix import TWO_PI, init_hypothesis, phase_scale
 from netpos.messages.values import Array, Velocity
 from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import EpochRows
 from netpos.tracking.estimates import Estimate
-from netpos.tracking.models import by_sectors, heading_index, pose_state, start_state
-from netpos.tracking.phase_fix import TWO_PI, init_hypothesis, phase_scale
-from netpos.tracking.sectors import PhaseAmbiguityBank, phase_place
+from netpos.tracking.models import (
+    by_sectors,
+    heading_index,
+    options_of,
+    pose_state,
+    start_state,
+)
 from netpos.tracking.step_heading import choose_sector
 
 _WALKING_MPS = 0.1  # a step velocity below this is none
@@ -70,7 +77,7 @@ class PhaseStart:
         at = phase_place(rows)
         start = pose_state(self.config, np.zeros(2), np.eye(2))
         if not self._by_heading:
-            return PhaseAmbiguityBank.begin(self.config, stamp_ns, rows, at, start)
+            return self._by_sectors(stamp_ns, rows, at, start)
         turns = self._turns(rows, at)
         self._epochs.append((stamp_ns, float(rows[at - 1, VALUE]), float(rows[at, VALUE])))
         if turns is None:
@@ -80,6 +87,23 @@ class PhaseStart:
         if init_hypothesis(mean, cov, rows[at - 1], rows[at], turns, speed, height) == -math.inf:
             return None
         return estimates.start(self.config, stamp_ns, mean, cov)
+
+    def _by_sectors(
+        self, stamp_ns: int, rows: Array, at: int, start: tuple[Array, Array]
+    ) -> Estimate | None:
+        """An estimate with a component in every sector of the phase ``rows[at]``, to which the
+        other measurements are applied; None where range and phase have no place."""
+        mean, cov = start_state(self.config, *start)
+        fix = sectors_of_fix(mean, cov, rows, at, options_of(self.config))
+        if not fix.log_weights.size:
+            return None
+        estimate = estimates.start_from(self.config, stamp_ns, fix)
+        rest = rows[rows[:, GROUP] != rows[at, GROUP]].copy()
+        if len(rest):
+            rest[:, GROUP] = np.unique(rest[:, GROUP], return_inverse=True)[1]
+            rest[:, BIAS] = rest[:, COMMON] = -1  # no states yet
+            estimate.step(stamp_ns, 0.0, 0, rest, NO_BIAS)
+        return estimate
 
     def _turns(self, rows: Array, at: int) -> int | None:
         """Turns of the phase ``rows[at]`` by the rule on the step that has just ended."""
@@ -103,23 +127,3 @@ class PhaseStart:
             return None
         continuous = np.unwrap(np.append(phases, phase[VALUE]))
         return choice.chosen + round(float(continuous[-1] - phase[VALUE]) / TWO_PI)
-
-
-def with_sectors(config: TrackerConfig, estimate: Estimate | None, rows: Array) -> Estimate:
-    """The estimate there is as a bank where ``rows`` hold a phase that it has not met before."""
-    assert estimate is not None
-    if isinstance(estimate, PhaseAmbiguityBank) or not by_sectors(config):
-        return estimate
-    at = phase_place(rows)
-    if at < 0:
-        return estimate
-    mean, cov = estimate.mean, estimate.cov
-    return PhaseAmbiguityBank.promote(config, estimate.stamp_ns, mean, cov, rows, at)
-
-
-def corrections(estimate: Estimate) -> int:
-    """How often a decision about the sector was replaced since last asked."""
-    if not isinstance(estimate, PhaseAmbiguityBank) or not estimate.corrected:
-        return 0
-    corrected, estimate.corrected = estimate.corrected, 0
-    return corrected

@@ -27,7 +27,7 @@ from netpos.tracking import estimates, output
 from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import EpochRows, Source, planar_form
-from netpos.tracking.estimates import Estimate, KalmanEstimate
+from netpos.tracking.estimates import Estimate
 from netpos.tracking.estimator import (
     Description,
     Estimator,
@@ -49,7 +49,7 @@ from netpos.tracking.models import (
     slow_states,
 )
 from netpos.tracking.networks.secondary import OwnNoise, Secondary
-from netpos.tracking.phase_start import PhaseStart, corrections, with_sectors
+from netpos.tracking.phase_start import PhaseStart
 from netpos.tracking.rsus import Rsu
 from netpos.tracking.shared_errors import SharedErrors
 from netpos.tracking.smoothing import Posterior, PosteriorRecorder
@@ -110,12 +110,8 @@ class PlanarEstimator(Estimator):
         self._options = options_of(config)
         self._phase_start.config = config
         self._process_noise.set_config(config)
-        if isinstance(self.estimate, KalmanEstimate):
+        if self.estimate is not None:
             self.estimate.set_config(config)
-
-    @property
-    def is_by_sectors(self) -> bool:
-        return self.estimate is not None and not isinstance(self.estimate, KalmanEstimate)
 
     def copy(self) -> Self:
         twin = super().copy()
@@ -220,21 +216,19 @@ class PlanarEstimator(Estimator):
 
     def update(self, stamp_ns: int, epoch_rows: EpochRows, past: Past) -> UpdateResult:
         rows, unheard_s = epoch_rows.rows, past.unheard_s
-        self.estimate = with_sectors(self._config, self.estimate, rows)
         estimate = self._prepared(stamp_ns, epoch_rows.items)
         was_ambiguous = bool(estimate.modes)
         nis, dof, flags = estimate.step(stamp_ns, unheard_s, past.rejected_in_row, rows, self.bias)
         if self._secondary is not None:
             self._own = self._secondary.after(self._own, stamp_ns, estimate, rows, self.bias)
-        corrected = corrections(estimate)
         # a smoother does not reach across: what it keeps is one Gaussian
-        breaks = corrected + (bool(estimate.modes) != was_ambiguous)
+        breaks = int(bool(estimate.modes) != was_ambiguous)
         innovations = np.empty((len(rows), 2))
         fused = FusedEpoch(*estimate.prior, rows, flags, unheard_s, estimate.mean)
         undetected_m = self._undetected_m(fused, innovations, stamp_ns, past.recent)
         sound, accepted = not math.isnan(undetected_m), flags.tolist()
         fit = nis, dof, accepted, innovations
-        return UpdateResult(*fit, undetected_m, sound, breaks, corrected)
+        return UpdateResult(*fit, undetected_m, sound, breaks)
 
     def _undetected_m(
         self, fused: FusedEpoch, innovations: Array, stamp_ns: int, recent: Recent

@@ -6,7 +6,7 @@ from collections import defaultdict
 from dataclasses import dataclass, field, fields, replace
 from operator import attrgetter
 
-from netpos.estimation.protection import NisWindow
+from netpos.estimation.nis_window import NisWindow
 from netpos.tracking.estimator import Estimator, Recent
 from netpos.tracking.nlos_rate import NlosRate
 from netpos.tracking.pose_wait import PoseWait
@@ -21,7 +21,10 @@ class TrackSnapshot:
     segment: int = 0
     recent: Recent = ()
     """The newest epochs that fitted: an initial pose is weighed with them."""
-    nis_window: NisWindow = field(default_factory=NisWindow)
+    rsus_nis: NisWindow = field(default_factory=NisWindow)
+    """Of epochs with a measurement of an RSU."""
+    device_nis: NisWindow = field(default_factory=NisWindow)
+    """Of those without one: steps that agree say nothing of ranges."""
     has_clock: bool = False
     pose_wait: PoseWait = field(default_factory=PoseWait)
     rejected_in_row: int = 0
@@ -36,7 +39,8 @@ class TrackSnapshot:
         twin = TrackSnapshot(*_values(self))
         twin.estimator = self.estimator.copy()
         twin.nlos_rate = self.nlos_rate.copy()
-        twin.nis_window = self.nis_window.copy()
+        twin.rsus_nis = self.rsus_nis.copy()
+        twin.device_nis = self.device_nis.copy()
         twin.pose_wait = replace(self.pose_wait)
         twin.rejected = self.rejected.copy()
         twin.velocity_ns = self.velocity_ns.copy()

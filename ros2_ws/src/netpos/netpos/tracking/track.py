@@ -68,11 +68,6 @@ class Track:
         estimator = _estimator_of(vue_id, config, rsus, shared)
         self._state = TrackSnapshot(estimator, NlosRate.of(config))
 
-    @property
-    def is_by_sectors(self) -> bool:
-        """Whether the estimate is a bank of filters, one for each sector of a phase."""
-        return self._state.estimator.is_by_sectors
-
     def set_config(self, config: TrackerConfig) -> None:
         """Go on with other live parameters. Epochs that are over keep what they were applied with,
         unless a measurement comes late that is older than the change."""
@@ -298,8 +293,6 @@ class Track:
         """Count what an update has rejected, and where a smoother cannot reach across."""
         state = self._state
         state.segment += result.breaks
-        if result.sectors_corrected:
-            state.rejected["sector_corrected"] += result.sectors_corrected
         if not result.sound:
             state.rejected["diverged"] += 1
         elif 0.0 in result.accepted:
@@ -311,7 +304,8 @@ class Track:
         state.undetected_m = result.undetected_m
         nis, dof = with_refused(epoch_rows, accepted, self._gate, result.nis, result.dof)
         if math.isfinite(nis):
-            state.nis_window.add(nis, dof)
+            of_rsus = any(isinstance(item, RsuMeasurement) for item in epoch_rows.items)
+            (state.rsus_nis if of_rsus else state.device_nis).add(nis, dof)
         if self._config.isolate_rsus:
             items, rows = epoch_rows.items, epoch_rows.rows
             self._health.hear(
@@ -385,7 +379,8 @@ class Track:
 
     def _level(self, stamp_ns: int, radius_m: float) -> float:
         """Protection level [m] of the estimate's Gaussian, whose error leaves ``radius_m``."""
-        state, inflation = self._state, self._state.nis_window.inflation()
+        state = self._state
+        inflation = max(state.rsus_nis.inflation(), state.device_nis.inflation())
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
         level: float = level_of(
             radius_m, inflation, state.undetected_m, self._config.manoeuvre_sd_mps, unheard_s

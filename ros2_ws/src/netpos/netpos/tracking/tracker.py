@@ -25,7 +25,7 @@ from netpos.tracking.clocks import Clocks, Stranger
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.diagnosis import Finding
 from netpos.tracking.health import HealthConfig, RsuHealth, RsuReport
-from netpos.tracking.live_parameters import LIVE_OF_ONE_MODEL, check_change
+from netpos.tracking.live_parameters import check_change
 from netpos.tracking.rate_limit import RATE, RateLimit
 from netpos.tracking.refusals import Refusals
 from netpos.tracking.register import Register
@@ -93,14 +93,7 @@ class Tracker:
 
     def check_config(self, config: TrackerConfig) -> None:
         """Raises ``ValueError`` where ``set_config`` would, and changes nothing."""
-        changed = check_change(self._config, config)
-        held = sorted(set(changed) & set(LIVE_OF_ONE_MODEL))
-        banks = [v for v, t in self._tracks.items() if t.is_by_sectors]
-        if held and banks:
-            raise ValueError(
-                f"{', '.join(held)} cannot change while {', '.join(sorted(banks))} is tracked by"
-                " sectors of a phase; reset the tracker, then set it"
-            )
+        check_change(self._config, config)
 
     def set_config(self, config: TrackerConfig) -> None:
         """Go on with other parameters, all of them from the next epoch on.

@@ -12,14 +12,14 @@ from netpos.estimation.engine import EpochInput
 from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import GROUP, VARIANCE, Kind
 from netpos.estimation.mixture import epoch as epochs
-from netpos.estimation.mixture.gaussians import Mixture, mode_of, moments, one_component
+from netpos.estimation.mixture.gaussians import Mixture, leaders, mode_of, moments, one_component
 from netpos.estimation.mixture.reduction import reduced
 from netpos.estimation.mixture.ring import RING_MERGE_COST, is_wide, split_along_ring
 from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.rows import linear_rows
 from netpos.messages.values import Array
 from netpos.tracking import TrackerConfig
-from netpos.tracking.estimates import KalmanEstimate
+from netpos.tracking.estimates import Estimate
 from netpos.tracking.models import dynamics_of, options_of
 from scipy.stats import exponnorm, multivariate_normal, norm
 
@@ -271,8 +271,9 @@ def test_modes_are_chains_of_components() -> None:
     means = np.zeros((5, 6))
     means[:, 0] = 0.0, 3.0, 6.0, 9.0, 40.0
     covs = np.tile(np.eye(6), (5, 1, 1))
-    mode = mode_of(Mixture(means, covs, np.log([0.1, 0.1, 0.1, 0.1, 0.6])))
-    assert mode.tolist() == [1, 1, 1, 1, 0]
+    parts = Mixture(means, covs, np.log([0.1, 0.05, 0.15, 0.1, 0.6]))
+    assert mode_of(parts).tolist() == [1, 1, 1, 1, 0]
+    assert leaders(parts).tolist() == [4, 2]
 
 
 # a measurement that the gate refuses
@@ -363,7 +364,7 @@ def test_every_filter_follows_a_turn_and_forgets_an_outlier(name: str) -> None:
     rng = np.random.default_rng(3)
     truth, velocity = np.array([0.0, 0.0]), np.array([4.0, 0.0])
     start = np.diag([0.04, 0.04, 0.04, 0.04, 1.0, 1.0])
-    estimate = KalmanEstimate(config, 0, np.array([0.0, 0.0, 4.0, 0.0, 0.0, 0.0]), start)
+    estimate = Estimate(config, 0, np.array([0.0, 0.0, 4.0, 0.0, 0.0, 0.0]), start)
     errors = []
     for k in range(1, 120):
         velocity = np.array([4.0, 0.0]) if k < 80 else np.array([0.0, 4.0])

@@ -10,6 +10,7 @@ import pytest
 from engine_cases import opened, start
 from netpos.estimation import engine
 from netpos.estimation.forms import ekf, srukf
+from netpos.estimation.manoeuvre import add_manoeuvre
 from netpos.estimation.measurement import GATE_VARIANCE, VARIANCE
 from netpos.estimation.motion import NO_BIAS, noise
 from netpos.estimation.rows import linear_rows
@@ -37,18 +38,13 @@ def test_opening_a_factor_is_opening_its_covariance() -> None:
 
 @pytest.mark.parametrize("within_s", [0.0, 0.1, 4.0])
 def test_a_manoeuvre_at_any_time(within_s: float) -> None:
-    """The second moments of a step at a uniform time, for covariance and factor."""
+    """The second moments of a step at a uniform time."""
     _, cov = start()
-    root = options_of(TrackerConfig(filter="srukf", manoeuvre_speed_sd_mps=3.0))
-    plain = options_of(TrackerConfig(manoeuvre_speed_sd_mps=3.0))
     nodes, weights = np.polynomial.legendre.leggauss(3)
     steps = [opened(cov, 3.0, within_s * (x + 1.0) / 2.0) for x in nodes]
     expected = sum(w / 2.0 * step for w, step in zip(weights, steps, strict=True))
-    L, P = srukf.factor(cov), cov.copy()
-    engine.inflate_for_manoeuvre(P, within_s, plain)
-    engine.inflate_for_manoeuvre(L, within_s, root)
-    np.testing.assert_allclose(P, expected, rtol=1e-12, atol=1e-14)
-    np.testing.assert_allclose(L @ L.T, expected, rtol=1e-12, atol=1e-13)
+    add_manoeuvre(3.0, within_s, cov)
+    np.testing.assert_allclose(cov, expected, rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize(("opened_sd", "turn"), [(0.0, 0.0), (5.0, 0.0), (0.0, 3.0), (5.0, 3.0)])
@@ -61,8 +57,7 @@ def test_a_smoother_is_told_of_both_steps(opened_sd: float, turn: float) -> None
     noise(np.zeros(6), 0.1, motion, NO_BIAS, noted)
     expected = opened(without, opened_sd, 1.3)
     if turn > 0.0:
-        options = options_of(TrackerConfig(manoeuvre_speed_sd_mps=turn))
-        engine.inflate_for_manoeuvre(expected, 0.7, options)
+        add_manoeuvre(turn, 0.7, expected)
     np.testing.assert_allclose(noted, expected, rtol=1e-12, atol=1e-14)
 
 

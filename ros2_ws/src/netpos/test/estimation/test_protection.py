@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import filter_rows
 import numpy as np
@@ -25,7 +24,6 @@ from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.protection import (
     RISK_MIN,
     FusedEpoch,
-    NisWindow,
     gaussian_radius,
     gaussian_tail,
     manoeuvre_level,
@@ -155,83 +153,6 @@ def test_inflation_is_a_factor() -> None:
 def test_unsound_input_is_refused(cov: Array, risk: float, inflation: float, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         protection_level(cov, risk, inflation)
-
-
-# the NIS window
-
-
-def test_window_at_its_bound() -> None:
-    """chi2.ppf(0.999, 40) = 73.402: just below it nothing, just above it the Birge ratio."""
-    bound = float(stats.chi2.ppf(0.999, 40))
-    for total, factor in ((bound - 1e-6, 1.0), (bound + 1e-6, math.sqrt(bound / 40))):
-        window = NisWindow(epochs=10)
-        for _ in range(10):
-            window.add(total / 10, 4)
-        assert window.inflation() == pytest.approx(factor)
-
-
-def test_window_forgets_and_ignores_epochs_without_measurements() -> None:
-    window = NisWindow(epochs=5)
-    for _ in range(5):
-        window.add(100.0, 4)
-    assert window.inflation() == pytest.approx(5.0)
-    for _ in range(20):
-        window.add(0.0, 0)
-    assert window.inflation() == pytest.approx(5.0)
-    copy = window.copy()
-    for _ in range(5):
-        window.add(4.0, 4)
-    assert window.inflation() == 1.0
-    assert copy.inflation() == pytest.approx(5.0)
-    assert NisWindow().inflation() == 1.0
-
-
-def test_window_forgets_the_degrees_of_freedom_with_their_nis() -> None:
-    """Epochs of different size: the sums of the last five alone."""
-    window, dofs = NisWindow(epochs=5), [2, 9, 4, 1, 7, 3, 8, 2, 6, 5]
-    for dof in dofs:
-        window.add(100.0, dof)
-    expected = math.sqrt(500.0 / sum(dofs[-5:]))
-    assert window.inflation() == pytest.approx(expected)
-    assert window.copy().inflation() == window.inflation()
-    twin = window.copy()
-    twin.add(100.0, 11)
-    assert twin.inflation() == pytest.approx(math.sqrt(500.0 / (sum(dofs[-4:]) + 11)))
-    assert window.inflation() == pytest.approx(expected)
-
-
-def test_window_finds_the_scale_and_is_quiet_where_the_filter_is_right() -> None:
-    rng = np.random.default_rng(12)
-    for scale in (1.0, 3.0):
-        window, factors = NisWindow(epochs=50), []
-        for nis in scale**2 * rng.chisquare(4, size=5000):
-            window.add(nis, 4)
-            factors.append(window.inflation())
-        if scale == 1.0:
-            assert np.mean(np.array(factors) > 1.0) < 0.004
-        else:
-            assert np.median(factors) == pytest.approx(scale, rel=0.03)
-
-
-def test_window_over_a_run() -> None:
-    """Sums of the last fifty epochs with measurements, by slices, against SciPy's bound."""
-    rng = np.random.default_rng(3)
-    dof = rng.integers(0, 7, size=300)
-    nis = np.where(dof > 0, rng.chisquare(np.maximum(dof, 1)) * rng.uniform(0.5, 2.2, 300), 0.0)
-    expected = []
-    for k in range(dof.size):
-        heard = np.flatnonzero(dof[: k + 1])[-50:]
-        total, rows = nis[heard].sum(), dof[heard].sum()
-        inflated = rows > 0 and total > stats.chi2.isf(1e-3, rows)
-        expected.append(math.sqrt(total / rows) if inflated else 1.0)
-    assert 0 < np.count_nonzero(np.array(expected) > 1.0) < dof.size
-    np.testing.assert_allclose(NisWindow.of_run(nis, dof), expected, rtol=1e-12)
-
-
-@pytest.mark.parametrize("bad", [{"epochs": 0}, {"confidence": 1.0}, {"confidence": 0.1}])
-def test_window_refuses_unsound_settings(bad: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=next(iter(bad))):
-        NisWindow(**bad)
 
 
 # manoeuvres

@@ -128,7 +128,7 @@ def test_a_loss_that_was_counted_is_one(statuses: tuple[str, dict[str, int]], lo
 
 def test_refused_measurements_are_a_share_of_all() -> None:
     """Samples of the IMU and losses are no measurements."""
-    counts = {"gate": 6, "late": 4, "imu_late": 50, "track_lost": 2, "sector_corrected": 3}
+    counts = {"gate": 6, "late": 4, "imu_late": 50, "track_lost": 2}
     assert rejected_share(status(0.0, "T", accepted=30, rejected=counts)) == pytest.approx(0.25)
     assert rejected_share(status(0.0, "T", rejected={"track_lost": 2})) is None
 

@@ -81,12 +81,20 @@ def test_every_kind_of_input_is_read(bag: Path) -> None:
     assert list(map(repr, read(bag, WithImu))) == list(map(repr, [*expected, SHAKEN]))
 
 
-@pytest.mark.parametrize(("backend", "is_read"), [("compiled", True), ("filterpy", False)])
+@pytest.mark.parametrize(
+    ("name", "value", "is_read"),
+    [
+        ("backend", "compiled", True),
+        ("backend", "filterpy", False),
+        ("sector_probability", "0.999", True),
+        ("sector_probability", "0.9", False),
+    ],
+)
 def test_a_bag_of_a_tracker_with_a_removed_parameter(
-    backend: str, is_read: bool, tmp_path: Path
+    name: str, value: str, is_read: bool, tmp_path: Path
 ) -> None:
     """Read where every tracker now does what the parameter said."""
-    told = {"tracker": f"backend: {backend}\nhold_s: 0.5\n"}
+    told = {"tracker": f"{name}: {value}\nhold_s: 0.5\n"}
     with BagWriter(tmp_path / "bag", metadata=told) as out:
         out.write("/rsu/measurements", codec().measurement_to_msg(MEASURED), 1)
     with BagReader(tmp_path / "bag") as bag:
@@ -94,7 +102,7 @@ def test_a_bag_of_a_tracker_with_a_removed_parameter(
     if is_read:
         assert TrackerConfig.from_mapping(parameters) == TrackerConfig(hold_s=0.5)
     else:
-        with pytest.raises(ValueError, match="unknown tracker parameter 'backend'"):
+        with pytest.raises(ValueError, match=f"unknown tracker parameter '{name}'"):
             TrackerConfig.from_mapping(parameters)
 
 

@@ -12,11 +12,10 @@ from netpos.estimation.measurement import GROUP
 from netpos.estimation.motion import Parameter, add_velocity_step
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.estimates import OneModel
 from netpos.tracking.models import augmented, initial_extra_sd, motions_of, options_of
 
 
-class FilterpyEstimate(OneModel):
+class FilterpyEstimate:
     """``estimates.Estimate`` of one motion model and one component; ``filter`` is ekf or ukf."""
 
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
@@ -27,6 +26,15 @@ class FilterpyEstimate(OneModel):
         self._update = getattr(reference, f"{config.filter}_update")
         self.mean, self.cov = augmented(mean, cov, initial_extra_sd(config))
         self.prior = (self.mean, self.cov)
+
+    @property
+    def motion(self) -> Array:
+        return self._motion
+
+    def set_imu_increment(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
+        self._motion[Parameter.YAW_INCREMENT] = yaw_rad
+        self._motion[Parameter.SPEED_INCREMENT] = speed_mps
+        self._motion[Parameter.GYRO] = gyro_density
 
     @property
     def modes(self) -> tuple[TrackMode, ...]:

@@ -73,6 +73,7 @@ def test_options_hold_what_the_parameters_say() -> None:
         coast_after_s=0.7,
         robust=RobustOptions(ROBUST.index("student_t"), 5.5, 0.1, 33.0),
         models=1,
+        sector_slip=1e-6,
         of_form=options.of_form,
         gate_nis=options.gate_nis,
     )

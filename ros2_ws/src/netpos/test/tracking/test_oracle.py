@@ -3,12 +3,9 @@ with the tracker at tiny settings."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -21,8 +18,8 @@ from particle_kernels import Kind, weigh
 from posterior import Cloud, Modes
 from scipy.integrate import quad
 from scipy.stats import chi2, norm
+from script_parts import loaded
 
-SCRIPT = Path(__file__).resolve().parents[5] / "scripts/oracle.py"
 RANGE_SD = 0.2
 
 
@@ -250,16 +247,6 @@ def test_twice_the_particles_change_nothing(problem: int) -> None:
     assert clouds[0].radius() == pytest.approx(clouds[1].radius(), rel=0.2)
 
 
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("oracle_script", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_the_script_compares_and_writes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -267,7 +254,7 @@ def test_the_script_compares_and_writes(
     document.write_text(f"Before.\n{BEGIN}\nold\n{END}\nAfter.\n", encoding="utf-8")
     tiny = ["--seeds", "2", "--particles", "300", "--share", "0.2", "--problem", "5"]
     out = ["--json", str(figures), "--document", str(document)]
-    assert script().main([*tiny, *out]) == 0
+    assert loaded("oracle").main([*tiny, *out]) == 0
     printed = capsys.readouterr().out
     assert f"Before.\n{BEGIN}\n{printed}{END}\nAfter.\n" == document.read_text(encoding="utf-8")
     told = json.loads(figures.read_text(encoding="utf-8"))
@@ -288,5 +275,5 @@ def test_a_page_without_marks_is_left_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize("bad", [["--problem", "7"], ["--seeds", "0"], ["--share", "2"]])
 def test_the_script_refuses_bad_usage(bad: list[str]) -> None:
     with pytest.raises(SystemExit) as stop:
-        script().main(bad)
+        loaded("oracle").main(bad)
     assert stop.value.code == 2

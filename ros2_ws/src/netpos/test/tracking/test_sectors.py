@@ -34,8 +34,7 @@ from netpos.messages.values import (
     TrackState,
 )
 from netpos.tracking import Tracker, TrackerConfig, TrackOutput
-from netpos.tracking.models import pose_state
-from netpos.tracking.sectors import PhaseAmbiguityBank
+from netpos.tracking.phase_start import PhaseStart
 
 
 def test_ambiguous_until_the_evidence_decides() -> None:
@@ -86,15 +85,20 @@ def test_a_wrong_fix_is_found_and_repaired(seed: int) -> None:
     outputs = tracked(walk, [pose])
     error = errors(walk, outputs)
     assert error[2] > 0.5
-    assert outputs[-1].status.rejected["sector_corrected"] == 1
+    assert outputs[2].status.state == TrackState.TRACKING
+    assert TrackState.AMBIGUOUS in {o.status.state for o in outputs}
     assert outputs[-1].status.state == TrackState.TRACKING
     assert error[-10:].max() < 0.15
 
 
-def test_a_right_fix_is_never_corrected() -> None:
+def test_a_right_fix_stays_in_its_sector() -> None:
     for seed in range(5):
-        outputs = tracked(Walk(np.array([-2.0, 3.0]), 0.3, 4.0, seed))
-        assert "sector_corrected" not in outputs[-1].status.rejected
+        walk = Walk(np.array([-2.0, 3.0]), 0.3, 4.0, seed)
+        outputs = tracked(walk)
+        decided = np.array([o.status.state is TrackState.TRACKING for o in outputs])
+        assert decided.mean() > 0.7
+        assert decided[-10:].all()
+        assert errors(walk, outputs)[decided].max() < 0.15
 
 
 def test_a_rough_pose_from_outside_chooses_the_sector_at_once() -> None:
@@ -132,7 +136,6 @@ def test_a_burst_of_wrong_phases_is_survived(seed: int) -> None:
 
 def test_half_a_wavelength_needs_no_decision() -> None:
     """K = 1: one sector, decided by the first measurement."""
-    config = TrackerConfig(**CONFIG)
     info = RsuInfo(
         rsu_id="anchor",
         position=np.zeros(3),
@@ -146,12 +149,10 @@ def test_half_a_wavelength_needs_no_decision() -> None:
     measured = walk.measured(0)
     measured.phase_difference_rad = math.pi * sine
     rows = rsu_rows(measured, info, rsu_axes(info), 0)
-    bank = PhaseAmbiguityBank.begin(
-        config, T0, rows, 1, pose_state(config, np.zeros(2), np.eye(2))
-    )
-    assert bank is not None
-    assert bank.decided
-    assert np.hypot(*(bank.mean[POSITION] - xy[0])) < 0.1
+    estimate = PhaseStart(TrackerConfig(**CONFIG)).add(T0, rows, np.zeros(2))
+    assert estimate is not None
+    assert estimate.modes == ()
+    assert np.hypot(*(estimate.mean[POSITION] - xy[0])) < 0.1
 
 
 STEADY = {"steady_accel_density_mps2_sqrthz": 0.05}

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 
-from netpos.estimation.compile import inlined, kernel
+from netpos.estimation.compile import inlined
 from netpos.estimation.dispatch import Kernel, choose
-from netpos.estimation.factor import factor
 from netpos.estimation.forms.form import copy_matrix
 from netpos.estimation.forms.table import FORMS
 from netpos.estimation.motion import add_velocity_step as add_to_cov
@@ -31,11 +30,6 @@ def _no_update(
     return math.nan, 0
 
 
-@kernel
-def _factorise(cov: Array, L: Array) -> None:
-    L[:] = factor(cov)
-
-
 def _chosen(name: str, otherwise: Kernel) -> Kernel:
     return choose([(k, getattr(form, name)) for k, form in enumerate(FORMS)], otherwise)
 
@@ -50,5 +44,3 @@ write_cov = _chosen("write_cov", copy_matrix)
 """``(number, cov_or_sqrt, cov)``"""
 write_cov_or_sqrt = _chosen("write_cov_or_sqrt", copy_matrix)
 """``(number, cov, cov_or_sqrt)``"""
-write_sqrt = _chosen("write_sqrt", _factorise)
-"""``(number, cov_or_sqrt, L)``"""

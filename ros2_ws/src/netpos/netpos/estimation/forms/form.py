@@ -34,14 +34,12 @@ class FilterForm:
         fused and their number. ``options`` is ``engine.FilterOptions``, ``accepted`` (groups,) is
         filled with 0 or 1, ``work`` is of ``fusion.workspace``.
 
-    The four that follow are None where the form carries the covariance itself.
+    The three that follow are None where the form carries the covariance itself.
 
     add_velocity_step : ``(sd, time_s, position_sd, cov_or_sqrt)`` as
         ``motion.add_velocity_step``
     write_cov : ``(cov_or_sqrt, cov)`` writes the covariance to cov (n, n)
     write_cov_or_sqrt : ``(cov, cov_or_sqrt)``, the other way
-    write_sqrt : ``(cov_or_sqrt, L)`` writes the lower Cholesky factor of the covariance to L
-        (n, n)
     """
 
     name: str
@@ -51,7 +49,6 @@ class FilterForm:
     add_velocity_step: Kernel | None = None
     write_cov: Kernel | None = None
     write_cov_or_sqrt: Kernel | None = None
-    write_sqrt: Kernel | None = None
     update_shared: Kernel | None = None
     """``kf.update_shared`` of a linear form, which can say what of a covariance its own rows made;
     None: the form is not linear."""

@@ -21,7 +21,7 @@ import numpy as np
 
 from netpos.estimation.compile import inlined, kernel, leaf, spliced
 from netpos.estimation.factor import factor
-from netpos.estimation.forms.form import FilterForm, copy_matrix
+from netpos.estimation.forms.form import FilterForm
 from netpos.estimation.gate import gate_groups, select_rows
 from netpos.estimation.measurement import GATE_VARIANCE, VARIANCE
 from netpos.estimation.motion import noise
@@ -214,6 +214,5 @@ FORM = FilterForm(
     add_velocity_step=add_velocity_step,
     write_cov=_write_cov,
     write_cov_or_sqrt=_write_factor,
-    write_sqrt=copy_matrix,
     summary="square root",
 )

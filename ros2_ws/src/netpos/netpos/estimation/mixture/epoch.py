@@ -27,11 +27,24 @@ from netpos.estimation.engine import (
 from netpos.estimation.forms.choice import write_cov, write_cov_or_sqrt
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.mixture import mixing
-from netpos.estimation.mixture.candidates import Update, apply, candidates, first_of
-from netpos.estimation.mixture.gaussians import Mixture, moments, one_component
+from netpos.estimation.mixture.candidates import (
+    Candidates,
+    Update,
+    apply,
+    candidates,
+    first_of,
+)
+from netpos.estimation.mixture.gaussians import Mixture, leaders, moments, one_component
 from netpos.estimation.mixture.paths import along_paths, paths_are_open, reweight_by_best
 from netpos.estimation.mixture.reduction import reduced
 from netpos.estimation.mixture.ring import any_splits, one_by_one
+from netpos.estimation.mixture.sectors import (
+    add_turns_of_phase,
+    ambiguous_phase,
+    keep_sectors,
+    most_turns,
+    reduced_by_sector,
+)
 from netpos.estimation.mixture.turns import add_explanations, may_turn, turn
 from netpos.estimation.protection import mixture_radius
 from netpos.messages.values import Array
@@ -96,35 +109,63 @@ def moved_to_epoch(
 
 
 @kernel
+def _add_candidates(
+    k: int,
+    end: int,
+    prior: Mixture,
+    epoch: EpochInput,
+    at: int,
+    options: FilterOptions,
+    found: Candidates,
+) -> int:
+    """Make the candidate ``k`` from the component ``k`` of ``prior``, and at the end one for each
+    other sector of a phase in the row ``at`` and each explanation of what is refused; the number
+    of candidates then."""
+    if at >= 0:
+        end = add_turns_of_phase(k, end, prior, epoch.rows, at, options, found)
+    else:
+        found.means[k], found.covs[k] = prior.means[k], prior.covs[k]
+        if options.models > 1:
+            mixing.open_velocity(k, epoch, options, found)
+        apply(k, prior.log_weights[k], epoch.rows, options, found)
+    if options.models > 1 and found.used[k] == 0:
+        found.covs[k] = prior.covs[k]
+    refuses = found.accepted[k].sum() < found.accepted.shape[1]
+    if refuses and options.manoeuvre_speed_sd > 0.0:
+        end = add_explanations(k, k, end, prior, epoch, options, found)
+    return int(end)
+
+
+@kernel
 def _at_once(
     prior: Mixture,
     epoch: EpochInput,
+    at: int,
     options: FilterOptions,
     since_turn_s: float,
     accepted: Array,
 ) -> Update:
-    """All measurements of the epoch, for every component of ``prior``."""
+    """All measurements of the epoch, for every component of ``prior``, in every sector of an
+    ambiguous phase in the row ``at`` (-1: there is none)."""
     rows = epoch.rows
     count, groups = prior.log_weights.size, int(rows[rows.shape[0] - 1, GROUP]) + 1
-    found = candidates(3 * count + 1, prior.means.shape[1], groups)
-    end = count
+    sectors = 2 * most_turns(rows[at]) + 1 if at >= 0 else 0
+    size = 3 * count + 1 + (sectors + 1) * (count + 1)
+    found = candidates(size, prior.means.shape[1], groups)
+    end = np.int64(count)
     for k in range(count):
-        found.means[k], found.covs[k] = prior.means[k], prior.covs[k]
-        if options.models > 1:
-            mixing.open_velocity(k, epoch, options, found)
-        apply(k, prior.log_weights[k], rows, options, found)
-        if options.models > 1 and found.used[k] == 0:
-            found.covs[k] = prior.covs[k]
-        refuses = found.accepted[k].sum() < groups
-        if refuses and options.manoeuvre_speed_sd > 0.0:
-            end = add_explanations(k, k, end, prior, epoch, options, found)
+        end = _add_candidates(k, end, prior, epoch, at, options, found)
     best = int(np.argmax(found.log_weights[:count]))
     turns = found.accepted[best, 0] == 1.0 and may_turn(
         prior.means[best], rows, since_turn_s, options
     )
     if turns:
-        turn(end, prior, best, max(since_turn_s, epoch.unheard_s), rows, options, found)
-        end += 1
+        weighed = Mixture(prior.means, prior.covs, found.log_weights[:count])
+        for k in leaders(weighed):
+            turn(end, prior, k, max(since_turn_s, epoch.unheard_s), rows, options, found)
+            end += 1
+    if at >= 0:
+        end = keep_sectors(prior, best, end, rows, at, options, found)
     best = int(np.argmax(found.log_weights[:end]))
     top = found.log_weights[best]
     if not math.isfinite(top):
@@ -133,10 +174,13 @@ def _at_once(
     accepted[:groups] = found.accepted[best]
     weights = np.exp(found.log_weights[:end] - top)
     turned = weights[found.within_s[:end] > 0.0].sum() / weights.sum()
+    merge_cost = _MERGE_SHARE * options.integrity_risk
     if options.models > 1:
         components = mixing.one_of_each(first_of(found, end))
+    elif at >= 0:
+        components = reduced_by_sector(first_of(found, end), rows, at, merge_cost, options)
     else:
-        components = reduced(first_of(found, end), _MERGE_SHARE * options.integrity_risk)
+        components = reduced(first_of(found, end), merge_cost)
     nis, used = found.nis[best], int(found.used[best])
     return Update(components, nis, used, turned, found.within_s[:end].max(), turns)
 
@@ -182,16 +226,18 @@ def apply_epoch(
     """The components, moved to the epoch already, after it; ``accepted`` (groups,) is filled with
     0 or 1. ``since_turn_s``: since the last component "it has turned" began."""
     rows, blocked = epoch.rows, options.robust.nlos_probability > 0.0
-    if options.models == 1 and any_splits(components, rows, options.height_m):
-        if blocked:
-            reweight_by_best(components, rows, options.height_m, options.robust)
-        found: Update = one_by_one(components, rows, options, accepted)
-    elif options.models == 1 and blocked:
-        found = along_paths(components, epoch, options, since_turn_s, accepted)
+    at = ambiguous_phase(rows, options)
+    one_model = options.models == 1 and at < 0
+    splits = one_model and any_splits(components, rows, options.height_m)
+    if one_model and blocked and not splits:
+        found: Update = along_paths(components, epoch, options, since_turn_s, accepted)
+        return found
+    if blocked:
+        reweight_by_best(components, rows, options.height_m, options.robust)
+    if splits:
+        found = one_by_one(components, rows, options, accepted)
     else:
-        if blocked:
-            reweight_by_best(components, rows, options.height_m, options.robust)
-        found = _at_once(components, epoch, options, since_turn_s, accepted)
+        found = _at_once(components, epoch, at, options, since_turn_s, accepted)
     return found
 
 
@@ -247,9 +293,10 @@ def _advance(
     rows, several = epoch.rows, components.log_weights.size > 1
     moved = False
     found: Update = Update(components, 0.0, 0, 0.0, 0.0, False)
-    if not several and epoch.dt_s > options.coast_after_s:
+    is_ambiguous = ambiguous_phase(rows, options) >= 0
+    if not several and (is_ambiguous or epoch.dt_s > options.coast_after_s):
         P = cov_of(S, options)
-        several = is_too_wide(x, P, epoch, dynamics, options)
+        several = is_ambiguous or is_too_wide(x, P, epoch, dynamics, options)
         if several:
             components = one_component(x, P)
     if not several and rows.shape[0] == 0:

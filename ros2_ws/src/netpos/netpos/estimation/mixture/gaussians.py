@@ -93,6 +93,17 @@ def mode_of(components: Mixture) -> Ints:
 
 
 @kernel
+def leaders(components: Mixture) -> Ints:
+    """Index of the most probable component of each mode (M,), the most probable first."""
+    modes = mode_of(components)
+    first = np.full(modes.max() + 1, -1)
+    for k in np.argsort(-components.log_weights):
+        if first[modes[k]] < 0:
+            first[modes[k]] = k
+    return first
+
+
+@kernel
 def fuse_value(mean: Array, cov: Array, h: Array, residual: float, variance: float) -> float:
     """Fuse one linearised value in place, in Joseph form; its log likelihood."""
     n = mean.size

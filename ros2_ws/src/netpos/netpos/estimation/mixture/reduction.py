@@ -12,7 +12,7 @@ from netpos.estimation.mixture.gaussians import Ints, Mixture
 from netpos.messages.values import Array
 
 _VELOCITY_END = 4  # position and velocity come first
-_LEAST_WEIGHT = 1e-8
+LEAST_WEIGHT = 1e-8
 _LEAST_PIVOT = 1e-300
 _COMPONENTS_MAX = 64
 _AT_ONCE_MAX = 256  # components that are merged at once
@@ -141,7 +141,7 @@ def reduced(components: Mixture, merge_cost: float) -> Mixture:
     means, covs, log_weights = components
     top = log_weights.max()
     logs = log_weights - (top + math.log(np.exp(log_weights - top).sum()))
-    kept = np.flatnonzero(logs > math.log(_LEAST_WEIGHT))
+    kept = np.flatnonzero(logs > math.log(LEAST_WEIGHT))
     means, covs, weights = means[kept], covs[kept], np.exp(logs[kept])
     while weights.size > _AT_ONCE_MAX:
         order, end = np.argsort(means[:, 0]), 0

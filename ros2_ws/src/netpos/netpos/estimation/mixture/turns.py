@@ -13,7 +13,7 @@ from netpos.estimation.mixture.gaussians import Mixture
 from netpos.messages.values import Array
 
 TURN_PERIOD_S = 0.25  # a component "it has turned" begins so long after the last, with one RSU
-_TURNS_HZ = 1.0 / 30.0  # how often a device turns
+TURNS_HZ = 1.0 / 30.0  # how often a device turns
 
 
 @kernel
@@ -30,7 +30,7 @@ def turn(
     the last ``within_s`` seconds."""
     found.means[k], found.covs[k] = prior.means[parent], prior.covs[parent]
     add_manoeuvre(options.manoeuvre_speed_sd, within_s, found.covs[k])
-    turns = math.log(_TURNS_HZ * within_s)
+    turns = math.log(TURNS_HZ * within_s)
     apply(k, prior.log_weights[parent] + turns, rows, options, found)
     found.within_s[k] = within_s
 

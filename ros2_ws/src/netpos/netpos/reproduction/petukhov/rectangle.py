@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from netpos.estimation.measurement import GROUP, VALUE, predict_row
 from netpos.estimation.motion import NO_BIAS
+from netpos.estimation.phase_fix import TWO_PI, init_hypothesis
 from netpos.estimation.state import POSITION
 from netpos.messages.values import Array
 from netpos.radio.noise import generator
@@ -31,12 +32,11 @@ from netpos.reproduction.petukhov.waist_chain import Settings, config_of
 from netpos.reproduction.rows import RowTemplates, observation_rows
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.schema import RectangleRoute
+from netpos.tracking import estimates
 from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimates import Estimate
-from netpos.tracking.phase_fix import TWO_PI, init_hypothesis
 from netpos.tracking.phase_start import PhaseStart
-from netpos.tracking.sectors import PhaseAmbiguityBank
 
 Ints = npt.NDArray[np.int64]
 
@@ -173,7 +173,7 @@ def _moved(config: TrackerConfig, estimate: Estimate, rows: Array) -> Estimate:
     velocity, velocity_cov = mean[moving].copy(), cov[moving, moving].copy()
     init_hypothesis(mean, cov, rows[0], phase, turns + (1 if turns <= 0 else -1), speed, height_m)
     mean[moving], cov[moving, moving] = velocity, velocity_cov
-    return PhaseAmbiguityBank.promote(config, estimate.stamp_ns, mean, cov, rows, 1)
+    return estimates.start(config, estimate.stamp_ns, mean, cov)
 
 
 def _alone(rows: Array) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from netpos.estimation.measurement import GATE_VARIANCE, VALUE, VARIANCE
+from netpos.estimation.mixture.sectors import turns_of
 from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.rows import rsu_axes, rsu_rows
 from netpos.evaluation.work import Work
@@ -27,8 +28,8 @@ from netpos.reproduction.petukhov.steps import (
 from netpos.reproduction.petukhov.waist_chain import SCENARIO, config_of
 from netpos.scenario import load_scenario
 from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
-from netpos.tracking.models import pose_state
-from netpos.tracking.sectors import PhaseAmbiguityBank
+from netpos.tracking.estimates import Estimate
+from netpos.tracking.phase_start import PhaseStart
 from netpos.tracking.step_heading import choose_sector
 from netpos.world.frames import quaternion_from_yaw
 
@@ -146,20 +147,29 @@ class Setup:
     ) -> tuple[Bools, Bools, Array]:
         right, decided = np.zeros(STEPS, dtype=bool), np.zeros(STEPS, dtype=bool)
         claimed = np.zeros(STEPS)
-        first = pose_state(self.config, np.zeros(2), np.eye(2))
-        bank = PhaseAmbiguityBank.begin(self.config, NS, rows[0], 1, first)
-        assert bank is not None
+        estimate = PhaseStart(self.config).add(NS, rows[0], np.zeros(len(rows[0])))
+        assert estimate is not None
         process_noise = AdaptiveProcessNoise(self.config)
         for k in range(1, len(rows)):
             stamp_ns = NS + round(self.times_s[k] * NS)
             density = process_noise.density(stamp_ns, [reported(stamp_ns, rows[k, 2:])])
             if density is not None:
-                bank.set_process_noise(density)
-            bank.step(stamp_ns, INTERVAL_S, 0, rows[k], NO_BIAS)
+                estimate.set_process_noise(density)
+            estimate.step(stamp_ns, INTERVAL_S, 0, rows[k], NO_BIAS)
             s = int(step[k])  # the last epoch of the step stays
-            right[s], decided[s] = bank.sector == turns[k], bank.decided
-            claimed[s] = bank.probabilities.max()
+            probable, claimed[s] = self._sector(estimate, rows[k, 1])
+            right[s], decided[s] = probable == turns[k], not estimate.modes
         return right, decided, claimed
+
+    def _sector(self, estimate: Estimate, phase: Array) -> tuple[int, float]:
+        """Turns of the most probable sector of a phase row, and its probability."""
+        means, _, log_weights = estimate.components
+        turns, place = np.unique(
+            turns_of(means, phase, self.config.device_height_m), return_inverse=True
+        )
+        weights = np.bincount(place, np.exp(log_weights))
+        best = int(np.argmax(weights))
+        return int(turns[best]), float(weights[best])
 
     def _rule(
         self,

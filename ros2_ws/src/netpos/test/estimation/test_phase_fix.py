@@ -19,10 +19,7 @@ from netpos.estimation.measurement import (
     predict_row,
 )
 from netpos.estimation.measurement import HEIGHT as ROW_HEIGHT
-from netpos.estimation.rows import rsu_axes, rsu_rows
-from netpos.estimation.state import POSITION, VELOCITY
-from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
-from netpos.tracking.phase_fix import (
+from netpos.estimation.phase_fix import (
     admissible,
     init_hypothesis,
     nearest_turns,
@@ -30,6 +27,9 @@ from netpos.tracking.phase_fix import (
     place,
     to_fix,
 )
+from netpos.estimation.rows import rsu_axes, rsu_rows
+from netpos.estimation.state import POSITION, VELOCITY
+from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from scipy.spatial.transform import Rotation
 
 HEIGHT = 1.2
