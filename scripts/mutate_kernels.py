@@ -68,7 +68,7 @@ TESTS_OF = {
         )
     },
     "engine": "test_engine_parts.py test_engine.py -knot+equals_the_tracker",
-    "tracking/fit": "test_protection.py -kinnovations_and_level+or+is_not_sound",
+    "predicted": "test_manoeuvre.py test_fit.py test_protection.py",
     "estimation/mixture/window": "../../tracking/test_initialise_fit.py",
     "tracking/output": "test_output.py",
     "phase_fix": "test_phase_fix.py",

@@ -7,21 +7,10 @@ import math
 from enum import IntEnum
 from typing import NamedTuple
 
-import numpy as np
-
 from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.fusion import group_nis
-from netpos.estimation.measurement import (
-    BLOCKED,
-    GATE_VARIANCE,
-    VALUE,
-    VARIANCE,
-    curvature_variance,
-    innovation_row,
-    innovation_variance,
-    is_range,
-    linearise,
-)
+from netpos.estimation.measurement import BLOCKED, GATE_VARIANCE, VALUE, VARIANCE, is_range
+from netpos.estimation.predicted import PredictedRows
 from netpos.estimation.robust import huber_factor, nlos_mixture_exponential, student_t_factor
 from netpos.estimation.sensors.row import group_end
 from netpos.messages.values import Array
@@ -100,36 +89,23 @@ def m_estimate(
 
 
 @kernel
-def reweight(
-    mean: Array,
-    cov: Array,
-    rows: Array,
-    height_m: float,
-    options: RobustOptions,
-    h: Array,
-) -> None:
-    """Re-weight ``rows`` (m, ROW_WIDTH) in place, as seen from the prior mean (n,), cov (n, n).
-
-    h : scratch of at least n entries
-    """
-    m = rows.shape[0]
+def reweight(cov: Array, rows: Array, predicted: PredictedRows, options: RobustOptions) -> None:
+    """Re-weight ``rows`` (m, ROW_WIDTH) in place, as ``predicted`` from a prior with cov (n, n); a
+    value that is shifted shifts its innovation."""
     if options.nlos_probability > 0.0:
-        for i in range(m):
+        for i in range(rows.shape[0]):
             row = rows[i]
             if may_be_late(row):
-                innovation = innovation_row(row, mean, height_m, h)
-                innovation_var = innovation_variance(row, mean, cov, height_m, row[VARIANCE], h)
+                known = predicted.prior_var[i] + predicted.second_order_var[i]
+                before = row[VALUE]
                 nlos_correct(
                     row,
-                    innovation,
-                    innovation_var,
+                    predicted.innovation[i],
+                    row[VARIANCE] + known,
                     options.nlos_probability,
                     options.nlos_excess_m,
                 )
-    if options.kind == Robust.NONE:
-        return
-    innovations, H = linearise(rows, mean, height_m)
-    second_order_var = np.empty(m)
-    for i in range(m):
-        second_order_var[i] = curvature_variance(rows[i], mean, cov, height_m)
-    m_estimate(cov, rows, innovations, H, second_order_var, options)
+                predicted.innovation[i] += row[VALUE] - before
+    if options.kind != Robust.NONE:
+        H = predicted.H[:, : cov.shape[0]].copy()
+        m_estimate(cov, rows, predicted.innovation, H, predicted.second_order_var, options)

@@ -17,6 +17,7 @@ from netpos.estimation.forms.table import FORMS
 from netpos.estimation.manoeuvre import detection_delay_s
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS, Parameter
+from netpos.estimation.predicted import PredictedRows, predict_rows
 from netpos.estimation.state import X
 from netpos.messages.values import Array
 
@@ -65,13 +66,16 @@ class StepResult(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of ``step``: of ``fusion.workspace``, groups accepted (groups,) and the prediction
-    (n,), (n, n)."""
+    """Memory of ``predict_epoch`` and ``update_epoch``: of ``fusion.workspace``, groups accepted
+    (groups,), the prediction (n,), (n, n), and the covariance (n, n) that the rows met: that of
+    the prediction with what ``open_velocity`` added."""
 
     work: Array
     accepted: Array
     prior_mean: Array
     prior_cov_or_sqrt: Array
+    prior_cov: Array
+    met_cov: Array
 
 
 class Epochs(NamedTuple):
@@ -86,7 +90,8 @@ class Epochs(NamedTuple):
 class Run(NamedTuple):
     """What a filter made of N epochs: means (N, n), covs (N, n, n) of the mixture; of the accepted
     rows nis (N,), dof (N,) their number and groups (N,) that of their groups; radius (N,) [m] that
-    a mixture leaves with the integrity risk, 0 where there is one component."""
+    a mixture leaves with the integrity risk, 0 where there is one component; undetected_m (N,) how
+    far a manoeuvre that an epoch does not show may have taken the device."""
 
     means: Array
     covs: Array
@@ -94,12 +99,14 @@ class Run(NamedTuple):
     dof: Array
     groups: Array
     radius: Array
+    undetected_m: Array
 
 
 @kernel
 def scratch(n: int, m: int) -> Scratch:
-    """Memory for ``step`` with ``n`` states and up to ``m`` rows."""
-    return Scratch(fusion.workspace(n, m), np.zeros(m), np.zeros(n), np.zeros((n, n)))
+    """Memory for one component with ``n`` states and up to ``m`` rows."""
+    work, square = fusion.workspace(n, m), np.zeros((3, n, n))
+    return Scratch(work, np.zeros(m), np.zeros(n), square[0], square[1], square[2])
 
 
 def to_cov_or_sqrt(cov: Array, options: FilterOptions) -> Array:
@@ -172,8 +179,8 @@ def update(
     accepted: Array,
     work: Array,
 ) -> tuple[float, int]:
-    """Gate and apply one epoch, in place: NIS of the accepted rows and their number; ``accepted``
-    (groups,) is filled."""
+    """Gate and apply one epoch, in place, the rows of which are predicted in ``work``: NIS of the
+    accepted rows and their number; ``accepted`` (groups,) is filled."""
     gate_nis = options.gate_nis
     nis, used = update_with_gate(mean, cov_or_sqrt, rows, options, gate_nis, accepted, work)
     return nis, used
@@ -186,18 +193,17 @@ def open_velocity(cov_or_sqrt: Array, sd: float, unheard_s: float, options: Filt
     choice.add_velocity_step(options.filter, sd, unheard_s, 0.0, cov_or_sqrt)
 
 
-@kernel
+@leaf
 def manoeuvre_s(
-    mean: Array, cov: Array, rows: Array, unheard_s: float, options: FilterOptions
+    cov: Array, rows: Array, predicted: PredictedRows, unheard_s: float, options: FilterOptions
 ) -> float:
-    """Time [s] in which a manoeuvre may have begun, seen from the prediction mean (n,), cov (n,
-    n): since the last accepted measurement, or for as long as it goes unnoticed. A step of the
-    velocity that its own sd allows for is followed, and no manoeuvre."""
-    h, height_m = np.empty(mean.size), options.height_m
+    """Time [s] in which a manoeuvre may have begun, seen from a prediction with cov (n, n): since
+    the last accepted measurement, or for as long as it goes unnoticed. A step of the velocity that
+    its own sd allows for is followed, and no manoeuvre."""
     speed, gate = options.manoeuvre_speed_sd, options.gate_nis[2]
     if 2.0 * speed * speed <= cov[X.VX, X.VX] + cov[X.VY, X.VY]:
         return unheard_s
-    typical_s, _ = detection_delay_s(mean, cov, rows, height_m, gate, speed, h)
+    typical_s, _ = detection_delay_s(rows, predicted, gate, speed)
     return max(unheard_s, typical_s if math.isfinite(typical_s) else 0.0)
 
 
@@ -252,7 +258,7 @@ def _count(accepted: Array, groups: int) -> int:
 
 
 @leaf
-def step(
+def predict_epoch(
     mean: Array,
     cov_or_sqrt: Array,
     epoch: EpochInput,
@@ -260,37 +266,49 @@ def step(
     bias: Array,
     options: FilterOptions,
     scratch: Scratch,
-) -> StepResult:
-    """Predict and apply one epoch to one component, in place.
+) -> None:
+    """Move one component to an epoch, in place, and see its rows from there.
 
-    After ``inflate_after`` epochs rejected in a row the velocity opens to its initial sd. Nothing
-    accepted leaves the prediction. ``scratch`` keeps the prediction, and 0 or 1 of each group in
-    ``accepted``. The robust options re-weight the rows in place. The velocity step allowed for is
-    left in ``motion`` (``set_velocity_step_noise``), for a smoother to know.
+    After ``inflate_after`` epochs rejected in a row the velocity opens to its initial sd.
+    ``scratch`` keeps the prediction without that, and the rows as the component sees them
+    (``fusion.predicted_in``).
     """
-    rows, unheard_s = epoch.rows, epoch.unheard_s
-    groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
     predict(mean, cov_or_sqrt, epoch.dt_s, motion, bias, options)
     _copy(mean, cov_or_sqrt, scratch.prior_mean, scratch.prior_cov_or_sqrt)
-    opened = epoch.rejected_in_row >= options.inflate_after
-    opened_sd = options.initial_speed_sd if opened else 0.0
-    if opened:
-        open_velocity(cov_or_sqrt, opened_sd, unheard_s, options)
+    choice.write_cov(options.filter, cov_or_sqrt, scratch.prior_cov)
+    if epoch.rejected_in_row >= options.inflate_after:
+        open_velocity(cov_or_sqrt, options.initial_speed_sd, epoch.unheard_s, options)
+    choice.write_cov(options.filter, cov_or_sqrt, scratch.met_cov)
+    predicted = fusion.predicted_in(scratch.work, mean.size, epoch.rows.shape[0])
+    predict_rows(mean, scratch.met_cov, epoch.rows, options.height_m, predicted)
+
+
+@leaf
+def update_epoch(
+    mean: Array,
+    cov_or_sqrt: Array,
+    epoch: EpochInput,
+    motion: Array,
+    options: FilterOptions,
+    scratch: Scratch,
+) -> StepResult:
+    """Apply an epoch to one component after ``predict_epoch``, in place.
+
+    Nothing accepted leaves the prediction. ``scratch`` keeps 0 or 1 of each group in ``accepted``.
+    The robust options re-weight the rows in place. The velocity step allowed for is left in
+    ``motion`` (``set_velocity_step_noise``), for a smoother to know.
+    """
+    rows = epoch.rows
+    groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
     if options.robust.kind != Robust.NONE or options.robust.nlos_probability > 0.0:
-        reweight(mean, cov_or_sqrt, rows, options, scratch.work)
+        predicted = fusion.predicted_in(scratch.work, mean.size, rows.shape[0])
+        conditioning.reweight(scratch.met_cov, rows, predicted, options.robust)
     nis, used = update(mean, cov_or_sqrt, rows, options, scratch.accepted, scratch.work)
     taken = _count(scratch.accepted, groups)
     if taken == 0:
         _copy(scratch.prior_mean, scratch.prior_cov_or_sqrt, mean, cov_or_sqrt)
     else:
-        set_velocity_step_noise(motion, opened_sd, unheard_s, 0.0, 0.0)
+        opened = epoch.rejected_in_row >= options.inflate_after
+        opened_sd = options.initial_speed_sd if opened else 0.0
+        set_velocity_step_noise(motion, opened_sd, epoch.unheard_s, 0.0, 0.0)
     return StepResult(nis, used, taken)
-
-
-@kernel
-def reweight(
-    mean: Array, cov_or_sqrt: Array, rows: Array, options: FilterOptions, work: Array
-) -> None:
-    """Re-weight the rows in place as the robust options say."""
-    cov = cov_of(cov_or_sqrt, options)
-    conditioning.reweight(mean, cov, rows, options.height_m, options.robust, work[0])

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+import numpy.typing as npt
+
 from netpos.estimation.compile import kernel
 from netpos.estimation.factor import factor
-from netpos.estimation.measurement import (
-    VARIANCE,
-    curvature_variance,
-    linearise,
-    second_order_variance,
-)
+from netpos.estimation.measurement import VARIANCE, linearise, second_order_variance
+from netpos.estimation.predicted import PredictedRows
 from netpos.messages.values import Array
+
+Ints = npt.NDArray[np.int64]
 
 
 @kernel
@@ -54,22 +55,28 @@ def map_cost(
 
 @kernel
 def neg2_log_likelihood(
-    mean: Array, cov: Array, rows: Array, height_m: float, at_its_largest: bool
+    mean: Array,
+    cov: Array,
+    rows: Array,
+    height_m: float,
+    predicted: PredictedRows,
+    index: Ints,
 ) -> tuple[float, float]:
-    """Squared Mahalanobis distance of ``rows`` (m, ROW_WIDTH) from what mean (n,), cov (n, n)
-    predict of them, and ln det(2 pi S): minus twice their log density is the sum of the two. What
-    is known exactly is left out.
+    """Squared Mahalanobis distance of the rows ``index`` (k,) of ``rows`` (m, ROW_WIDTH) from
+    where mean (n,), cov (n, n) ``predicted`` them, and ln det(2 pi S): minus twice their log
+    density is the sum of the two. What is known exactly is left out.
 
-    at_its_largest : S has the curvature as the extended Kalman filter takes it; else
-        ``second_order_variance``, to weigh priors of different widths
+    S has the curvature as ``second_order_variance``, to weigh priors of different widths.
     """
-    innovation, H = linearise(rows, mean, height_m)
-    S = H @ cov @ H.T
-    for i in range(innovation.size):
-        if at_its_largest:
-            S[i, i] += rows[i, VARIANCE] + curvature_variance(rows[i], mean, cov, height_m)
-        else:
-            S[i, i] += rows[i, VARIANCE] + second_order_variance(rows[i], mean, cov, height_m)
+    innovation, S = predicted.innovation[index], np.empty((index.size, index.size))
+    for a in range(index.size):
+        i = index[a]
+        for b in range(a + 1):
+            total = 0.0
+            for c in range(mean.size):
+                total += predicted.H[i, c] * predicted.HP[index[b], c]
+            S[a, b] = S[b, a] = total
+        S[a, a] += rows[i, VARIANCE] + second_order_variance(rows[i], mean, cov, height_m)
     L = factor(S)
     distance, size = 0.0, 0.0
     for i in range(innovation.size):

@@ -7,24 +7,27 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netpos.estimation.compile import inlined, kernel, leaf, local_array
+from netpos.estimation.compile import inlined, kernel, leaf, local_array, spliced
 from netpos.estimation.factor import factor
+from netpos.estimation.predicted import PredictedRows
 from netpos.estimation.state import N_CORE, X
 from netpos.messages.values import Array
 
-# The workspace: vectors of one entry per row or state, then the prior covariance (n), H (m), P H'
+# The workspace: vectors of one entry per row or state, then the prior covariance (n), H (m), H P
 # (m), and n more.
 (
     W_VARIANCE,
     W_GATE_VARIANCE,
     W_INNOVATION,
+    W_PRIOR_VARIANCE,
+    W_SECOND_ORDER,
     W_STEP,
     W_PH,
     W_GAIN,
     W_USE,
     W_PRIOR,
     W_COV,
-) = range(9)
+) = range(11)
 # A pivot of the posterior below this share of the prior's variance has lost its digits: the result
 # may be off by more than 1e-5 sd.
 _ROUNDING = 1e-11
@@ -34,6 +37,20 @@ _ROUNDING = 1e-11
 def workspace(n: int, m: int) -> Array:
     """Scratch memory for updates of up to ``n`` states with up to ``m`` rows."""
     return np.zeros((W_COV + 2 * n + 2 * m, max(n, m)))
+
+
+@spliced
+def predicted_in(work: Array, n: int, m: int) -> PredictedRows:
+    """The part of a workspace that holds ``m`` rows at a prediction of ``n`` states; an update
+    leaves it as it is. Spliced: a leaf does not count the references it returns."""
+    h, hp = W_COV + n, W_COV + n + m
+    return PredictedRows(
+        work[W_INNOVATION],
+        work[h:hp],
+        work[hp : hp + m],
+        work[W_PRIOR_VARIANCE],
+        work[W_SECOND_ORDER],
+    )
 
 
 @inlined

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from netpos.estimation.compile import kernel, leaf
+from netpos.estimation.compile import leaf
 from netpos.estimation.factor import eigenvalues
-from netpos.estimation.measurement import GATE_VARIANCE, innovation_row, innovation_variance
+from netpos.estimation.measurement import GATE_VARIANCE
 from netpos.estimation.motion import add_velocity_step
+from netpos.estimation.predicted import PredictedRows
 from netpos.estimation.state import X
 from netpos.messages.values import Array
 
@@ -25,21 +24,18 @@ _FOLLOWED = 2.0
 
 @leaf
 def detection_delay_s(
-    mean: Array, cov: Array, rows: Array, height_m: float, gate: float, speed: float, h: Array
+    rows: Array, predicted: PredictedRows, gate: float, speed: float
 ) -> tuple[float, float]:
     """Time [s] until a velocity step of ``speed`` [m/s] takes ``rows`` (m, ROW_WIDTH) as far off
-    the prediction mean (n,), cov (n, n) as ``gate``, a squared Mahalanobis distance, allows: for
-    a step in any direction, and for one in the direction they know least (inf: not at all). A
-    measured velocity shows the step at once, the longest time is then an upper bound.
-
-    h : (n,) scratch
-    """
+    where they are ``predicted`` as ``gate``, a squared Mahalanobis distance, allows: for a step in
+    any direction, and for one in the direction they know least (inf: not at all). A measured
+    velocity shows the step at once, the longest time is then an upper bound."""
     xx = xy = yy = 0.0
     velocity_xx = velocity_xy = velocity_yy = 0.0
     for i in range(rows.shape[0]):
-        innovation_row(rows[i], mean, height_m, h)
-        noise = rows[i, GATE_VARIANCE]
-        variance = innovation_variance(rows[i], mean, cov, height_m, noise, h)
+        h = predicted.H[i]
+        known = predicted.prior_var[i] + predicted.second_order_var[i]
+        variance = rows[i, GATE_VARIANCE] + known
         xx += h[X.PX] * h[X.PX] / variance
         xy += h[X.PX] * h[X.PY] / variance
         yy += h[X.PY] * h[X.PY] / variance
@@ -59,16 +55,14 @@ def detection_delay_s(
     return _FOLLOWED * typical, longest
 
 
-@kernel
-def measures_velocity(mean: Array, rows: Array, height_m: float) -> bool:
-    """Whether ``rows`` (m, ROW_WIDTH), about mean (n,), measure both axes of the velocity."""
-    h = np.empty(mean.size)
+@leaf
+def measures_velocity(H: Array) -> bool:
+    """Whether rows with the Jacobian H (m, n) measure both axes of the velocity."""
     xx = xy = yy = 0.0
-    for i in range(rows.shape[0]):
-        innovation_row(rows[i], mean, height_m, h)
-        xx += h[X.VX] * h[X.VX]
-        xy += h[X.VX] * h[X.VY]
-        yy += h[X.VY] * h[X.VY]
+    for i in range(H.shape[0]):
+        xx += H[i, X.VX] * H[i, X.VX]
+        xy += H[i, X.VX] * H[i, X.VY]
+        yy += H[i, X.VY] * H[i, X.VY]
     least, largest = eigenvalues(xx, xy, yy)
     return bool(least > 1e-6 * largest)
 

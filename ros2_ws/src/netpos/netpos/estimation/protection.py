@@ -19,6 +19,7 @@ from netpos.estimation.fusion import W_GAIN, fuse
 from netpos.estimation.manoeuvre import add_manoeuvre, detection_delay_s
 from netpos.estimation.measurement import GROUP, VARIANCE, curvature_variance, innovation_row
 from netpos.estimation.mixture.gaussians import Mixture
+from netpos.estimation.predicted import PredictedRows
 from netpos.estimation.state import X
 from netpos.messages.values import Array
 
@@ -148,7 +149,7 @@ def radius_of(cov2: Array, risk: float) -> float:
     return math.nan
 
 
-Scratch = tuple[Array, Array, Array, Array]
+LevelScratch = tuple[Array, Array, Array, Array]
 
 
 class FusedEpoch(NamedTuple):
@@ -164,34 +165,29 @@ class FusedEpoch(NamedTuple):
 
 
 @kernel
-def level_scratch(n: int, m: int) -> Scratch:
-    """Scratch memory of ``level_in`` for ``n`` states and up to ``m`` rows."""
+def level_scratch(n: int, m: int) -> LevelScratch:
+    """Memory of ``manoeuvre_level`` for ``n`` states and up to ``m`` rows."""
     vectors, covs = np.empty((4, max(n, m))), np.empty((2, n, n))
     return vectors, covs, np.empty((m, n)), np.empty((W_GAIN + 1, n))
 
 
-@kernel
-def manoeuvre_level(epoch: FusedEpoch, options: FilterOptions) -> float:
+@leaf
+def manoeuvre_level(
+    epoch: FusedEpoch, predicted: PredictedRows, options: FilterOptions, scratch: LevelScratch
+) -> float:
     """Radius [m] round the posterior mean that a device leaves with probability ``integrity_risk``
     if it is in a manoeuvre nobody has noticed.
 
     The accepted groups are applied once more to the prediction, which allows for a manoeuvre in
     the time it goes unnoticed: how far the two answers lie apart, and the level of the second
     (solution separation, as receiver autonomous integrity monitoring has it). inf where there is
-    no gate, or a direction is open.
+    no gate, or a direction is open. ``predicted``: the rows as the prediction sees them.
     """
-    scratch = level_scratch(epoch.mean.size, epoch.rows.shape[0])
-    return float(level_in(epoch, options, scratch))
-
-
-@leaf
-def level_in(epoch: FusedEpoch, options: FilterOptions, scratch: Scratch) -> float:
-    """``manoeuvre_level`` in the memory of ``level_scratch``."""
     prior_mean, prior_cov, rows, mean = epoch.prior_mean, epoch.prior_cov, epoch.rows, epoch.mean
     n, height_m, speed = mean.size, options.height_m, options.manoeuvre_speed_sd
     x, wide, P = scratch[0][0, :n], scratch[1][0], scratch[1][1]
     gate = options.gate_nis[2]
-    _, longest_s = detection_delay_s(prior_mean, prior_cov, rows, height_m, gate, speed, x)
+    _, longest_s = detection_delay_s(rows, predicted, gate, speed)
     if math.isinf(longest_s):
         return math.inf
     for a in range(n):
@@ -216,7 +212,7 @@ def apply_about(
     rows: Array,
     accepted: Array,
     height_m: float,
-    scratch: Scratch,
+    scratch: LevelScratch,
 ) -> None:
     """Apply the accepted groups of ``rows`` (m, ROW_WIDTH) to the prior (n,), (n, n), linearised
     at ``x`` (n,), an answer already known, and once more at what comes of it, with the curvature

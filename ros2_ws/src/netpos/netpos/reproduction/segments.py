@@ -79,7 +79,7 @@ class Followed(NamedTuple):
 
 
 def _empty_run(epochs: int, n: int) -> Run:
-    figures = np.zeros((4, epochs))
+    figures = np.zeros((5, epochs))
     return Run(np.full((epochs, n), np.nan), np.full((epochs, n, n), np.nan), *figures)
 
 
@@ -138,9 +138,8 @@ class Follower:
             else:
                 done = self._stepped(part, fix, part_run, imu, part_motions)
             end = first + done
-            level[first:end] = run_levels(
-                part.measured, _part(part_run, 0, done), part_motions, part.bias, self._options
-            )
+            whole = _part(part_run, 0, done)
+            level[first:end] = run_levels(part.measured, whole, self._options)
             lost = end < count
             tracked[first : end - lost] = True  # nothing is published of the epoch of the loss
             losses += lost
@@ -191,9 +190,9 @@ class Follower:
                     estimate.set_imu_increment(yaw, speed, config.gyro_noise_density)
                 unheard_s, bias = (stamp - heard_ns) / NS, epochs.bias[:, : known - first].copy()
                 step = estimate.step(stamp, unheard_s, rejected, rows, bias)
-                run.nis[k], run.dof[k], accepted = step
-                run.groups[k] = accepted.sum()
-                rejected = 0 if 2 * accepted.sum() >= accepted.size else rejected + 1
+                run.nis[k], run.dof[k], run.undetected_m[k] = step.nis, step.dof, step.undetected_m
+                run.groups[k] = step.accepted.sum()
+                rejected = 0 if 2 * run.groups[k] >= step.accepted.size else rejected + 1
                 heard_ns = stamp if run.dof[k] else heard_ns
             run.means[k], run.covs[k] = augmented(estimate.mean, estimate.cov, sd)
             run.radius[k] = estimate.radius(0.0)

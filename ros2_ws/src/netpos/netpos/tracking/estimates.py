@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from netpos.estimation import engine
-from netpos.estimation.engine import EpochInput, StepResult
+from netpos.estimation.engine import EpochInput
 from netpos.estimation.forms.table import form_of
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.mixture import epoch as mixtures
-from netpos.estimation.mixture.epoch import Dynamics
+from netpos.estimation.mixture.epoch import Dynamics, Memory, Outcome
 from netpos.estimation.mixture.gaussians import Mixture, mode_of, moments, one_component
-from netpos.estimation.mixture.paths import paths_are_open
-from netpos.estimation.mixture.sectors import phase_place
 from netpos.estimation.motion import NO_BIAS, Parameter
 from netpos.estimation.protection import mixture_radius
 from netpos.estimation.state import N_CORE, X
@@ -26,6 +26,19 @@ from netpos.tracking.models import (
     options_of,
     start_state,
 )
+
+
+class Step(NamedTuple):
+    """What came of an epoch: NIS of the accepted rows and their number; 1 or 0 of each group
+    (groups,), until the next step; innovations (m, 2) of the rows as the prediction saw them, and
+    their sd; how far [m] a manoeuvre that the epoch does not show may have taken the device, not a
+    number where the posterior is not sound."""
+
+    nis: float
+    dof: int
+    accepted: Array
+    innovations: Array
+    undetected_m: float
 
 
 class Estimate:
@@ -43,7 +56,6 @@ class Estimate:
         self._dynamics = dynamics_of(config, NO_BIAS)
         self._motion: Array = self._dynamics.motions[0]
         self._components: Mixture | None = None  # replaced, never changed; None: one component
-        self._prior: tuple[Array, Array] | None = None  # of a mixture
         self._modes: tuple[TrackMode, ...] | None = ()  # None: not yet asked for
         mean, cov = start_state(config, mean, cov)
         self.mean, self._cov_or_sqrt = mean.copy(), engine.to_cov_or_sqrt(cov, self._options)
@@ -79,11 +91,8 @@ class Estimate:
     def _make_room(self, rows: int) -> None:
         n = self.mean.size
         self._rows = max(rows, self._rows)
-        self._scratch: engine.Scratch = engine.scratch(n, self._rows)
-
-    @property
-    def _paths_may_be_blocked(self) -> bool:
-        return self._options.models == 1 and self._options.robust.nlos_probability > 0.0
+        self._memory: Memory = mixtures.memory_of(n, self._rows)
+        self._one = Mixture(np.empty((1, n)), np.empty((1, n, n)), np.zeros(1))  # stands for it
 
     @property
     def cov(self) -> Array:
@@ -97,12 +106,7 @@ class Estimate:
     @property
     def prior(self) -> tuple[Array, Array]:
         """Mean and covariance predicted in the last ``step``."""
-        return self._prior or self._prior_of_one()
-
-    def _prior_of_one(self) -> tuple[Array, Array]:
-        cov_or_sqrt = self._scratch.prior_cov_or_sqrt
-        cov = engine.to_cov(cov_or_sqrt, self._options) if self._factored else cov_or_sqrt
-        return self._scratch.prior_mean, cov
+        return self._memory.step.prior_mean, self._memory.step.prior_cov
 
     def _set(self, mixture: Mixture) -> None:
         """Go on with ``mixture``; mean and covariance are those of all of them together."""
@@ -168,66 +172,32 @@ class Estimate:
 
     def step(
         self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
-    ) -> tuple[float, int, Array]:
-        """Move to ``stamp_ns`` and apply one epoch: NIS, its degrees of freedom and, per group,
-        whether it was accepted. ``prior`` holds the prediction afterwards."""
-        if len(rows) > self._rows:
-            self._make_room(len(rows))
-        dt_s = (stamp_ns - self.stamp_ns) * 1e-9
-        epoch, accepted = (
-            EpochInput(dt_s, unheard_s, rejected_in_row, rows),
-            self._scratch.accepted,
+    ) -> Step:
+        """Move to ``stamp_ns`` and apply one epoch. ``prior`` holds the prediction afterwards."""
+        m = len(rows)
+        if m > self._rows:
+            self._make_room(m)
+        memory = self._memory
+        epoch = EpochInput((stamp_ns - self.stamp_ns) * 1e-9, unheard_s, rejected_in_row, rows)
+        found: Outcome = mixtures.advance(
+            self.mean,
+            self._cov_or_sqrt,
+            self._components or self._one,
+            epoch,
+            (stamp_ns - self._turn_ns) * 1e-9,
+            self._with(bias),
+            self._options,
+            memory,
         )
-        motion, options, groups = self._motion, self._options, int(rows.item(-1, GROUP)) + 1
-        since_turn_s = (stamp_ns - self._turn_ns) * 1e-9
-        if self._components is None and self._is_split_by(epoch, bias):
-            self._components = one_component(self.mean, self.cov)
-        if self._components is None:
-            raw = rows.copy() if self._paths_may_be_blocked else rows
-            result = engine.step(
-                self.mean, self._cov_or_sqrt, epoch, motion, bias, options, self._scratch
-            )
-            self.stamp_ns, self._prior = stamp_ns, None
-            before = self._prior_of_one()
-            if self._explains(result, raw, epoch, since_turn_s):
-                return result.nis, result.used, accepted[:groups]
-            prior = one_component(*before)
-            rows[:] = raw
-        else:
-            prior = mixtures.moved_to_epoch(self._components, epoch, self._with(bias), options)
-            self.stamp_ns = stamp_ns
-        found = mixtures.apply_epoch(prior, epoch, options, since_turn_s, accepted)
-        mixtures.note_turn(found, motion, options)
-        self._prior = moments(prior)
-        self._set(found.components)
+        self.stamp_ns = stamp_ns
         if found.begun:
             self._turn_ns = stamp_ns
-        return found.nis, found.used, accepted[:groups]
-
-    def _is_split_by(self, epoch: EpochInput, bias: Array) -> bool:
-        """Whether an epoch makes several components of the one: it has an ambiguous phase, or a
-        range after a silence."""
-        options = self._options
-        if options.sector_slip > 0.0 and phase_place(epoch.rows) >= 0:
-            return True
-        if epoch.dt_s <= options.coast_after_s:
-            return False
-        split: bool = mixtures.is_too_wide(self.mean, self.cov, epoch, self._with(bias), options)
-        return split
-
-    def _explains(
-        self, result: StepResult, raw: Array, epoch: EpochInput, since_turn_s: float
-    ) -> bool:
-        """Whether one component explains an epoch with the rows ``raw``, of which ``engine.step``
-        made ``result``."""
-        groups, options = int(raw.item(-1, GROUP)) + 1, self._options
-        if result.groups < groups or groups == 1:
-            more = mixtures.is_not_enough(result, self.mean, epoch, since_turn_s, options)
-            if more:
-                return False
-        if not self._paths_may_be_blocked:
-            return True
-        return not paths_are_open(*self._prior_of_one(), raw, options)
+        several = found.components.log_weights.size > 1
+        self._components = found.components if several else None
+        self._modes = None if several else ()
+        accepted = memory.step.accepted[: int(rows.item(-1, GROUP)) + 1]
+        innovations = memory.innovations[:m].copy()
+        return Step(found.nis, found.used, accepted, innovations, found.undetected_m)
 
     def copy(self) -> Estimate:
         """An independent copy."""

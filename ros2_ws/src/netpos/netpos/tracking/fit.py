@@ -8,17 +8,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from netpos.estimation.compile import kernel, leaf
-from netpos.estimation.engine import FilterOptions, is_sound
-from netpos.estimation.measurement import (
-    GATE_VARIANCE,
-    GROUP,
-    KIND,
-    Kind,
-    innovation_row,
-    innovation_variance,
-)
-from netpos.estimation.protection import FusedEpoch, manoeuvre_level
+from netpos.estimation.compile import kernel
+from netpos.estimation.measurement import GROUP, KIND, Kind
+from netpos.estimation.predicted import note_innovations, predicted_rows
 from netpos.messages.values import Array, RsuMeasurement
 from netpos.tracking.epoch_rows import EpochRows, Source
 from netpos.tracking.health import RsuHealth
@@ -28,41 +20,13 @@ from netpos.tracking.rsus import Rsu
 AnySource = TypeVar("AnySource", bound=Source)
 
 
-@leaf
-def _innovations_with_sd(
-    mean: Array, cov: Array, rows: Array, height_m: float, h: Array, innovations: Array
-) -> None:
-    for i in range(rows.shape[0]):
-        innovations[i, 0] = innovation_row(rows[i], mean, height_m, h)
-        noise = rows[i, GATE_VARIANCE]
-        innovations[i, 1] = math.sqrt(innovation_variance(rows[i], mean, cov, height_m, noise, h))
-
-
 @kernel
 def innovations_with_sd(mean: Array, cov: Array, rows: Array, height_m: float) -> Array:
     """Innovation of each row (m, ROW_WIDTH) at ``mean`` (n,) and its standard deviation under
     ``cov`` (n, n): (m, 2)."""
     innovations = np.empty((rows.shape[0], 2))
-    _innovations_with_sd(mean, cov, rows, height_m, np.empty(mean.size), innovations)
+    note_innovations(rows, predicted_rows(mean, cov, rows, height_m), innovations)
     return innovations
-
-
-@kernel
-def innovations_and_level(
-    epoch: FusedEpoch, cov: Array, options: FilterOptions, innovations: Array
-) -> float:
-    """``innovations_with_sd`` at the prediction, put into ``innovations`` (m, 2);
-    ``manoeuvre_level`` where there may be a manoeuvre, else 0. Not a number where the posterior,
-    of covariance ``cov`` (n, n), is not sound."""
-    if not is_sound(epoch.mean, cov):
-        return math.nan
-    h = np.empty(epoch.mean.size)
-    _innovations_with_sd(
-        epoch.prior_mean, epoch.prior_cov, epoch.rows, options.height_m, h, innovations
-    )
-    if options.manoeuvre_speed_sd <= 0.0:
-        return 0.0
-    return float(manoeuvre_level(epoch, options))
 
 
 def widen(innovations: Array, rows: Array, rsu: Rsu) -> None:

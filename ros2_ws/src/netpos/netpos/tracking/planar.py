@@ -11,7 +11,6 @@ import numpy as np
 
 from netpos.estimation.measurement import VARIANCE
 from netpos.estimation.mixture.gaussians import moments, one_component
-from netpos.estimation.protection import FusedEpoch
 from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import (
     Array,
@@ -36,7 +35,7 @@ from netpos.tracking.estimator import (
     Recent,
     UpdateResult,
 )
-from netpos.tracking.fit import innovations_and_level, innovations_with_sd
+from netpos.tracking.fit import innovations_with_sd
 from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser, with_heading
 from netpos.tracking.learning import LearnedErrors
@@ -218,30 +217,28 @@ class PlanarEstimator(Estimator):
         rows, unheard_s = epoch_rows.rows, past.unheard_s
         estimate = self._prepared(stamp_ns, epoch_rows.items)
         was_ambiguous = bool(estimate.modes)
-        nis, dof, flags = estimate.step(stamp_ns, unheard_s, past.rejected_in_row, rows, self.bias)
+        step = estimate.step(stamp_ns, unheard_s, past.rejected_in_row, rows, self.bias)
         if self._secondary is not None:
             self._own = self._secondary.after(self._own, stamp_ns, estimate, rows, self.bias)
         # a smoother does not reach across: what it keeps is one Gaussian
         breaks = int(bool(estimate.modes) != was_ambiguous)
-        innovations = np.empty((len(rows), 2))
-        fused = FusedEpoch(*estimate.prior, rows, flags, unheard_s, estimate.mean)
-        undetected_m = self._undetected_m(fused, innovations, stamp_ns, past.recent)
-        sound, accepted = not math.isnan(undetected_m), flags.tolist()
-        fit = nis, dof, accepted, innovations
-        return UpdateResult(*fit, undetected_m, sound, breaks)
+        return UpdateResult(
+            step.nis,
+            step.dof,
+            step.accepted.tolist(),
+            step.innovations,
+            self._undetected_m(step.undetected_m, stamp_ns, rows, past.recent),
+            sound=not math.isnan(step.undetected_m),
+            breaks=breaks,
+        )
 
-    def _undetected_m(
-        self, fused: FusedEpoch, innovations: Array, stamp_ns: int, recent: Recent
-    ) -> float:
-        """Level of a manoeuvre that this epoch, or the recent ones with it, would not show; fills
-        ``innovations``. Not a number where the posterior is not sound."""
-        cov = self._there().cov
-        level_m: float = innovations_and_level(fused, cov, self._options, innovations)
-        if math.isinf(level_m):
-            epochs = [*((then_ns, rows.rows) for then_ns, rows in recent), (stamp_ns, fused.rows)]
-            prior = fused.prior_mean, fused.prior_cov
-            return level_of_epochs(epochs, stamp_ns, prior, cov, self._options)
-        return level_m
+    def _undetected_m(self, level_m: float, stamp_ns: int, rows: Array, recent: Recent) -> float:
+        """``level_m``, or where one epoch does not bound it that of the recent ones with it."""
+        if not math.isinf(level_m):
+            return level_m
+        estimate = self._there()
+        epochs = [*((then_ns, before.rows) for then_ns, before in recent), (stamp_ns, rows)]
+        return level_of_epochs(epochs, stamp_ns, estimate.prior, estimate.cov, self._options)
 
     def learn(
         self, stamp_ns: int, rows: Array, accepted: Sequence[float]

@@ -12,11 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from netpos.estimation.engine import FilterOptions
-from netpos.estimation.measurement import linearise
+from netpos.estimation.measurement import GATE_VARIANCE
+from netpos.estimation.predicted import predicted_rows
 from netpos.estimation.protection import radius_of
 from netpos.estimation.state import POSITION
 from netpos.messages.values import Array
-from netpos.tracking.fit import innovations_with_sd
 
 _BLIND = 1e-12  # share of the information along the line they see best
 
@@ -61,7 +61,8 @@ def level_of_epochs(
 
 def _information(mean: Array, cov: Array, rows: Array, height_m: float) -> Array:
     """Of rows (m, ROW_WIDTH) about the position of mean (n,) (2, 2)."""
-    _, H = linearise(rows, mean, height_m)
-    slopes = H[:, POSITION] / innovations_with_sd(mean, cov, rows, height_m)[:, 1:]
+    predicted = predicted_rows(mean, cov, rows, height_m)
+    variance = rows[:, GATE_VARIANCE] + predicted.prior_var + predicted.second_order_var
+    slopes = predicted.H[:, POSITION] / np.sqrt(variance)[:, np.newaxis]
     information: Array = slopes.T @ slopes
     return information

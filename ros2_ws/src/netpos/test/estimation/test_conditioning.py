@@ -25,6 +25,7 @@ from netpos.estimation.measurement import (
     Kind,
     curvature_variance,
 )
+from netpos.estimation.predicted import predicted_rows
 from netpos.estimation.state import X
 from netpos.messages.values import Array
 from scipy.integrate import quad
@@ -49,7 +50,7 @@ def conditioned(
     out, before = rows.copy(), (mean.copy(), cov.copy())
     # one signature to compile
     options = RobustOptions(int(weights[0]), float(weights[1]), float(late[0]), float(late[1]))
-    reweight(mean, cov, out, height_m, options, np.full(mean.size, np.nan))
+    reweight(cov, out, predicted_rows(mean, cov, out, height_m), options)
     np.testing.assert_array_equal(mean, before[0])
     np.testing.assert_array_equal(cov, before[1])
     return out

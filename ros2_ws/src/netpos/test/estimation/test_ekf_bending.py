@@ -19,6 +19,7 @@ from netpos.estimation.measurement import (
     Kind,
     linearise,
 )
+from netpos.estimation.predicted import predict_rows
 from netpos.estimation.state import X
 from netpos.messages.values import Array
 from scipy.optimize import brentq
@@ -30,11 +31,8 @@ def passes(mean: Array, cov: Array, rows: Array, threshold: float, iterations: i
     curvature)."""
     n, m = mean.size, len(rows)
     work = scratch(n, m)
-    innovation, H = linearise(rows, mean, 0.0)
-    work[fusion.W_INNOVATION, :m] = innovation
+    predict_rows(mean, cov, rows, 0.0, fusion.predicted_in(work, n, m))
     work[fusion.W_GATE_VARIANCE, :m] = rows[:, GATE_VARIANCE]
-    work[fusion.W_COV + n : fusion.W_COV + n + m, :n] = H
-    work[fusion.W_COV + n + m : fusion.W_COV + n + 2 * m, :n] = H @ cov
     return bool(ekf._passes(mean, cov, rows, (0, m), 0.0, threshold, iterations, work))
 
 

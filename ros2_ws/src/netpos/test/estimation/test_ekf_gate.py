@@ -9,6 +9,7 @@ import pytest
 from ekf_update import fused, updated
 from filter_rows import NO_GATE, linear_row, random_spd
 from netpos.estimation.forms import ekf
+from netpos.estimation.fusion import predicted_in
 from netpos.estimation.measurement import (
     GATE_VARIANCE,
     GROUP,
@@ -16,6 +17,7 @@ from netpos.estimation.measurement import (
     VALUE,
     VARIANCE,
 )
+from netpos.estimation.predicted import predict_rows
 from netpos.estimation.state import X
 from netpos.messages.values import Array
 from scipy.stats import chi2
@@ -184,6 +186,7 @@ def test_gate_of_correlated_rows_at_its_boundary(size: int, before: int, seed: i
         gate = np.full(7, limit * factor)
         work, accepted = ekf.workspace(6, len(rows)), np.full(group + 2, 9.0)
         mean, cov = x.copy(), P.copy()
+        predict_rows(mean, cov, rows, 0.0, predicted_in(work, 6, len(rows)))
         used = ekf.gate(mean, cov, rows, 0.0, gate, 1, accepted, work)
         assert accepted[group] == taken
         assert used == sum(accepted[int(g)] for g in rows[:, GROUP])

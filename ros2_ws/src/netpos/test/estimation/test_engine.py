@@ -18,6 +18,7 @@ from netpos.estimation.measurement import (
 )
 from netpos.estimation.mixture.epoch import run_epochs
 from netpos.estimation.motion import NO_BIAS, SPEED_OF_LIGHT_MPS, Parameter, noise
+from netpos.estimation.predicted import predicted_rows
 from netpos.estimation.rows import rsu_axes, rsu_rows
 from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array, Field, InitialPose, RsuInfo, RsuMeasurement
@@ -80,8 +81,8 @@ def plain_step(
     P = prior_cov
     if rejected >= options.inflate_after:
         P = opened(P, options.initial_speed_sd, unheard_s)
-    rows, work = rows.copy(), ekf.workspace(len(mean), len(rows))
-    conditioning.reweight(prior, P, rows, 0.0, options.robust, work[0])
+    rows = rows.copy()
+    conditioning.reweight(P, rows, predicted_rows(prior, P, rows, 0.0), options.robust)
     best = gated(prior, P, rows, options)
     if not best[4].any():
         return prior, prior_cov, best[2], best[3], best[4]
@@ -102,7 +103,8 @@ def compiled_step(
 ) -> tuple[Array, Array, float, int, Array]:
     x, S = mean.copy(), engine.to_cov_or_sqrt(cov, options)
     scratch, epoch = engine.scratch(6, len(rows)), EpochInput(dt, unheard_s, rejected, rows)
-    result = engine.step(x, S, epoch, motion, NO_BIAS, options, scratch)
+    engine.predict_epoch(x, S, epoch, motion, NO_BIAS, options, scratch)
+    result = engine.update_epoch(x, S, epoch, motion, options, scratch)
     accepted = scratch.accepted[:3]
     assert result.groups == accepted.sum()
     return x, engine.to_cov(S, options), result.nis, result.used, accepted
@@ -174,7 +176,7 @@ def drive(epochs: int = 60) -> tuple[Array, Array, Array]:
 def run(config: TrackerConfig, mean: Array, cov: Array, inputs: Any) -> tuple[int, Run]:
     stamps, starts, rows = inputs
     N, n = len(stamps), len(mean)
-    out = Run(*(np.full(shape, np.nan) for shape in ((N, n), (N, n, n), N, N, N, N)))
+    out = Run(*(np.full(shape, np.nan) for shape in ((N, n), (N, n, n), N, N, N, N, N)))
     before, dynamics = rows.copy(), dynamics_of(config, NO_BIAS)
     epochs = Epochs(stamps, starts, rows)
     done = run_epochs(epochs, mean, cov, dynamics, options_of(config), out)
@@ -188,7 +190,7 @@ def test_a_run_is_its_steps(change: dict[str, Any]) -> None:
     motion, options = motions_of(config)[0], options_of(config)
     mean, cov = start()
     stamps, starts, rows = drive()
-    done, (means, covs, nis, dof, taken, _) = run(config, mean, cov, (stamps, starts, rows))
+    done, (means, covs, nis, dof, taken, *_) = run(config, mean, cov, (stamps, starts, rows))
     assert done == len(stamps)
     rejected, heard = 0, stamps[0]
     rejected_most = 0
@@ -219,7 +221,7 @@ def test_a_run_ends_where_the_track_is_lost() -> None:
     )
     mean, cov = start()
     stamps, starts, rows = drive(60)
-    done, (means, _, _, _, taken, _) = run(config, mean, 1e-4 * cov, (stamps, starts, rows))
+    done, (means, _, _, _, taken, *_) = run(config, mean, 1e-4 * cov, (stamps, starts, rows))
     lost = 33  # the epochs 30, 31, 32 are rejected; 33 has no rows
     assert done == lost
     assert taken[29] > 0
@@ -285,7 +287,7 @@ def test_a_run_equals_the_tracker(metis: Any, name: str, rtol: float) -> None:
     stamps, starts, rows = as_rows(rsus, items)
     assert pose.stamp_ns <= stamps[0]
     mean, cov = pose_state(config, pose.position[:2], pose.cov[:2, :2])
-    done, (means, covs, nis, dof, taken, _) = run(config, mean, cov, (stamps, starts, rows))
+    done, (means, covs, nis, dof, taken, *_) = run(config, mean, cov, (stamps, starts, rows))
     outputs = [o for o in outputs if o.status.stamp_ns >= stamps[0]]
     assert done == len(stamps) == len(outputs) > 600
     assert pose.stamp_ns == stamps[0]

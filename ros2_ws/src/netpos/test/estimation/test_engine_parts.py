@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from engine_cases import opened, start
 from netpos.estimation import engine
+from netpos.estimation.engine import EpochInput
 from netpos.estimation.forms import ekf, srukf
+from netpos.estimation.fusion import predicted_in
 from netpos.estimation.manoeuvre import add_manoeuvre
 from netpos.estimation.measurement import GATE_VARIANCE, VARIANCE
 from netpos.estimation.motion import NO_BIAS, noise
+from netpos.estimation.predicted import predict_rows, predicted_rows
 from netpos.estimation.rows import linear_rows
 from netpos.estimation.state import POSITION
 from netpos.tracking import TrackerConfig
@@ -132,7 +135,9 @@ def test_every_filter_applies_what_is_linear_alike(name: str) -> None:
     R, fix = np.diag([0.25, 0.16]), prior[POSITION] + np.array([0.8, -0.5])
     rows = np.vstack([linear_rows(fix, R, H, 0), linear_rows(fix + 100.0, R, H, 1)])
     x, S, accepted = prior.copy(), engine.to_cov_or_sqrt(cov, options), np.full(2, 9.0)
-    nis, used = engine.update(x, S, rows, options, accepted, ekf.workspace(6, 4))
+    work = ekf.workspace(6, 4)
+    predict_rows(x, cov, rows, 0.0, predicted_in(work, 6, 4))
+    nis, used = engine.update(x, S, rows, options, accepted, work)
     assert accepted.tolist() == [1.0, 0.0]
     residual, information = fix - prior[POSITION], np.linalg.inv(cov)
     expected = residual @ np.linalg.solve(cov[POSITION, POSITION] + R, residual)
@@ -148,8 +153,9 @@ def test_the_linear_filter_has_its_floors() -> None:
     floors = {"position_gain_min": 0.5, "velocity_gain_min": 0.25, "accel_gain_min": 0.125}
     options = options_of(TrackerConfig(filter="kf", **floors))
     x, P = np.zeros(8), 1e-6 * np.eye(8)
-    rows = linear_rows(np.array([2.0, -1.0]), np.eye(2), H, 0)
-    engine.update(x, P, rows, options, np.zeros(1), ekf.workspace(8, 2))
+    rows, work = linear_rows(np.array([2.0, -1.0]), np.eye(2), H, 0), ekf.workspace(8, 2)
+    predict_rows(x, P, rows, 0.0, predicted_in(work, 8, 2))
+    engine.update(x, P, rows, options, np.zeros(1), work)
     np.testing.assert_allclose(x, [1.0, -0.5, 0.5, -0.25, 0.0, 0.0, 0.25, -0.125], rtol=1e-9)
 
 
@@ -167,10 +173,12 @@ def test_a_manoeuvre_is_more_than_the_velocity_allows_for(
     rows = linear_rows(np.zeros(2), 3.0 * np.eye(2), H, 0)
     shows_s = math.sqrt(chi2.ppf(0.999, 2) * 5.0) / 3.0
     for unheard_s in (0.1, 2.01 * shows_s):
-        within_s = engine.manoeuvre_s(np.zeros(6), cov, rows, unheard_s, options)
+        seen = predicted_rows(np.zeros(6), cov, rows, 0.0)
+        within_s = engine.manoeuvre_s(cov, rows, seen, unheard_s, options)
         expected = max(unheard_s, 2.0 * shows_s) if is_one else unheard_s
         assert within_s == pytest.approx(expected, rel=1e-9)
-        assert engine.manoeuvre_s(np.zeros(6), cov, rows[:0], unheard_s, options) == unheard_s
+        nothing = predicted_rows(np.zeros(6), cov, rows[:0], 0.0)
+        assert engine.manoeuvre_s(cov, rows[:0], nothing, unheard_s, options) == unheard_s
 
 
 @pytest.mark.parametrize("name", ["iekf", "srukf"])
@@ -179,8 +187,10 @@ def test_rows_are_weighed_by_what_is_carried(name: str) -> None:
     options = options_of(TrackerConfig(filter=name, robust="huber", robust_parameter=1.5))
     (mean, cov), R, off = start(), np.diag([0.25, 0.16]), np.array([9.0, -7.0])
     rows = linear_rows(mean[POSITION] + off, R, H, 0)
-    S, work = engine.to_cov_or_sqrt(cov, options), ekf.workspace(6, 2)
-    engine.reweight(mean, S, rows, options, work)
+    S, memory = engine.to_cov_or_sqrt(cov, options), engine.scratch(6, 2)
+    epoch, motion = EpochInput(0.0, 0.0, 0, rows), motions_of(TrackerConfig())[0]
+    engine.predict_epoch(mean.copy(), S, epoch, motion, NO_BIAS, options, memory)
+    engine.update_epoch(mean.copy(), S, epoch, motion, options, memory)
     factor = math.sqrt(off @ np.linalg.solve(cov[POSITION, POSITION] + R, off) / 2.0) / 1.5
     assert factor > 2.0
     np.testing.assert_allclose(rows[:, [VARIANCE, GATE_VARIANCE]], factor, rtol=1e-9)

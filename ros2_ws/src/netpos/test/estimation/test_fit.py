@@ -23,8 +23,18 @@ from netpos.estimation.measurement import (
     Kind,
     curvature_variance,
     linearise,
+    second_order_variance,
 )
+from netpos.estimation.predicted import predicted_rows
 from netpos.estimation.state import POSITION
+from netpos.messages.values import Array
+
+
+def neg2_log_likelihood(mean: Array, cov: Array, rows: Array) -> tuple[float, float]:
+    """Of all rows."""
+    predicted, index = predicted_rows(mean, cov, rows, 0.0), np.arange(len(rows))
+    found: tuple[float, float] = fit.neg2_log_likelihood(mean, cov, rows, 0.0, predicted, index)
+    return found
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -67,9 +77,9 @@ def test_misfit_is_twice_the_negative_log_posterior(seed: int) -> None:
 def test_surprise_is_what_scipy_makes_of_it() -> None:
     mean, cov, rows = range_problem(3)
     innovation, H = linearise(rows, mean, 0.0)
-    bent = [curvature_variance(row, mean, cov, 0.0) for row in rows]
+    bent = [second_order_variance(row, mean, cov, 0.0) for row in rows]
     S = H @ cov @ H.T + np.diag(rows[:, VARIANCE] + bent)
-    distance, size = fit.neg2_log_likelihood(mean, cov, rows, 0.0, True)
+    distance, size = neg2_log_likelihood(mean, cov, rows)
     assert distance == pytest.approx(innovation @ np.linalg.solve(S, innovation), rel=1e-9)
     assert size == pytest.approx(np.linalg.slogdet(2.0 * np.pi * S)[1], rel=1e-9)
 
@@ -98,17 +108,24 @@ def test_a_bearing_does_not_bend_along_itself() -> None:
     _, gradient = linearise(row, mean, 0.0)
     S = gradient[0] @ cov @ gradient[0] + 1e-4 + 0.5 * np.trace(bent @ bent)
     innovation = -0.6 - azimuth(4.0, -3.0)
-    distance, size = fit.neg2_log_likelihood(mean, cov, row, 0.0, False)
+    distance, size = neg2_log_likelihood(mean, cov, row)
     assert distance == pytest.approx(innovation**2 / S, rel=1e-5)
     assert size == pytest.approx(math.log(2.0 * math.pi * S), rel=1e-5)
-    assert size < fit.neg2_log_likelihood(mean, cov, row, 0.0, True)[1]
+    at_most = curvature_variance(row[0], mean, cov, 0.0)
+    assert second_order_variance(row[0], mean, cov, 0.0) < at_most
     row[0, AXES + 8] = 0.9
-    assert fit.neg2_log_likelihood(mean, cov, row, 0.0, False) == fit.neg2_log_likelihood(
-        mean, cov, row, 0.0, True
-    )
+    at_most = curvature_variance(row[0], mean, cov, 0.0)
+    assert second_order_variance(row[0], mean, cov, 0.0) == at_most
     mean, cov, rows = range_problem(3)
     ranges = rows[rows[:, KIND] == Kind.RANGE]
     assert len(ranges) > 0
-    assert fit.neg2_log_likelihood(mean, cov, ranges, 0.0, False) == fit.neg2_log_likelihood(
-        mean, cov, ranges, 0.0, True
-    )
+    for row in ranges:
+        at_most = curvature_variance(row, mean, cov, 0.0)
+        assert second_order_variance(row, mean, cov, 0.0) == at_most
+
+
+def test_rows_that_are_left_out_say_nothing() -> None:
+    mean, cov, rows = range_problem(3)
+    predicted = predicted_rows(mean, cov, rows, 0.0)
+    some = fit.neg2_log_likelihood(mean, cov, rows, 0.0, predicted, np.array([0, 2]))
+    assert some == pytest.approx(neg2_log_likelihood(mean, cov, rows[[0, 2]]), rel=1e-12)

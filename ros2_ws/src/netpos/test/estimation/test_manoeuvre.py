@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from netpos.estimation.manoeuvre import add_manoeuvre, detection_delay_s, measures_velocity
 from netpos.estimation.measurement import GATE_VARIANCE, Kind, curvature_variance, linearise
+from netpos.estimation.predicted import predicted_rows
 from netpos.estimation.rows import linear_rows
 from netpos.messages.values import Array
 
@@ -35,12 +36,20 @@ def known(cov: Array, rows: Array) -> Array:
     return information
 
 
+def delay_s(cov: Array, rows: Array) -> tuple[float, float]:
+    """``detection_delay_s`` of rows that MEAN predicts."""
+    found: tuple[float, float] = detection_delay_s(
+        rows, predicted_rows(MEAN, cov, rows, 1.0), GATE, SPEED
+    )
+    return found
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_a_step_is_noticed_where_it_reaches_the_gate(seed: int) -> None:
     """In the direction known least, by search over all; twice as long as in the mean over them,
     for as long as that the filter follows."""
     cov, rows = problem(seed)
-    typical_s, longest_s = detection_delay_s(MEAN, cov, rows, 1.0, GATE, SPEED, np.empty(6))
+    typical_s, longest_s = delay_s(cov, rows)
     angles = np.linspace(0.0, math.pi, 20001)
     ways = np.array([np.cos(angles), np.sin(angles)])
     reached = np.einsum("in,ij,jn->n", ways, known(cov, rows), ways)  # of a step of one metre
@@ -52,13 +61,10 @@ def test_a_step_is_noticed_where_it_reaches_the_gate(seed: int) -> None:
 def test_what_no_row_tells_is_never_noticed() -> None:
     """One bearing leaves its own direction open, and no rows everything."""
     cov, rows = problem(1)
-    some_s, longest_s = detection_delay_s(MEAN, cov, rows[:1], 1.0, GATE, SPEED, np.empty(6))
+    some_s, longest_s = delay_s(cov, rows[:1])
     assert math.isfinite(some_s)
     assert longest_s == math.inf
-    assert detection_delay_s(MEAN, cov, rows[:0], 1.0, GATE, SPEED, np.empty(6)) == (
-        math.inf,
-        math.inf,
-    )
+    assert delay_s(cov, rows[:0]) == (math.inf, math.inf)
 
 
 def test_a_step_at_any_time_moves_the_place_by_half_of_it() -> None:
@@ -81,20 +87,18 @@ def velocities(sd: float) -> Array:
 
 def test_a_measured_velocity_shows_a_step_at_once() -> None:
     cov, rows = 0.01 * np.eye(6), velocities(0.1)
-    assert detection_delay_s(MEAN, cov, rows, 1.0, GATE, SPEED, np.empty(6)) == (0.0, 0.0)
-    assert measures_velocity(MEAN, rows, 1.0)
-    assert not measures_velocity(MEAN, rows[:1], 1.0)
-    assert not measures_velocity(MEAN, problem(1)[1], 1.0)
+    assert delay_s(cov, rows) == (0.0, 0.0)
+    _, H = linearise(rows, MEAN, 1.0)
+    assert measures_velocity(H)
+    assert not measures_velocity(H[:1])
+    assert not measures_velocity(linearise(problem(1)[1], MEAN, 1.0)[1])
 
 
 def test_a_velocity_too_uncertain_to_show_a_step_leaves_it_to_the_positions() -> None:
     """At sd so large that the step is far within the gate, the delay is that of the other rows."""
     cov, rows = problem(2)
-    alone = detection_delay_s(MEAN, cov, rows, 1.0, GATE, SPEED, np.empty(6))
+    alone = delay_s(cov, rows)
     with_both = np.concatenate([rows, velocities(1e6)])
-    both = detection_delay_s(MEAN, cov, with_both, 1.0, GATE, SPEED, np.empty(6))
+    both = delay_s(cov, with_both)
     np.testing.assert_allclose(both, alone, rtol=1e-6)
-    assert detection_delay_s(MEAN, cov, velocities(1e6), 1.0, GATE, SPEED, np.empty(6)) == (
-        math.inf,
-        math.inf,
-    )
+    assert delay_s(cov, velocities(1e6)) == (math.inf, math.inf)

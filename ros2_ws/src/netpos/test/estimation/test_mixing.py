@@ -26,6 +26,7 @@ from netpos.estimation.motion import (
     noise,
     transition,
 )
+from netpos.estimation.predicted import predicted_rows
 from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
@@ -67,7 +68,8 @@ def moved_and_updated(
 
 def log_likelihood(mean: Array, cov: Array, rows: Array) -> float:
     """Log density of ``rows`` as the extended Kalman filter at mean, cov sees them."""
-    distance, size = neg2_log_likelihood(mean, cov, rows, 0.0, True)
+    predicted, index = predicted_rows(mean, cov, rows, 0.0), np.arange(len(rows))
+    distance, size = neg2_log_likelihood(mean, cov, rows, 0.0, predicted, index)
     return float(-0.5 * (distance + size))
 
 

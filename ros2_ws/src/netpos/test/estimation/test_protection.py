@@ -21,11 +21,14 @@ from netpos.estimation.measurement import (
     linearise,
 )
 from netpos.estimation.mixture.gaussians import Mixture
+from netpos.estimation.motion import NO_BIAS
+from netpos.estimation.predicted import predicted_rows
 from netpos.estimation.protection import (
     RISK_MIN,
     FusedEpoch,
     gaussian_radius,
     gaussian_tail,
+    level_scratch,
     manoeuvre_level,
     mixture_radius,
     protection_level,
@@ -34,8 +37,8 @@ from netpos.estimation.protection import (
 from netpos.estimation.rows import linear_rows, rsu_axes, rsu_rows
 from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
-from netpos.tracking import TrackerConfig
-from netpos.tracking.fit import innovations_and_level, innovations_with_sd
+from netpos.tracking import TrackerConfig, estimates
+from netpos.tracking.fit import innovations_with_sd
 from netpos.tracking.models import options_of
 from scipy import integrate, optimize, stats
 
@@ -176,8 +179,9 @@ def test_a_manoeuvre_is_noticed_where_the_gate_begins_to_refuse() -> None:
     weaker bearing alone sees a device that moves across it, and lets it pass until just then."""
     mean, cov, sd, gate = np.array([100.0, 0, 0, 0, 0, 0]), np.zeros((6, 6)), math.radians(1), 9.0
     rows = np.vstack([azimuth_row(0.0, 0.0, sd, mean), azimuth_row(100.0, 40.0, sd, mean)])
-    h, speed = np.empty(6), 2.5
-    typical, longest = detection_delay_s(mean, cov, rows, 0.0, gate, speed, h)
+    speed = 2.5
+    predicted = predicted_rows(mean, cov, rows, 0.0)
+    typical, longest = detection_delay_s(rows, predicted, gate, speed)
     assert longest == pytest.approx(3.0 * sd * 100.0 / speed, rel=1e-9)
     moved = mean.copy()
     moved[1] += longest * speed
@@ -186,7 +190,7 @@ def test_a_manoeuvre_is_noticed_where_the_gate_begins_to_refuse() -> None:
     a, b = 100.0 * sd, 40.0 * sd
     expected = 2.0 * math.sqrt(gate / ((1 / a**2 + 1 / b**2) / 2)) / speed
     assert typical == pytest.approx(expected, rel=1e-9)
-    wider = detection_delay_s(mean, np.eye(6), rows, 0.0, gate, speed, h)
+    wider = detection_delay_s(rows, predicted_rows(mean, np.eye(6), rows, 0.0), gate, speed)
     assert wider[0] > typical
     assert wider[1] > longest
 
@@ -203,6 +207,13 @@ def fused(
     prior: Array, cov: Array, rows: Array, accepted: Array, unheard_s: float, mean: Array
 ) -> FusedEpoch:
     return FusedEpoch(prior, cov, rows, accepted, unheard_s, mean)
+
+
+def level_of(epoch: FusedEpoch, said: FilterOptions) -> float:
+    """``manoeuvre_level`` of an epoch."""
+    predicted = predicted_rows(epoch.prior_mean, epoch.prior_cov, epoch.rows, said.height_m)
+    memory = level_scratch(epoch.mean.size, len(epoch.rows))
+    return float(manoeuvre_level(epoch, predicted, said, memory))
 
 
 @pytest.mark.parametrize("unheard_s", [0.1, 5.0])
@@ -228,7 +239,7 @@ def test_level_of_a_manoeuvre_is_a_second_answer_and_how_far_it_is(unheard_s: fl
     expected = np.linalg.norm(x[POSITION] - mean[POSITION]) + protection_level(
         P[POSITION, POSITION], 1e-4
     )
-    level = manoeuvre_level(fused(prior, cov, rows, accepted, unheard_s, mean), options())
+    level = level_of(fused(prior, cov, rows, accepted, unheard_s, mean), options())
     assert level == pytest.approx(expected, rel=1e-6)
 
 
@@ -244,7 +255,7 @@ def test_level_of_a_manoeuvre_with_biases_that_tell_nothing() -> None:
         state = mean.copy()
         state[POSITION] += 0.7, -0.4
         epoch = fused(mean, P, rows, np.ones(2), 0.3, state)
-        levels.append(manoeuvre_level(epoch, options()))
+        levels.append(level_of(epoch, options()))
         assert np.array_equal(mean[:6], prior)
         assert np.array_equal(P[:6, :6], cov)
     assert levels[0] == pytest.approx(levels[1], rel=1e-9)
@@ -263,9 +274,8 @@ def test_level_of_a_manoeuvre_is_linearised_at_its_own_answer() -> None:
         ]
     )
     accepted, mean, height_m = np.array([1.0, 1.0, 0.0]), prior + 0.4, said.height_m
-    _, longest_s = detection_delay_s(
-        prior, cov, rows, height_m, said.gate_nis[2], 4.0, np.empty(6)
-    )
+    predicted = predicted_rows(prior, cov, rows, height_m)
+    _, longest_s = detection_delay_s(rows, predicted, said.gate_nis[2], 4.0)
     nodes, weights = np.polynomial.legendre.leggauss(3)
     times_s = longest_s * (nodes + 1.0) / 2.0
     wide = sum(w / 2.0 * opened(cov, 4.0, s) for s, w in zip(times_s, weights, strict=True))
@@ -280,7 +290,7 @@ def test_level_of_a_manoeuvre_is_linearised_at_its_own_answer() -> None:
     expected = np.linalg.norm(x[POSITION] - mean[POSITION]) + protection_level(
         P[POSITION, POSITION], 1e-4
     )
-    level = manoeuvre_level(fused(prior, cov, rows, accepted, 0.1, mean), said)
+    level = level_of(fused(prior, cov, rows, accepted, 0.1, mean), said)
     assert level == pytest.approx(expected, rel=1e-9)
 
 
@@ -288,39 +298,40 @@ def test_a_manoeuvre_nobody_could_notice() -> None:
     """Along a single bearing, or without a gate."""
     mean, accepted = np.array([100.0, 0, 0, 0, 0, 0]), np.ones(1)
     row = azimuth_row(0.0, 0.0, 0.01, mean)
-    level = manoeuvre_level(fused(mean, np.eye(6), row, accepted, 0.1, mean), options())
+    level = level_of(fused(mean, np.eye(6), row, accepted, 0.1, mean), options())
     assert math.isinf(level)
     fix = linear_rows(mean[POSITION], np.eye(2), np.eye(2, 6), 0)
     for probability, finite in ((1.0, False), (0.9999, True)):
         epoch = fused(mean, np.eye(6), fix, accepted, 0.1, mean)
-        level = manoeuvre_level(epoch, options(probability))
+        level = level_of(epoch, options(probability))
         assert math.isfinite(level) is finite
 
 
 @pytest.mark.parametrize("speed", [0.0, 4.0])
-def test_innovations_and_level_in_one_go(speed: float) -> None:
+def test_an_epoch_tells_its_innovations_and_the_level_of_a_manoeuvre(speed: float) -> None:
+    """Both of the prediction, whose second group is refused: as each by itself."""
     prior, cov = np.array([10.0, 20.0, 3.0, -1.0, 0.0, 0.0]), np.diag([4.0, 9.0, 0.2, 0.3, 1, 1])
     rows = np.vstack([azimuth_row(-50.0, 0.0, 0.05, prior), azimuth_row(9.0, -80.0, 0.02, prior)])
     rows[:, GROUP] = 0, 1
-    mean, taken, fits = prior + 0.2, np.array([1.0, 0.0]), np.full((2, 2), np.nan)
-    said = options(speed=speed)
-    epoch = fused(prior, cov, rows, taken, 0.3, mean)
-    level = innovations_and_level(epoch, cov, said, fits)
-    assert np.array_equal(fits, innovations_with_sd(prior, cov, rows, said.height_m))
-    assert level == (manoeuvre_level(epoch, said) if speed else 0.0)
+    config = TrackerConfig(filter="ekf", manoeuvre_speed_sd_mps=speed, integrity_risk=1e-4)
+    estimate, said = estimates.start(config, 0, prior, cov), options_of(config)
+    step = estimate.step(0, 0.0, 0, rows.copy(), NO_BIAS)
+    fits = innovations_with_sd(prior, cov, rows, said.height_m)
+    np.testing.assert_allclose(step.innovations, fits, rtol=1e-12)
+    epoch = fused(prior, cov, rows, np.ones(2), 0.0, estimate.mean)
+    assert step.undetected_m == pytest.approx(level_of(epoch, said) if speed else 0.0, rel=1e-9)
 
 
 @pytest.mark.parametrize("where", ["mean", "cov"])
 def test_nothing_is_told_of_what_is_not_sound(where: str) -> None:
-    mean, cov, fits = np.zeros(6), np.eye(6), np.full((1, 2), 7.0)
+    mean, cov = np.zeros(6), np.eye(6)
     if where == "mean":
-        mean[X.PX] = np.nan
+        mean[X.VX] = 3e9
     else:
-        cov[X.PY, X.PY] = -1.0
+        cov[X.PY, X.PX] = cov[X.PX, X.PY] = 2.0
     row = azimuth_row(-50.0, 0.0, 0.05, np.zeros(6))
-    epoch = fused(np.zeros(6), np.eye(6), row, np.ones(1), 0.1, mean)
-    assert math.isnan(innovations_and_level(epoch, cov, options(), fits))
-    assert np.array_equal(fits, [[7.0, 7.0]])
+    estimate = estimates.start(TrackerConfig(filter="ekf"), 0, mean, cov)
+    assert math.isnan(estimate.step(0, 0.0, 0, row, NO_BIAS).undetected_m)
 
 
 @pytest.mark.parametrize("risk", [0.3, 1e-2, 1e-4, 1e-8])

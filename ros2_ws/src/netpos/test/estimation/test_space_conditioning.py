@@ -15,6 +15,7 @@ from netpos.estimation.measurement import (
     VALUE,
     Kind,
 )
+from netpos.estimation.predicted import predicted_rows
 from netpos.estimation.space_conditioning import reweight_3d
 from netpos.estimation.state import ERR_BIASES, Err, Nav, X
 from netpos.inertial.strapdown import NAV
@@ -57,7 +58,7 @@ def test_in_the_plane_it_is_the_planar_one(weights: Robust, late: tuple[float, f
     )
     planar, spatial = rows.copy(), rows.copy()
     options = RobustOptions(int(weights), 2.0, *late)
-    reweight(mean, cov, planar, 0.0, options, np.empty(6))
+    reweight(cov, planar, predicted_rows(mean, cov, planar, 0.0), options)
     reweight_3d(nav, wide, spatial, options)
     np.testing.assert_allclose(spatial, planar, rtol=1e-9)
     changed = not np.array_equal(planar, rows)

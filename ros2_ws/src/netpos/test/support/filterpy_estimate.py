@@ -1,5 +1,5 @@
-"""An estimate of a track on FilterPy: the rules of ``engine.step`` written once more around
-``filterpy_reference``."""
+"""An estimate of a track on FilterPy: the rules of ``engine.predict_epoch`` and ``update_epoch``
+written once more around ``filterpy_reference``."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from netpos.estimation.measurement import GROUP
 from netpos.estimation.motion import Parameter, add_velocity_step
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.estimates import Step
+from netpos.tracking.fit import innovations_with_sd
 from netpos.tracking.models import augmented, initial_extra_sd, motions_of, options_of
 
 
@@ -59,7 +61,7 @@ class FilterpyEstimate:
 
     def step(
         self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
-    ) -> tuple[float, int, Array]:
+    ) -> Step:
         self.predict(stamp_ns, bias)
         self.prior = self.mean, self.cov
         mean, cov = self.mean.copy(), self.cov.copy()
@@ -68,11 +70,12 @@ class FilterpyEstimate:
         add_velocity_step(sd, unheard_s, 0.0, cov)
         accepted = np.zeros(int(rows[-1, GROUP]) + 1)
         gate, height_m = self._options.gate_nis, self._options.height_m
+        innovations = innovations_with_sd(mean, cov, rows, height_m)
         nis, used = self._update(mean, cov, rows, height_m, gate, accepted)
         if used:
             self.mean, self.cov = mean, cov
             engine.set_velocity_step_noise(self._motion, sd, unheard_s, 0.0, 0.0)
-        return nis, used, accepted
+        return Step(nis, used, accepted, innovations, 0.0)
 
     def copy(self) -> FilterpyEstimate:
         twin = copy.copy(self)

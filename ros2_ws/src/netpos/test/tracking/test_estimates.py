@@ -211,10 +211,10 @@ def test_step_keeps_the_prediction_and_what_it_accepted(name: str) -> None:
     ahead.predict(T0 + 10**9, NO_BIAS)
     far = np.vstack([fix(4.0, 6.0), fix(900.0, 6.0)])
     far[2:, 6] = 1
-    nis, dof, accepted = estimate.step(T0 + 10**9, 1.0, 0, far, NO_BIAS)
-    assert accepted.tolist() == [1.0, 0.0]
-    assert dof == 2
-    assert 0.0 <= nis < 1.0
+    step = estimate.step(T0 + 10**9, 1.0, 0, far, NO_BIAS)
+    assert step.accepted.tolist() == [1.0, 0.0]
+    assert step.dof == 2
+    assert 0.0 <= step.nis < 1.0
     np.testing.assert_allclose(estimate.prior[0], ahead.mean, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(estimate.prior[1], ahead.cov, rtol=1e-12, atol=1e-15)
     # models that interact: to the stop, 20 times its variance away, the fix may be an outlier
@@ -223,7 +223,8 @@ def test_step_keeps_the_prediction_and_what_it_accepted(name: str) -> None:
     assert cov[X.PX, X.PX] < 0.3 < ahead.cov[X.PX, X.PX]
     # nothing accepted: the prediction it is
     refused = started(name)
-    assert refused.step(T0 + 10**9, 1.0, 0, fix(900.0, 6.0), NO_BIAS)[1:] == (0, [0.0])
+    step = refused.step(T0 + 10**9, 1.0, 0, fix(900.0, 6.0), NO_BIAS)
+    assert (step.dof, step.accepted.tolist()) == (0, [0.0])
     np.testing.assert_allclose(refused.mean, ahead.mean, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(refused.cov, ahead.cov, rtol=1e-12, atol=1e-15)
 
@@ -233,11 +234,11 @@ def test_many_rows_need_no_warning() -> None:
     estimate = started("ekf")
     rows = np.vstack([fix(1.0, 2.0) for _ in range(30)])
     rows[:, 6] = np.repeat(np.arange(30), 2)
-    _, dof, accepted = estimate.step(T0, 0.0, 0, rows, NO_BIAS)
-    assert (dof, accepted.sum()) == (60, 30)
+    step = estimate.step(T0, 0.0, 0, rows, NO_BIAS)
+    assert (step.dof, step.accepted.sum()) == (60, 30)
     assert estimate.cov[X.PX, X.PX] == pytest.approx(1.0 / (1.0 + 30 / 0.25))
-    _, dof, accepted = estimate.step(T0, 0.0, 0, fix(1.0, 2.0), NO_BIAS)
-    assert (dof, accepted.tolist()) == (2, [1.0])
+    step = estimate.step(T0, 0.0, 0, fix(1.0, 2.0), NO_BIAS)
+    assert (step.dof, step.accepted.tolist()) == (2, [1.0])
 
 
 @pytest.mark.parametrize(
@@ -263,7 +264,7 @@ def test_interacting_models_in_one_kernel_are_the_same(name: str) -> None:
     times = np.array([0.0, 0.1, 0.2, 0.3, 1.9, 2.0])
     stamps = T0 + np.round(times * 1e9).astype(np.int64)
     rows = [fix(1.0 + 3.0 * t + 500.0 * (t == 0.2), 2.0 + 4.0 * t) for t in times]
-    run = Run(np.empty((6, 7)), np.empty((6, 7, 7)), *np.empty((4, 6)))
+    run = Run(np.empty((6, 7)), np.empty((6, 7, 7)), *np.empty((5, 6)))
     epochs = Epochs(stamps, np.arange(0, 14, 2), np.vstack(rows))
     done = run_epochs(
         epochs,
@@ -276,9 +277,13 @@ def test_interacting_models_in_one_kernel_are_the_same(name: str) -> None:
     heard, rejected = T0, 0
     for k, stamp in enumerate(stamps.tolist()):
         part = rows[k].copy()
-        nis, dof, taken = estimate.step(stamp, (stamp - heard) * 1e-9, rejected, part, NO_BIAS)
-        heard, rejected = (stamp, 0) if taken.any() else (heard, rejected + 1)
-        assert (run.nis[k], run.dof[k]) == (nis, dof)
+        step = estimate.step(stamp, (stamp - heard) * 1e-9, rejected, part, NO_BIAS)
+        heard, rejected = (stamp, 0) if step.accepted.any() else (heard, rejected + 1)
+        assert (run.nis[k], run.dof[k], run.undetected_m[k]) == (
+            step.nis,
+            step.dof,
+            step.undetected_m,
+        )
         np.testing.assert_array_equal(run.means[k], estimate.mean)
         np.testing.assert_array_equal(run.covs[k], estimate.cov)
         assert run.radius[k] == estimate.radius(0.0)

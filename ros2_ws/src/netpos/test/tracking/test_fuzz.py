@@ -19,6 +19,7 @@ import pytest
 from netpos.estimation import conditioning
 from netpos.estimation.measurement import GATE_VARIANCE, VARIANCE, Kind
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
+from netpos.estimation.predicted import predicted_rows
 from netpos.estimation.rows import Coupling, rsu_axes, rsu_rows
 from netpos.messages.values import (
     AngleConvention,
@@ -396,7 +397,7 @@ def test_a_capped_variance_leaves_the_gate_variance_positive() -> None:
     rows = rsu_rows(m, info, rsu_axes(info), 0, coupling)
     mean, cov = np.array([30.0, 0.0, 1.0, 1.0, 0.0, 0.0]), np.eye(6)
     options = conditioning.RobustOptions(0, 4.0, 0.2, 20.0)
-    conditioning.reweight(mean, cov, rows, 0.0, options, np.zeros(6))
+    conditioning.reweight(cov, rows, predicted_rows(mean, cov, rows, 0.0), options)
     assert rows[0, GATE_VARIANCE] > 0.0
     assert rows[0, VARIANCE] > 0.0
 

@@ -17,6 +17,8 @@ from netpos.estimation.fusion import (
     W_GATE_VARIANCE,
     W_INNOVATION,
     W_PRIOR,
+    W_PRIOR_VARIANCE,
+    W_SECOND_ORDER,
     W_USE,
     W_VARIANCE,
     fuse,
@@ -24,6 +26,7 @@ from netpos.estimation.fusion import (
     group_nis,
     is_definite,
     keeps_digits,
+    predicted_in,
     workspace,
 )
 from netpos.estimation.gate import leave_odd_out
@@ -35,14 +38,9 @@ from netpos.estimation.iteration import (
     iterate_used,
     refine_used,
 )
-from netpos.estimation.measurement import (
-    GATE_VARIANCE,
-    GROUP,
-    VARIANCE,
-    curvature_variance,
-    innovation_row,
-)
+from netpos.estimation.measurement import GATE_VARIANCE, GROUP, VARIANCE
 from netpos.estimation.motion import add_noise, is_straight, propagate, transition
+from netpos.estimation.predicted import predict_rows
 from netpos.estimation.sensors.row import group_end
 from netpos.estimation.state import N_CORE, X
 from netpos.messages.values import Array
@@ -133,17 +131,16 @@ def _predict_biased(cov: Array, dt: float, bias: Array) -> None:
 
 @leaf
 def _small_nis(start: int, stop: int, work: Array, n: int, m: int) -> float:
-    """``group_nis`` of one or two rows of the workspace, where P H' is known."""
+    """``group_nis`` of one or two rows of the workspace."""
     first, second, ph = W_COV + n + start, W_COV + n + start + 1, m
     r0, r1 = work[W_INNOVATION, start], 0.0
-    s00, s01, s11 = work[W_GATE_VARIANCE, start], 0.0, 1.0
-    for a in range(n):
-        s00 += work[first, a] * work[first + ph, a]
+    s00 = work[W_GATE_VARIANCE, start] + work[W_PRIOR_VARIANCE, start]
+    s01, s11 = 0.0, 1.0
     if stop - start == 2:
-        r1, s11 = work[W_INNOVATION, start + 1], work[W_GATE_VARIANCE, start + 1]
+        r1 = work[W_INNOVATION, start + 1]
+        s11 = work[W_GATE_VARIANCE, start + 1] + work[W_PRIOR_VARIANCE, start + 1]
         for a in range(n):
             s01 += work[first, a] * work[second + ph, a]
-            s11 += work[second, a] * work[second + ph, a]
     rest = r1 - s01 / s00 * r0
     return float(r0 * r0 / s00 + rest * rest / (s11 - s01 * s01 / s00))
 
@@ -214,22 +211,13 @@ def gate(
     accepted: Array,
     work: Array,
 ) -> int:
-    """Linearise ``rows`` at the prior into the workspace and accept or reject each group as a
-    whole; returns the number of rows to fuse."""
-    n, m = mean.size, rows.shape[0]
+    """Accept or reject each group of the rows predicted in the workspace as a whole; returns the
+    number of rows to fuse."""
+    m = rows.shape[0]
     is_open = math.isinf(gate_nis[gate_nis.size - 1])
     for i in range(m):
-        h, ph = work[W_COV + n + i], work[W_COV + n + m + i]
-        extra = curvature_variance(rows[i], mean, cov, height_m)
-        work[W_VARIANCE, i] = rows[i, VARIANCE] + extra
-        work[W_GATE_VARIANCE, i] = rows[i, GATE_VARIANCE] + extra
-        work[W_INNOVATION, i] = innovation_row(rows[i], mean, height_m, h)
-        if not is_open:
-            for a in range(n):
-                total = 0.0
-                for b in range(n):
-                    total += cov[a, b] * h[b]
-                ph[a] = total
+        work[W_VARIANCE, i] = rows[i, VARIANCE] + work[W_SECOND_ORDER, i]
+        work[W_GATE_VARIANCE, i] = rows[i, GATE_VARIANCE] + work[W_SECOND_ORDER, i]
     used, start = 0, 0
     while start < m:
         group = int(rows[start, GROUP])
@@ -265,10 +253,27 @@ def update(
         (last entry inf: no gate)
     iterations : linearisations at most; 1 is the extended Kalman filter
     accepted : (groups,), filled with 0 or 1
-    work : of ``workspace``
+    work : of ``workspace``, filled
 
     Returns the NIS of the accepted rows together and their number.
     """
+    predict_rows(mean, cov, rows, height_m, predicted_in(work, mean.size, rows.shape[0]))
+    nis, used = update_predicted(mean, cov, rows, height_m, gate_nis, iterations, accepted, work)
+    return nis, used
+
+
+@leaf
+def update_predicted(
+    mean: Array,
+    cov: Array,
+    rows: Array,
+    height_m: float,
+    gate_nis: Array,
+    iterations: int,
+    accepted: Array,
+    work: Array,
+) -> tuple[float, int]:
+    """``update`` with rows that are predicted in the workspace already."""
     used = gate(mean, cov, rows, height_m, gate_nis, iterations, accepted, work)
     if used == 0:
         return 0.0, 0
@@ -355,7 +360,7 @@ def _update_form(
     work: Array,
 ) -> tuple[float, int]:
     height_m, iterations = options.height_m, options.iterations
-    nis, used = update(mean, cov, rows, height_m, gate_nis, iterations, accepted, work)
+    nis, used = update_predicted(mean, cov, rows, height_m, gate_nis, iterations, accepted, work)
     return nis, used
 
 

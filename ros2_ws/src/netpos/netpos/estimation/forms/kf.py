@@ -12,8 +12,10 @@ from netpos.estimation.compile import kernel, spliced
 from netpos.estimation.factor import factor
 from netpos.estimation.forms import ekf
 from netpos.estimation.forms.form import FilterForm
+from netpos.estimation.fusion import predicted_in
 from netpos.estimation.gate import gate_groups, select_rows
-from netpos.estimation.measurement import GATE_VARIANCE, GROUP, KIND, VARIANCE, Kind, linearise
+from netpos.estimation.measurement import GATE_VARIANCE, GROUP, KIND, VARIANCE, Kind
+from netpos.estimation.predicted import PredictedRows, predicted_rows
 from netpos.estimation.state import X
 from netpos.messages.values import Array
 
@@ -68,9 +70,26 @@ def update_shared(
     """``update`` that also carries ``own`` (n, n), or (0, 0): the part of ``cov`` that the noise
     of these rows and those before made. What else is in ``cov`` comes from the motion and the
     start, which others who watch the same object share."""
-    m = rows.shape[0]
-    innovation, H = linearise(rows, mean, height_m)
-    S = H @ cov @ H.T
+    predicted = predicted_rows(mean, cov, rows, height_m)
+    nis, used = _update_predicted(mean, cov, rows, predicted, gate_nis, accepted, gain_floor, own)
+    return nis, used
+
+
+@kernel
+def _update_predicted(
+    mean: Array,
+    cov: Array,
+    rows: Array,
+    predicted: PredictedRows,
+    gate_nis: Array,
+    accepted: Array,
+    gain_floor: Array,
+    own: Array,
+) -> tuple[float, int]:
+    """``update_shared`` with the rows ``predicted``."""
+    m, n = rows.shape[0], mean.size
+    innovation, H = predicted.innovation[:m].copy(), predicted.H[:, :n].copy()
+    S = H @ predicted.HP[:, :n].copy().T
     for i in range(m):
         S[i, i] += rows[i, GATE_VARIANCE]
     gate_groups(rows, innovation, S, gate_nis, accepted)
@@ -85,6 +104,22 @@ def update_shared(
         residual = innovation[i] - np.dot(H[i], mean - start)
         fuse_row(mean, cov, residual, H[i], rows[i, VARIANCE], gain_floor, own)
     return nis, index.size
+
+
+@kernel
+def _update_in(
+    mean: Array,
+    cov: Array,
+    rows: Array,
+    gate_nis: Array,
+    accepted: Array,
+    gain_floor: Array,
+    work: Array,
+) -> tuple[float, int]:
+    """``update`` with rows that are predicted in the workspace."""
+    predicted, own = predicted_in(work, mean.size, rows.shape[0]), np.empty((0, 0))
+    nis, used = _update_predicted(mean, cov, rows, predicted, gate_nis, accepted, gain_floor, own)
+    return nis, used
 
 
 @kernel
@@ -145,9 +180,9 @@ def _update_form(
     options: FilterOptions,
     gate_nis: Array,
     accepted: Array,
-    _work: Array,
+    work: Array,
 ) -> tuple[float, int]:
-    nis, used = update(mean, cov, rows, options.height_m, gate_nis, accepted, options.of_form)
+    nis, used = _update_in(mean, cov, rows, gate_nis, accepted, options.of_form, work)
     return nis, used
 
 

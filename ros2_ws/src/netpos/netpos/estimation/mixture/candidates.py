@@ -11,18 +11,17 @@ import numpy as np
 from netpos.estimation import fusion
 from netpos.estimation.compile import kernel
 from netpos.estimation.engine import (
-    GATE_SIZE,
     FilterOptions,
     cov_of,
     cov_or_sqrt_of,
     is_sound,
-    update,
     update_with_gate,
 )
 from netpos.estimation.fit import neg2_log_likelihood
 from netpos.estimation.gate import accepted_rows
 from netpos.estimation.measurement import GROUP, is_range
 from netpos.estimation.mixture.gaussians import Mixture
+from netpos.estimation.predicted import PredictedRows, predict_rows
 from netpos.estimation.sensors.row import group_end
 from netpos.messages.values import Array
 
@@ -86,14 +85,19 @@ def outlier_log(rows: Array) -> float:
 
 @kernel
 def log_likelihood(
-    mean: Array, cov: Array, rows: Array, height_m: float, accepted: Array
+    mean: Array,
+    cov: Array,
+    rows: Array,
+    height_m: float,
+    predicted: PredictedRows,
+    accepted: Array,
 ) -> float:
-    """Log density of ``rows`` as mean (n,), cov (n, n) predict them; what is not accepted is an
-    outlier."""
+    """Log density of ``rows`` as mean (n,), cov (n, n) ``predicted`` them; what is not accepted is
+    an outlier."""
     total, start = 0.0, 0
     kept = accepted_rows(rows, accepted)
     if kept.size > 0:
-        distance, size = neg2_log_likelihood(mean, cov, rows[kept], height_m, False)
+        distance, size = neg2_log_likelihood(mean, cov, rows, height_m, predicted, kept)
         total = -0.5 * (distance + size)
     while start < rows.shape[0]:
         stop = group_end(rows, start)
@@ -104,53 +108,43 @@ def log_likelihood(
 
 
 @kernel
-def weigh(
-    k: int,
-    log_weight: float,
-    prior_mean: Array,
-    prior_cov: Array,
-    rows: Array,
-    options: FilterOptions,
-    found: Candidates,
+def apply(
+    k: int, log_weight: float, rows: Array, options: FilterOptions, found: Candidates, work: Array
 ) -> None:
-    """Weigh the candidate ``k`` by what its prediction says of ``rows``."""
-    likelihood = log_likelihood(prior_mean, prior_cov, rows, options.height_m, found.accepted[k])
-    sound = math.isfinite(likelihood) and is_sound(found.means[k], found.covs[k])
-    found.log_weights[k] = log_weight + likelihood if sound else -math.inf
+    """Gate and apply ``rows`` to the candidate ``k``, which holds its prediction, and weigh it by
+    what this says of them. Nothing accepted leaves the prediction. ``work`` keeps the rows as the
+    prediction sees them."""
+    predict_rows(
+        found.means[k],
+        found.covs[k],
+        rows,
+        options.height_m,
+        fusion.predicted_in(work, found.means.shape[1], rows.shape[0]),
+    )
+    apply_predicted(k, log_weight, rows, options, options.gate_nis, found, work)
 
 
 @kernel
-def apply(
-    k: int, log_weight: float, rows: Array, options: FilterOptions, found: Candidates
+def apply_predicted(
+    k: int,
+    log_weight: float,
+    rows: Array,
+    options: FilterOptions,
+    gate_nis: Array,
+    found: Candidates,
+    work: Array,
 ) -> None:
-    """Gate and apply ``rows`` to the candidate ``k``, which holds its prediction, and weigh it.
-    Nothing accepted leaves the prediction."""
+    """As ``apply``, with rows that are predicted in ``work`` already, and a gate of their own."""
     mean, cov, accepted = found.means[k], found.covs[k], found.accepted[k]
-    prior_mean, prior_cov = mean.copy(), cov.copy()
-    work = fusion.workspace(mean.size, rows.shape[0])
+    prior_mean, prior_cov, height_m = mean.copy(), cov.copy(), options.height_m
     cov_or_sqrt = cov_or_sqrt_of(cov, options)
-    nis, used = update(mean, cov_or_sqrt, rows, options, accepted, work)
+    nis, used = update_with_gate(mean, cov_or_sqrt, rows, options, gate_nis, accepted, work)
     if used > 0:
         cov[:] = cov_of(cov_or_sqrt, options)
     else:
         mean[:] = prior_mean
     found.nis[k], found.used[k], found.within_s[k] = nis, used, 0.0
-    weigh(k, log_weight, prior_mean, prior_cov, rows, options, found)
-
-
-@kernel
-def apply_all(
-    k: int, log_weight: float, rows: Array, options: FilterOptions, found: Candidates
-) -> None:
-    """As ``apply`` without a gate: ``rows`` come from the tail of their errors."""
-    mean, cov, accepted = found.means[k], found.covs[k], found.accepted[k]
-    prior_mean, prior_cov = mean.copy(), cov.copy()
-    work = fusion.workspace(mean.size, rows.shape[0])
-    no_gate = np.full(GATE_SIZE, np.inf)
-    cov_or_sqrt = cov_or_sqrt_of(cov, options)
-    found.nis[k], found.used[k] = update_with_gate(
-        mean, cov_or_sqrt, rows, options, no_gate, accepted, work
-    )
-    cov[:] = cov_of(cov_or_sqrt, options)
-    found.within_s[k] = 0.0
-    weigh(k, log_weight, prior_mean, prior_cov, rows, options, found)
+    predicted = fusion.predicted_in(work, mean.size, rows.shape[0])
+    likelihood = log_likelihood(prior_mean, prior_cov, rows, height_m, predicted, accepted)
+    sound = math.isfinite(likelihood) and is_sound(mean, cov)
+    found.log_weights[k] = log_weight + likelihood if sound else -math.inf

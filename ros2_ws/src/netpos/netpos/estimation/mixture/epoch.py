@@ -16,15 +16,17 @@ from netpos.estimation.engine import (
     FilterOptions,
     Run,
     Scratch,
-    StepResult,
     cov_of,
     cov_or_sqrt_of,
+    is_sound,
     predict,
+    predict_epoch,
     scratch,
     set_velocity_step_noise,
-    step,
+    update_epoch,
 )
 from netpos.estimation.forms.choice import write_cov, write_cov_or_sqrt
+from netpos.estimation.fusion import predicted_in, workspace
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.mixture import mixing
 from netpos.estimation.mixture.candidates import (
@@ -46,7 +48,14 @@ from netpos.estimation.mixture.sectors import (
     reduced_by_sector,
 )
 from netpos.estimation.mixture.turns import add_explanations, may_turn, turn
-from netpos.estimation.protection import mixture_radius
+from netpos.estimation.predicted import note_innovations, predict_rows
+from netpos.estimation.protection import (
+    FusedEpoch,
+    LevelScratch,
+    level_scratch,
+    manoeuvre_level,
+    mixture_radius,
+)
 from netpos.messages.values import Array
 
 _MERGE_SHARE = 0.1  # of the integrity risk: what merging two components may cost
@@ -117,22 +126,26 @@ def _add_candidates(
     at: int,
     options: FilterOptions,
     found: Candidates,
+    work: Array,
 ) -> int:
     """Make the candidate ``k`` from the component ``k`` of ``prior``, and at the end one for each
     other sector of a phase in the row ``at`` and each explanation of what is refused; the number
-    of candidates then."""
+    of candidates then. ``work`` keeps the rows as the component sees them."""
+    mean, cov, rows = prior.means[k], prior.covs[k], epoch.rows
     if at >= 0:
-        end = add_turns_of_phase(k, end, prior, epoch.rows, at, options, found)
+        end = add_turns_of_phase(k, end, prior, rows, at, options, found)
+        predicted = predicted_in(work, mean.size, rows.shape[0])
+        predict_rows(mean, cov, rows, options.height_m, predicted)
     else:
-        found.means[k], found.covs[k] = prior.means[k], prior.covs[k]
+        found.means[k], found.covs[k] = mean, cov
         if options.models > 1:
             mixing.open_velocity(k, epoch, options, found)
-        apply(k, prior.log_weights[k], epoch.rows, options, found)
+        apply(k, prior.log_weights[k], rows, options, found, work)
     if options.models > 1 and found.used[k] == 0:
-        found.covs[k] = prior.covs[k]
+        found.covs[k] = cov
     refuses = found.accepted[k].sum() < found.accepted.shape[1]
     if refuses and options.manoeuvre_speed_sd > 0.0:
-        end = add_explanations(k, k, end, prior, epoch, options, found)
+        end = add_explanations(k, k, end, prior, epoch, options, found, work)
     return int(end)
 
 
@@ -151,14 +164,14 @@ def _at_once(
     count, groups = prior.log_weights.size, int(rows[rows.shape[0] - 1, GROUP]) + 1
     sectors = 2 * most_turns(rows[at]) + 1 if at >= 0 else 0
     size = 3 * count + 1 + (sectors + 1) * (count + 1)
-    found = candidates(size, prior.means.shape[1], groups)
+    m, n = rows.shape[0], prior.means.shape[1]
+    found, work = candidates(size, n, groups), workspace(n, m)
     end = np.int64(count)
     for k in range(count):
-        end = _add_candidates(k, end, prior, epoch, at, options, found)
+        end = _add_candidates(k, end, prior, epoch, at, options, found, work)
     best = int(np.argmax(found.log_weights[:count]))
-    turns = found.accepted[best, 0] == 1.0 and may_turn(
-        prior.means[best], rows, since_turn_s, options
-    )
+    H = predicted_in(work, n, m).H  # velocities: of any component
+    turns = found.accepted[best, 0] == 1.0 and may_turn(H, groups, since_turn_s, options)
     if turns:
         weighed = Mixture(prior.means, prior.covs, found.log_weights[:count])
         for k in leaders(weighed):
@@ -199,23 +212,6 @@ def is_too_wide(
 
 
 @kernel
-def is_not_enough(
-    result: StepResult,
-    mean: Array,
-    epoch: EpochInput,
-    since_turn_s: float,
-    options: FilterOptions,
-) -> bool:
-    """Whether one component does not explain an epoch, of which ``engine.step`` made ``result``
-    and mean (n,): something is refused, or nothing tells that the device has not turned."""
-    groups = int(epoch.rows[epoch.rows.shape[0] - 1, GROUP]) + 1
-    if options.manoeuvre_speed_sd <= 0.0:
-        return False
-    refused = result.groups < groups
-    return bool(refused or may_turn(mean, epoch.rows, since_turn_s, options))
-
-
-@kernel
 def apply_epoch(
     components: Mixture,
     epoch: EpochInput,
@@ -249,36 +245,85 @@ def note_turn(found: Update, motion: Array, options: FilterOptions) -> None:
     set_velocity_step_noise(motion, 0.0, 0.0, speed_sd, found.within_s)
 
 
+class Outcome(NamedTuple):
+    """What came of an epoch of a track: its components; NIS of the rows accepted and their number;
+    how far [m] a manoeuvre that this epoch does not show may have taken the device (not a number
+    where the posterior is not sound); whether a component "it has turned" has begun."""
+
+    components: Mixture
+    nis: float
+    used: int
+    undetected_m: float
+    begun: bool
+
+
+class Memory(NamedTuple):
+    """Memory of ``advance`` for up to m rows: of one component, of ``manoeuvre_level``, and
+    innovations (m, 2) with their sd, as the whole estimate predicted them."""
+
+    step: Scratch
+    level: LevelScratch
+    innovations: Array
+
+
+@kernel
+def memory_of(n: int, m: int) -> Memory:
+    """Memory for ``advance`` with ``n`` states and up to ``m`` rows."""
+    return Memory(scratch(n, m), level_scratch(n, m), np.empty((m, 2)))
+
+
 @kernel
 def _by_one(
     x: Array,
     S: Array,
-    components: Mixture,
     epoch: EpochInput,
     since_turn_s: float,
     dynamics: Dynamics,
     options: FilterOptions,
     memory: Scratch,
-) -> tuple[bool, Update]:
-    """One epoch of the one component ``x`` (n,), ``S`` (n, n), in place: whether it does not
-    explain the epoch, and then its prediction, else what came of it."""
-    rows, nothing = epoch.rows, 0.0
+) -> tuple[bool, float, int]:
+    """One epoch of the one component ``x`` (n,), ``S`` (n, n), in place: whether that is enough,
+    NIS and number of the rows accepted. It is not where a late range has two paths, something is
+    refused, or nothing tells that the device has not turned; the rows are as they were then."""
+    rows, motion, n = epoch.rows, dynamics.motions[0], x.size
+    groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
+    predict_epoch(x, S, epoch, motion, dynamics.bias, options, memory)
+    predicted = predicted_in(memory.work, n, rows.shape[0])
     blocked = options.models == 1 and options.robust.nlos_probability > 0.0
+    if blocked and paths_are_open(rows, predicted, options):
+        return False, 0.0, 0
     raw = rows.copy() if blocked else rows
-    result = step(x, S, epoch, dynamics.motions[0], dynamics.bias, options, memory)
-    more = is_not_enough(result, x, epoch, since_turn_s, options)
-    if not more and blocked:
-        P = cov_of(memory.prior_cov_or_sqrt, options)
-        more = paths_are_open(memory.prior_mean, P, raw, options)
-    if more:
-        rows[:] = raw
-        before = one_component(memory.prior_mean, cov_of(memory.prior_cov_or_sqrt, options))
-        return True, Update(before, nothing, 0, nothing, nothing, False)
-    return False, Update(components, result.nis, result.used, nothing, nothing, False)
+    result = update_epoch(x, S, epoch, motion, options, memory)
+    if options.manoeuvre_speed_sd > 0.0:
+        refused = result.groups < groups
+        if refused or may_turn(predicted.H, groups, since_turn_s, options):
+            if blocked:
+                rows[:] = raw
+            return False, 0.0, 0
+    return True, result.nis, result.used
 
 
 @kernel
-def _advance(
+def _finish(
+    x: Array, S: Array, epoch: EpochInput, options: FilterOptions, memory: Memory
+) -> float:
+    """Fill the innovations of an epoch that the estimate ``x`` (n,), ``S`` (n, n) has had, from
+    the rows as its prediction saw them; ``Outcome.undetected_m``."""
+    step, rows = memory.step, epoch.rows
+    write_cov(options.filter, S, step.met_cov)
+    if not is_sound(x, step.met_cov):
+        return math.nan
+    predicted = predicted_in(step.work, x.size, rows.shape[0])
+    note_innovations(rows, predicted, memory.innovations)
+    if options.manoeuvre_speed_sd <= 0.0:
+        return 0.0
+    unheard_s, accepted = epoch.unheard_s, step.accepted
+    fused = FusedEpoch(step.prior_mean, step.prior_cov, rows, accepted, unheard_s, x)
+    return float(manoeuvre_level(fused, predicted, options, memory.level))
+
+
+@kernel
+def advance(
     x: Array,
     S: Array,
     components: Mixture,
@@ -286,36 +331,48 @@ def _advance(
     since_turn_s: float,
     dynamics: Dynamics,
     options: FilterOptions,
-    memory: Scratch,
-) -> Update:
-    """One epoch of a track: of its one component ``x`` (n,), ``S`` (n, n), in place, or of several
-    ``components``."""
-    rows, several = epoch.rows, components.log_weights.size > 1
-    moved = False
-    found: Update = Update(components, 0.0, 0, 0.0, 0.0, False)
+    memory: Memory,
+) -> Outcome:
+    """One epoch of a track: of its one component ``x`` (n,), ``S`` (n, n), or of several
+    ``components``, of which ``x`` and ``S`` are the moments; in place.
+
+    ``memory.step`` keeps the prediction of the whole estimate, and 0 or 1 of each group in
+    ``accepted``. ``dynamics.motions[0]`` keeps the velocity step that the epoch allowed for.
+    """
+    rows, several, step = epoch.rows, components.log_weights.size > 1, memory.step
     is_ambiguous = ambiguous_phase(rows, options) >= 0
     if not several and (is_ambiguous or epoch.dt_s > options.coast_after_s):
         P = cov_of(S, options)
         several = is_ambiguous or is_too_wide(x, P, epoch, dynamics, options)
         if several:
             components = one_component(x, P)
-    if not several and rows.shape[0] == 0:
-        predict(x, S, epoch.dt_s, dynamics.motions[0], dynamics.bias, options)
-        return found
     if not several:
-        moved, found = _by_one(x, S, components, epoch, since_turn_s, dynamics, options, memory)
-        if not moved:
-            return found
-        components = found.components
+        if rows.shape[0] == 0:
+            predict(x, S, epoch.dt_s, dynamics.motions[0], dynamics.bias, options)
+            return Outcome(components, 0.0, 0, 0.0, False)
+        enough, nis, used = _by_one(x, S, epoch, since_turn_s, dynamics, options, step)
+        if enough:
+            undetected_m = _finish(x, S, epoch, options, memory)
+            return Outcome(components, nis, used, undetected_m, False)
+        components = one_component(step.prior_mean, step.prior_cov)
     else:
         components = moved_to_epoch(components, epoch, dynamics, options)
-        found = Update(components, 0.0, 0, 0.0, 0.0, False)
-    if rows.shape[0] > 0:
-        found = apply_epoch(components, epoch, options, since_turn_s, memory.accepted)
+    if rows.shape[0] == 0:
+        mean, cov = moments(components)
+        x[:] = mean
+        write_cov_or_sqrt(options.filter, cov, S)
+        return Outcome(components, 0.0, 0, 0.0, False)
+    step.prior_mean[:], step.prior_cov[:] = moments(components)
+    write_cov_or_sqrt(options.filter, step.prior_cov, step.prior_cov_or_sqrt)
+    found = apply_epoch(components, epoch, options, since_turn_s, step.accepted)
+    predicted = predicted_in(step.work, x.size, rows.shape[0])
+    predict_rows(step.prior_mean, step.prior_cov, rows, options.height_m, predicted)
+    note_turn(found, dynamics.motions[0], options)
     mean, cov = moments(found.components)
     x[:] = mean
     write_cov_or_sqrt(options.filter, cov, S)
-    return found
+    undetected_m = _finish(x, S, epoch, options, memory)
+    return Outcome(found.components, found.nis, found.used, undetected_m, found.begun)
 
 
 @kernel
@@ -334,7 +391,7 @@ def run_epochs(
     ``lost_after`` epochs rejected in a row.
     """
     stamps_ns, row_start = epochs.stamps_ns, epochs.row_start
-    memory = scratch(mean.size, max(np.diff(row_start).max(), 1))
+    memory = memory_of(mean.size, max(np.diff(row_start).max(), 1))
     x, S = mean.copy(), cov_or_sqrt_of(cov, options)
     components, rejected_in_row = a_component_each(x, cov, dynamics), 0
     last_ns = heard_ns = turn_ns = stamps_ns[0]
@@ -344,13 +401,15 @@ def run_epochs(
         dt, unheard_s = (now_ns - last_ns) * 1e-9, (now_ns - heard_ns) * 1e-9
         epoch = EpochInput(dt, unheard_s, rejected_in_row, rows)
         since_turn_s, last_ns = (now_ns - turn_ns) * 1e-9, now_ns
-        found = _advance(x, S, components, epoch, since_turn_s, dynamics, options, memory)
+        found = advance(x, S, components, epoch, since_turn_s, dynamics, options, memory)
         components = found.components
         turn_ns = now_ns if found.begun else turn_ns
         run.nis[k], run.dof[k], run.groups[k], run.radius[k] = found.nis, found.used, 0, 0.0
+        run.undetected_m[k] = run.undetected_m[k - 1] if k > 0 else 0.0
         if rows.shape[0] > 0:
+            run.undetected_m[k] = found.undetected_m
             groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
-            taken = memory.accepted[:groups].sum()
+            taken = memory.step.accepted[:groups].sum()
             run.groups[k] = taken
             rejected_in_row = 0 if 2 * taken >= groups else rejected_in_row + 1
             heard_ns = now_ns if taken > 0 else heard_ns

@@ -11,17 +11,13 @@ import numpy as np
 from netpos.estimation.compile import kernel
 from netpos.estimation.conditioning import RobustOptions, may_be_late, reweight
 from netpos.estimation.engine import EpochInput, FilterOptions, is_sound
-from netpos.estimation.measurement import (
-    BLOCKED,
-    GROUP,
-    VARIANCE,
-    innovation_row,
-    innovation_variance,
-)
+from netpos.estimation.fusion import predicted_in, workspace
+from netpos.estimation.measurement import BLOCKED, GROUP, VARIANCE, linearise
 from netpos.estimation.mixture.candidates import (
     Candidates,
     Update,
     apply,
+    apply_predicted,
     candidates,
     first_of,
     log_likelihood,
@@ -30,6 +26,7 @@ from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.mixture.reduction import reduced
 from netpos.estimation.mixture.ring import RING_MERGE_COST
 from netpos.estimation.mixture.turns import add_explanations, may_turn, turn
+from netpos.estimation.predicted import PredictedRows, predict_rows, predicted_rows
 from netpos.estimation.robust import blocked_excess, matching_cost
 from netpos.estimation.sensors.row import group_end
 from netpos.messages.values import Array
@@ -41,8 +38,8 @@ def reweight_by_best(
 ) -> None:
     """Re-weight ``rows`` in place as the most probable component predicts them."""
     best = int(np.argmax(components.log_weights))
-    h = np.empty(components.means.shape[1])
-    reweight(components.means[best], components.covs[best], rows, height_m, robust, h)
+    mean, cov = components.means[best], components.covs[best]
+    reweight(cov, rows, predicted_rows(mean, cov, rows, height_m), robust)
 
 
 @kernel
@@ -72,11 +69,10 @@ class _Path(NamedTuple):
 
 
 @kernel
-def _path(mean: Array, cov: Array, row: Array, options: FilterOptions) -> _Path:
-    """What the component mean (n,), cov (n, n) says of a late row."""
-    robust, h = options.robust, np.empty(mean.size)
-    innovation = innovation_row(row, mean, options.height_m, h)
-    variance = innovation_variance(row, mean, cov, options.height_m, row[VARIANCE], h)
+def _path(i: int, rows: Array, predicted: PredictedRows, robust: RobustOptions) -> _Path:
+    """What a component says of the late row ``rows[i]``, as it ``predicted`` that."""
+    row, innovation = rows[i], predicted.innovation[i]
+    variance = row[VARIANCE] + predicted.prior_var[i] + predicted.second_order_var[i]
     share = row[BLOCKED] if row[BLOCKED] > 0.0 else robust.nlos_probability
     share = min(max(share, 1e-9), 1.0 - 1e-9)
     likelier, excess, excess_var = blocked_excess(innovation, variance, robust.nlos_excess_m)
@@ -89,27 +85,29 @@ def _path(mean: Array, cov: Array, row: Array, options: FilterOptions) -> _Path:
 
 
 @kernel
-def _fuse_blocked(mean: Array, cov: Array, row: Array, path: _Path, height_m: float) -> float:
-    """Fuse a range of a blocked path in place, by the moments of its excess; its NIS."""
-    h = np.empty(mean.size)
-    innovation = innovation_row(row, mean, height_m, h) - path.excess
-    variance = innovation_variance(row, mean, cov, height_m, row[VARIANCE], h)
-    gain = cov @ h / variance
+def _fuse_blocked(
+    mean: Array, cov: Array, i: int, rows: Array, predicted: PredictedRows, path: _Path
+) -> float:
+    """Fuse the range ``rows[i]`` of a blocked path in place, by the moments of its excess; its
+    NIS."""
+    innovation = predicted.innovation[i] - path.excess
+    variance = rows[i, VARIANCE] + predicted.prior_var[i] + predicted.second_order_var[i]
+    gain = predicted.HP[i, : mean.size] / variance
     mean += gain * innovation
     cov -= np.outer(gain, gain) * (variance - path.excess_var)
     return float(innovation * innovation / variance)
 
 
 @kernel
-def paths_are_open(mean: Array, cov: Array, rows: Array, options: FilterOptions) -> bool:
-    """Whether for a late range of ``rows`` a direct and a blocked path make two components of the
-    prediction mean (n,), cov (n, n)."""
+def paths_are_open(rows: Array, predicted: PredictedRows, options: FilterOptions) -> bool:
+    """Whether for a late range of ``rows``, as they are ``predicted``, a direct and a blocked path
+    make two components."""
     start = 0
     while start < rows.shape[0]:
         stop = group_end(rows, start)
         late = _late_row(rows[start:stop])
         if late >= 0:
-            path = _path(mean, cov, rows[start + late], options)
+            path = _path(start + late, rows, predicted, options.robust)
             if path.cost > RING_MERGE_COST:
                 return True
         start = stop
@@ -131,15 +129,20 @@ def _both_paths(
     is direct, and it is blocked, or both as one where that costs nothing; their probabilities of a
     ``blocked`` path. The number of candidates then."""
     mean, cov, log_weight = prior.means[k], prior.covs[k], prior.log_weights[k]
-    path = _path(mean, cov, rows[late], options)
-    read = rows.copy()
+    work = workspace(mean.size, rows.shape[0])
+    predicted = predicted_in(work, mean.size, rows.shape[0])
+    predict_rows(mean, cov, rows, options.height_m, predicted)
+    path = _path(late, rows, predicted, options.robust)
     several = math.exp(log_weight) * path.cost > RING_MERGE_COST
     found.means[end], found.covs[end] = mean, cov
     everything = np.ones(1)  # of the one measurement, whatever the gate says
-    likelihood = log_weight + log_likelihood(mean, cov, rows, options.height_m, everything)
+    likelihood = log_weight + log_likelihood(
+        mean, cov, rows, options.height_m, predicted, everything
+    )
     if not several:
-        reweight(mean, cov, read, options.height_m, options.robust, np.empty(mean.size))
-        apply(end, log_weight, read, options, found)
+        read = rows.copy()
+        reweight(cov, read, predicted, options.robust)
+        apply_predicted(end, log_weight, read, options, options.gate_nis, found, work)
         if found.accepted[end, 0] == 1.0 and math.isfinite(found.log_weights[end]):
             late_log = path.blocked_log + path.likelier
             smaller = math.exp(-abs(late_log - path.direct_log))
@@ -147,16 +150,15 @@ def _both_paths(
             found.log_weights[end] = likelihood + both_log
         blocked[end] = path.blocked
         return end + 1
-    apply(end, log_weight + path.direct_log, rows, options, found)
+    direct_log = log_weight + path.direct_log
+    apply_predicted(end, direct_log, rows, options, options.gate_nis, found, work)
     blocked[end] = 0.0
     found.means[end + 1], found.covs[end + 1] = mean, cov
-    nis = _fuse_blocked(
-        found.means[end + 1], found.covs[end + 1], rows[late], path, options.height_m
-    )
+    nis = _fuse_blocked(found.means[end + 1], found.covs[end + 1], late, rows, predicted, path)
     found.accepted[end + 1, 0], found.used[end + 1], found.within_s[end + 1] = 1.0, 0.0, 0.0
     if rows.shape[0] > 1:
         others = np.concatenate((rows[:late], rows[late + 1 :]))
-        apply(end + 1, log_weight, others, options, found)
+        apply(end + 1, log_weight, others, options, found, work)
     found.nis[end + 1] += nis
     found.used[end + 1] += 1.0
     sound = is_sound(found.means[end + 1], found.covs[end + 1])
@@ -180,16 +182,21 @@ def _add_paths(
     components for one measurement, of which the row ``late`` may be late (-1: none): the number of
     candidates."""
     end = np.int64(0)  # no literal: it would make another version of each kernel below
+    m, n = epoch.rows.shape[0], components.means.shape[1]
+    work = workspace(n, m)
     for k in range(components.log_weights.size):
-        first = end
+        first, mean, cov = end, components.means[k], components.covs[k]
         if late >= 0:
             end = _both_paths(k, end, late, components, epoch.rows, options, found, blocked)
         else:
-            found.means[end], found.covs[end] = components.means[k], components.covs[k]
-            apply(end, components.log_weights[k], epoch.rows, options, found)
+            found.means[end], found.covs[end] = mean, cov
+            apply(end, components.log_weights[k], epoch.rows, options, found, work)
             end += 1
         if found.accepted[first, 0] == 0.0 and options.manoeuvre_speed_sd > 0.0:
-            end = add_explanations(k, first, end, components, epoch, options, found)
+            if late >= 0:
+                predicted = predicted_in(work, n, m)
+                predict_rows(mean, cov, epoch.rows, options.height_m, predicted)
+            end = add_explanations(k, first, end, components, epoch, options, found, work)
     return int(end)
 
 
@@ -219,7 +226,8 @@ def along_paths(
         end = _add_paths(components, single, late, options, found, blocked)
         best = int(np.argmax(components.log_weights))
         if stop - start == raw.shape[0]:
-            turns = may_turn(components.means[best], raw, since_turn_s, options)
+            _, H = linearise(raw, components.means[best], options.height_m)
+            turns = may_turn(H, 1, since_turn_s, options)
         if turns:
             within_s = max(since_turn_s, epoch.unheard_s)
             turn(end, components, best, within_s, alone, options, found)

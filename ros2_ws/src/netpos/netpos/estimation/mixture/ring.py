@@ -10,6 +10,7 @@ import numpy as np
 
 from netpos.estimation.compile import kernel
 from netpos.estimation.engine import FilterOptions
+from netpos.estimation.fusion import workspace
 from netpos.estimation.measurement import (
     GROUP,
     ORIGIN,
@@ -157,13 +158,14 @@ def one_by_one(
         count, n = components.means.shape
         found = candidates(count * (RING_MAX + 1), n, 1)
         end = np.int64(0)  # no literal: it would make another version of each kernel below
+        work = workspace(n, alone.shape[0])
         for k in range(count):
             mean, cov = components.means[k], components.covs[k]
             if splits(alone, mean, cov, options.height_m):
                 end = ring(k, components, alone, end, options.height_m, found)
             else:
                 found.means[end], found.covs[end] = mean, cov
-                apply(end, components.log_weights[k], alone, options, found)
+                apply(end, components.log_weights[k], alone, options, found, work)
                 end += 1
         best = int(np.argmax(found.log_weights[:end]))
         weights = np.exp(found.log_weights[:end] - found.log_weights[best])

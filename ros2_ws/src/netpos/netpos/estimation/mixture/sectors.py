@@ -9,6 +9,7 @@ import numpy as np
 
 from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.engine import FilterOptions
+from netpos.estimation.fusion import predicted_in, workspace
 from netpos.estimation.measurement import (
     GROUP,
     KIND,
@@ -19,7 +20,7 @@ from netpos.estimation.measurement import (
     innovation_variance,
     predict_row,
 )
-from netpos.estimation.mixture.candidates import Candidates, apply
+from netpos.estimation.mixture.candidates import Candidates, apply, apply_predicted
 from netpos.estimation.mixture.gaussians import Ints, Mixture
 from netpos.estimation.mixture.reduction import LEAST_WEIGHT, reduced
 from netpos.estimation.phase_fix import (
@@ -30,6 +31,7 @@ from netpos.estimation.phase_fix import (
     phase_scale,
     to_fix,
 )
+from netpos.estimation.predicted import predict_rows
 from netpos.messages.values import Array
 
 _UNWRAPPED = float(Kind.UNWRAPPED_PHASE)
@@ -116,13 +118,16 @@ def _take_turns(
     having so many ``turns``. A component that knows the phase badly takes the fix itself, whose
     density is that of range and phase but for the area."""
     mean, cov, height_m = prior.means[parent], prior.covs[parent], options.height_m
-    own, h = _unwrapped(rows, at, turns), np.empty(mean.size)
-    innovation_row(own[at], mean, height_m, h)
-    phase_var = innovation_variance(own[at], mean, cov, height_m, 0.0, h)
-    placed = phase_var > _WIDE_RAD * _WIDE_RAD and to_fix(own, at, mean, height_m)
+    own, log_weight = _unwrapped(rows, at, turns), prior.log_weights[parent]
+    work = workspace(mean.size, rows.shape[0])
+    predicted = predicted_in(work, mean.size, rows.shape[0])
+    predict_rows(mean, cov, own, height_m, predicted)
+    phase_var = predicted.prior_var[at] + predicted.second_order_var[at]
     found.means[c], found.covs[c] = mean, cov
-    apply(c, prior.log_weights[parent], own, options, found)
-    if placed:
+    if phase_var <= _WIDE_RAD * _WIDE_RAD or not to_fix(own, at, mean, height_m):
+        apply_predicted(c, log_weight, own, options, options.gate_nis, found, work)
+    else:
+        apply(c, log_weight, own, options, found, work)
         found.log_weights[c] -= 0.5 * math.log(rows[at, VARIANCE] * rows[at - 1, VARIANCE])
 
 
@@ -190,7 +195,7 @@ def _place(
     found.accepted[k] = 1.0
     found.used[k], found.within_s[k] = 0.0, 0.0
     if rest.shape[0] > 0:
-        apply(k, 0.0, rest, options, found)
+        apply(k, 0.0, rest, options, found, workspace(mean.size, rest.shape[0]))
         found.accepted[k, group] = 1.0
     return True
 

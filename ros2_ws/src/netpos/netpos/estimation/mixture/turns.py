@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 
-from netpos.estimation.compile import kernel
+import numpy as np
+
+from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.engine import EpochInput, FilterOptions, manoeuvre_s
+from netpos.estimation.fusion import predicted_in, workspace
 from netpos.estimation.manoeuvre import add_manoeuvre, measures_velocity
-from netpos.estimation.measurement import GROUP
-from netpos.estimation.mixture.candidates import Candidates, apply, apply_all
+from netpos.estimation.mixture.candidates import Candidates, apply, apply_predicted
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.messages.values import Array
 
@@ -31,7 +33,8 @@ def turn(
     found.means[k], found.covs[k] = prior.means[parent], prior.covs[parent]
     add_manoeuvre(options.manoeuvre_speed_sd, within_s, found.covs[k])
     turns = math.log(TURNS_HZ * within_s)
-    apply(k, prior.log_weights[parent] + turns, rows, options, found)
+    own = workspace(prior.means.shape[1], rows.shape[0])
+    apply(k, prior.log_weights[parent] + turns, rows, options, found, own)
     found.within_s[k] = within_s
 
 
@@ -44,29 +47,30 @@ def add_explanations(
     epoch: EpochInput,
     options: FilterOptions,
     found: Candidates,
+    work: Array,
 ) -> int:
     """Where a manoeuvre explains what the candidate ``refused_by``, made of the component
     ``parent``, refuses, add it, and the same measurements from the tail of their errors; the
-    number of candidates then."""
-    mean, cov = prior.means[parent], prior.covs[parent]
-    within_s = manoeuvre_s(mean, cov, epoch.rows, epoch.unheard_s, options)
+    number of candidates then. ``work`` holds the rows as ``parent`` predicts them."""
+    mean, cov, rows = prior.means[parent], prior.covs[parent], epoch.rows
+    predicted = predicted_in(work, mean.size, rows.shape[0])
+    within_s = manoeuvre_s(cov, rows, predicted, epoch.unheard_s, options)
     if within_s <= 0.0:
         return end
-    turn(end, prior, parent, within_s, epoch.rows, options, found)
+    turn(end, prior, parent, within_s, rows, options, found)
     if found.accepted[end].sum() <= found.accepted[refused_by].sum():
         return end
     found.means[end + 1], found.covs[end + 1] = mean, cov
-    apply_all(end + 1, prior.log_weights[parent], epoch.rows, options, found)
+    no_gate = np.full_like(options.gate_nis, np.inf)
+    apply_predicted(end + 1, prior.log_weights[parent], rows, options, no_gate, found, work)
     return end + 2
 
 
-@kernel
-def may_turn(mean: Array, rows: Array, since_turn_s: float, options: FilterOptions) -> bool:
-    """Whether an epoch ``rows`` begins a component "it has turned" beside mean (n,),
-    ``since_turn_s`` after the last one: several RSUs tell where the device is, and a measured
-    velocity whether it has turned."""
-    if options.manoeuvre_speed_sd <= 0.0 or since_turn_s < TURN_PERIOD_S:
+@leaf
+def may_turn(H: Array, groups: int, since_turn_s: float, options: FilterOptions) -> bool:
+    """Whether an epoch of ``groups`` measurements with the Jacobian H (m, n) begins a component
+    "it has turned", ``since_turn_s`` after the last one: several RSUs tell where the device is,
+    and a measured velocity whether it has turned."""
+    if options.manoeuvre_speed_sd <= 0.0 or since_turn_s < TURN_PERIOD_S or groups > 1:
         return False
-    if rows.shape[0] == 0 or rows[rows.shape[0] - 1, GROUP] > 0.0:
-        return False
-    return not measures_velocity(mean, rows, options.height_m)
+    return not measures_velocity(H)

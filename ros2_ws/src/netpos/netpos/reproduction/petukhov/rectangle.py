@@ -150,11 +150,10 @@ class Setup:
                 if k == wrong_at:
                     estimate = _moved(self.config, estimate, epoch_rows)
                 unheard_s = (stamp - last_ns) / NS
-                nis[k], dof[k], accepted = estimate.step(
-                    stamp, unheard_s, rejected, epoch_rows, NO_BIAS
-                )
+                step = estimate.step(stamp, unheard_s, rejected, epoch_rows, NO_BIAS)
+                nis[k], dof[k] = step.nis, step.dof
                 # group 0 is the anchor's where it is heard
-                rejected = 0 if accepted[0] else rejected + 1
+                rejected = 0 if step.accepted[0] else rejected + 1
                 if rejected >= self.config.max_rejected_epochs:
                     start, estimate, rejected = PhaseStart(self.config), None, 0
             last_ns = stamp

@@ -1,0 +1,74 @@
+"""Rows as a prediction sees them: linearised once for an epoch and a component, and read by all
+that follows (gate, update, weights, protection level, health of the RSUs)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from netpos.estimation.compile import kernel, leaf
+from netpos.estimation.measurement import GATE_VARIANCE, curvature_variance, innovation_row
+from netpos.messages.values import Array
+
+
+class PredictedRows(NamedTuple):
+    """Rows (m, ROW_WIDTH) at a prediction mean (n,), cov (n, n). In a workspace the arrays are
+    wider: the first m and n entries count.
+
+    innovation : (m,) measured minus predicted value, wrapped where it is an angle
+    H, HP : (m, n) Jacobian, and the same times cov
+    prior_var : (m,) variance that the prediction has along H
+    second_order_var : (m,) variance of what linearising leaves out (``curvature_variance``)
+
+    An innovation has the variance of the row, ``prior_var`` and ``second_order_var`` together.
+    """
+
+    innovation: Array
+    H: Array
+    HP: Array
+    prior_var: Array
+    second_order_var: Array
+
+
+@leaf
+def predict_rows(
+    mean: Array, cov: Array, rows: Array, height_m: float, predicted: PredictedRows
+) -> None:
+    """Fill ``predicted`` with ``rows`` (m, ROW_WIDTH) at mean (n,), cov (n, n). ``height_m``:
+    nominal height of the device in map."""
+    n = mean.size
+    for i in range(rows.shape[0]):
+        h, hp = predicted.H[i], predicted.HP[i]
+        predicted.second_order_var[i] = curvature_variance(rows[i], mean, cov, height_m)
+        predicted.innovation[i] = innovation_row(rows[i], mean, height_m, h)
+        total = 0.0
+        for a in range(n):
+            value = 0.0
+            for b in range(n):
+                value += cov[a, b] * h[b]
+            hp[a] = value
+            total += h[a] * value
+        predicted.prior_var[i] = total
+
+
+@leaf
+def note_innovations(rows: Array, predicted: PredictedRows, innovations: Array) -> None:
+    """Write the innovations of ``rows`` and their sd, as they were ``predicted``, to
+    ``innovations`` (m, 2)."""
+    for i in range(rows.shape[0]):
+        known = predicted.prior_var[i] + predicted.second_order_var[i]
+        innovations[i, 0] = predicted.innovation[i]
+        innovations[i, 1] = math.sqrt(rows[i, GATE_VARIANCE] + known)
+
+
+@kernel
+def predicted_rows(mean: Array, cov: Array, rows: Array, height_m: float) -> PredictedRows:
+    """``predict_rows`` in new arrays."""
+    m, n = rows.shape[0], mean.size
+    predicted = PredictedRows(
+        np.empty(m), np.empty((m, n)), np.empty((m, n)), np.empty(m), np.empty(m)
+    )
+    predict_rows(mean, cov, rows, height_m, predicted)
+    return predicted
