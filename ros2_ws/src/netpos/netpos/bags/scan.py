@@ -9,12 +9,15 @@ A file that makes checksums is held to them: what none covers counts as lost.
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
+from bisect import bisect
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO
+from itertools import islice
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import IO, Any
@@ -117,6 +120,35 @@ class Scan:
         return {(Channel, channel.id), (Schema, channel.schema_id)} <= self._certain
 
 
+class _SparseFile(mmap):
+    """A file whose holes are not searched: nothing but zeros would be found there."""
+
+    extents: list[tuple[int, int]]
+
+    def find(self, mark: Any, position: int = 0, end: int | None = None) -> int:  # type: ignore[override]
+        """Offset of a ``mark`` of one byte that is not zero, -1 if there is none."""
+        until = len(self) if end is None else end
+        begin = max(bisect(self.extents, (position,)) - 1, 0)
+        for first, last in islice(self.extents, begin, None):
+            found = super().find(mark, max(first, position), min(last, until))
+            if found >= 0:
+                return found
+        return -1
+
+
+def _extents(descriptor: int, size: int) -> list[tuple[int, int]]:
+    """Where a file holds data: offsets of the beginning and the end of each part."""
+    extents, end = [], 0
+    while end < size:
+        try:
+            start = os.lseek(descriptor, end, os.SEEK_DATA)
+        except OSError:  # nothing but a hole
+            break
+        end = os.lseek(descriptor, start, os.SEEK_HOLE)
+        extents.append((start, end))
+    return extents
+
+
 @contextmanager
 def content_of(file: Path) -> Iterator[bytes | mmap]:
     """The bytes of a file, which may be larger than the memory."""
@@ -124,7 +156,8 @@ def content_of(file: Path) -> Iterator[bytes | mmap]:
         if not file.stat().st_size:
             yield b""
             return
-        with mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
+        with _SparseFile(stream.fileno(), 0, access=ACCESS_READ) as data:
+            data.extents = _extents(stream.fileno(), len(data))
             yield data
 
 

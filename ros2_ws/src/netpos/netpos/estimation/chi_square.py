@@ -32,7 +32,7 @@ def chi_square_bound(dof: int, tail: float) -> float:
     h = 2.0 / (9.0 * dof)
     y = max(dof / 2.0 * (1.0 - h - normal * math.sqrt(h)) ** 3, 1e-3)
     for _ in range(_STEPS):
-        log_q, slope = _log_survival(dof, y)
+        log_q, slope = log_survival(dof, y)
         step = (log_q - math.log(tail)) / slope
         y -= step if step < y else y / 2.0
         if abs(step) <= 1e-15 * y:
@@ -40,9 +40,10 @@ def chi_square_bound(dof: int, tail: float) -> float:
     return 2.0 * y
 
 
-def _log_survival(dof: int, y: float) -> tuple[float, float]:
+def log_survival(dof: int, y: float) -> tuple[float, float]:
     """Logarithm of Q(dof / 2, y), the regularised upper incomplete gamma function, and its
-    derivative; a finite sum for whole ``dof``."""
+    derivative; a finite sum for whole ``dof``. The probability that a chi-square variable exceeds
+    2 y."""
     log_y = math.log(y)
     first = 0.5 if dof % 2 else 0.0
     terms = [

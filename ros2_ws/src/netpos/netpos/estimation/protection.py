@@ -2,7 +2,7 @@
 it.
 
 The Gaussian part is exact (``protection_level``). What the covariance cannot know comes on top:
-an optimistic filter (``nis_window``) and a manoeuvre not yet noticed (``manoeuvre_level``).
+an optimistic filter (``noise_scale``) and a manoeuvre not yet noticed (``manoeuvre_level``).
 """
 
 from __future__ import annotations

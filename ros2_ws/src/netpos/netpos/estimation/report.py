@@ -8,7 +8,7 @@ import numpy as np
 from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.engine import GATE_SIZE, Epochs, FilterOptions, Run
 from netpos.estimation.measurement import GROUP
-from netpos.estimation.nis_window import NisWindow
+from netpos.estimation.noise_scale import NoiseScale
 from netpos.estimation.protection import gaussian_radius, radius_limit
 from netpos.estimation.state import X
 from netpos.messages.values import Array
@@ -27,11 +27,12 @@ def level_of(
 ) -> float:
     """Protection level [m] of an estimate that is one Gaussian.
 
-    radius_m : that its error leaves with ``integrity_risk``; inflation : factor on the sd
+    radius_m : that its error leaves with ``integrity_risk``; inflation : factor on it
     undetected_m : where a manoeuvre that nothing has shown may have taken the device, at the last
-        measurement that was accepted, ``unheard_s`` ago; it goes on at ``manoeuvre_sd_mps``
+        measurement that was accepted, ``unheard_s`` ago; it goes on at ``manoeuvre_sd_mps``.
+        Larger errors hide a larger manoeuvre.
     """
-    moved_m = undetected_m + manoeuvre_sd_mps * unheard_s
+    moved_m = inflation * undetected_m + manoeuvre_sd_mps * unheard_s
     return max(inflation * radius_m, min(moved_m, LEVEL_MAX_M))
 
 
@@ -39,7 +40,8 @@ def run_levels(epochs: Epochs, run: Run, options: FilterOptions) -> Array:
     """Protection levels [m] (N,) that a track reports of the ``epochs`` of which
     ``mixture.epoch.run_epochs`` made ``run``, or of the first N of them; the groups of an epoch
     have equally many rows."""
-    inflation = NisWindow.of_run(*_nis_of_all_groups(epochs, run, options))
+    fit = run.nis, *_rows_of_groups(epochs, run, options)
+    inflation = NoiseScale.of_run(*fit, options.integrity_risk)
     levels: Array = _levels(run, inflation, _unheard_s(epochs, run), options)
     return levels
 
@@ -51,13 +53,14 @@ def _unheard_s(epochs: Epochs, run: Run) -> Array:
     return np.asarray((stamps_ns - np.maximum.accumulate(heard)) * 1e-9, dtype=np.float64)
 
 
-def _nis_of_all_groups(epochs: Epochs, run: Run, options: FilterOptions) -> tuple[Array, Array]:
-    """NIS and number of rows (N,) of the epochs, refused groups as at their gate."""
+def _rows_of_groups(epochs: Epochs, run: Run, options: FilterOptions) -> tuple[Array, Array]:
+    """Number of accepted rows (N,) of the epochs; number of refused groups, rows of each, and
+    their gate (N, 3)."""
     row_start, rows = epochs.row_start[: run.nis.size + 1], epochs.rows
-    dof = np.diff(row_start)
     groups = rows[row_start[1:] - 1, GROUP].astype(int) + 1
-    refused = options.gate_nis[np.minimum(dof // groups, GATE_SIZE - 1)]
-    return run.nis + (groups - run.groups) * refused, dof
+    size = np.diff(row_start) // groups
+    gate_nis = options.gate_nis[np.minimum(size, GATE_SIZE - 1)]
+    return run.groups * size, np.column_stack([groups - run.groups, size, gate_nis])
 
 
 @kernel
@@ -69,7 +72,7 @@ def _levels(run: Run, inflation: Array, unheard_s: Array, options: FilterOptions
         cov, factor = run.covs[k], inflation[k]
         xx, xy, yy = cov[X.PX, X.PX], cov[X.PX, X.PY], cov[X.PY, X.PY]
         at_most = factor * radius_limit(xx, xy, yy, risk)
-        moved_m = level_of(0.0, 1.0, run.undetected_m[k], speed, unheard_s[k])
+        moved_m = level_of(0.0, factor, run.undetected_m[k], speed, unheard_s[k])
         level[k] = max(level[k], moved_m)
         if level[k] < at_most:
             level[k] = max(level[k], factor * gaussian_radius(xx, xy, yy, risk))

@@ -64,17 +64,18 @@ def fits(innovations: Array, gate: Array) -> bool:
     return bool(((innovations[:, 0] / innovations[:, 1]) ** 2 <= gate[1]).all())
 
 
-def with_refused(
-    epoch_rows: EpochRows, accepted: Sequence[float], gate: Array, nis: float, dof: int
-) -> tuple[float, int]:
-    """``nis`` of ``dof`` accepted rows of an epoch with those it refused, as at their gate."""
-    if dof < len(epoch_rows.rows):
-        sizes = np.bincount(epoch_rows.rows[:, GROUP].astype(int), minlength=len(accepted))
-        for size, taken in zip(sizes.tolist(), accepted, strict=True):
-            if not taken:
-                nis += float(gate[min(size, gate.size - 1)])
-                dof += size
-    return nis, dof
+def refused_groups(
+    epoch_rows: EpochRows, accepted: Sequence[float], gate: Array
+) -> list[tuple[int, float]]:
+    """Rows and gate of each group of an epoch that was refused."""
+    if 0.0 not in accepted:
+        return []
+    sizes = np.bincount(epoch_rows.rows[:, GROUP].astype(int), minlength=len(accepted))
+    return [
+        (size, float(gate[min(size, gate.size - 1)]))
+        for size, taken in zip(sizes.tolist(), accepted, strict=True)
+        if not taken
+    ]
 
 
 def observe_excluded(

@@ -6,7 +6,7 @@ from collections import defaultdict
 from dataclasses import dataclass, field, fields, replace
 from operator import attrgetter
 
-from netpos.estimation.nis_window import NisWindow
+from netpos.estimation.noise_scale import NoiseScale
 from netpos.tracking.estimator import Estimator, Recent
 from netpos.tracking.nlos_rate import NlosRate
 from netpos.tracking.pose_wait import PoseWait
@@ -21,9 +21,9 @@ class TrackSnapshot:
     segment: int = 0
     recent: Recent = ()
     """The newest epochs that fitted: an initial pose is weighed with them."""
-    rsus_nis: NisWindow = field(default_factory=NisWindow)
+    rsus_scale: NoiseScale = field(default_factory=NoiseScale)
     """Of epochs with a measurement of an RSU."""
-    device_nis: NisWindow = field(default_factory=NisWindow)
+    device_scale: NoiseScale = field(default_factory=NoiseScale)
     """Of those without one: steps that agree say nothing of ranges."""
     has_clock: bool = False
     pose_wait: PoseWait = field(default_factory=PoseWait)
@@ -39,8 +39,8 @@ class TrackSnapshot:
         twin = TrackSnapshot(*_values(self))
         twin.estimator = self.estimator.copy()
         twin.nlos_rate = self.nlos_rate.copy()
-        twin.rsus_nis = self.rsus_nis.copy()
-        twin.device_nis = self.device_nis.copy()
+        twin.rsus_scale = self.rsus_scale.copy()
+        twin.device_scale = self.device_scale.copy()
         twin.pose_wait = replace(self.pose_wait)
         twin.rejected = self.rejected.copy()
         twin.velocity_ns = self.velocity_ns.copy()

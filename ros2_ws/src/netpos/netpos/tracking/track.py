@@ -23,7 +23,7 @@ from netpos.messages.values import (
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import EpochRows, Source, mostly_accepted, velocity_inflation
 from netpos.tracking.estimator import RECENT, Estimator, ImuInput, Past, UpdateResult
-from netpos.tracking.fit import fits, observe_excluded, with_refused, without_excluded
+from netpos.tracking.fit import fits, observe_excluded, refused_groups, without_excluded
 from netpos.tracking.health import RsuHealth
 from netpos.tracking.history import History, merge
 from netpos.tracking.models import gate_thresholds
@@ -302,10 +302,10 @@ class Track:
         """Tell the protection level and the health of the RSUs how an epoch fitted."""
         state, accepted = self._state, result.accepted
         state.undetected_m = result.undetected_m
-        nis, dof = with_refused(epoch_rows, accepted, self._gate, result.nis, result.dof)
-        if math.isfinite(nis):
+        if math.isfinite(result.nis):
             of_rsus = any(isinstance(item, RsuMeasurement) for item in epoch_rows.items)
-            (state.rsus_nis if of_rsus else state.device_nis).add(nis, dof)
+            scale = state.rsus_scale if of_rsus else state.device_scale
+            scale.add(result.nis, result.dof, refused_groups(epoch_rows, accepted, self._gate))
         if self._config.isolate_rsus:
             items, rows = epoch_rows.items, epoch_rows.rows
             self._health.hear(
@@ -380,7 +380,8 @@ class Track:
     def _level(self, stamp_ns: int, radius_m: float) -> float:
         """Protection level [m] of the estimate's Gaussian, whose error leaves ``radius_m``."""
         state = self._state
-        inflation = max(state.rsus_nis.inflation(), state.device_nis.inflation())
+        risk = self._config.integrity_risk
+        inflation = max(state.rsus_scale.inflation(risk), state.device_scale.inflation(risk))
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
         level: float = level_of(
             radius_m, inflation, state.undetected_m, self._config.manoeuvre_sd_mps, unheard_s

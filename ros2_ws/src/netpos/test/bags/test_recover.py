@@ -511,6 +511,24 @@ def test_a_sparse_file_larger_than_the_memory(
     assert report.bytes_total == 20 * 10**9
 
 
+def test_holes_are_not_searched(tmp_path: Path, original: tuple[bytes, Counter]) -> None:
+    """Four terabytes of zeros, with the last chunk behind them, and nothing but zeros: to read
+    them would take an hour."""
+    data, messages = original
+    *_, (last, length) = chunk_offsets(data, tmp_path)
+    folder = damaged(tmp_path, data[:last])
+    with (folder / "run_0.mcap").open("r+b") as stream:
+        stream.seek(4 * 10**12)
+        stream.write(data[last : last + length])
+    report = recover(folder)
+    assert content(report.output) == messages
+    assert report.bytes_total == 4 * 10**12 + length
+    with (tmp_path / "zeros.mcap").open("wb") as stream:
+        stream.truncate(4 * 10**12)
+    with pytest.raises(BagError, match="nothing"):
+        recover(tmp_path / "zeros.mcap")
+
+
 def test_a_few_bytes_that_unpack_to_gigabytes(tmp_path: Path) -> None:
     bomb = zstandard.compress(bytes(2**20)) * 3
     for size in (2**40, 2**20):

@@ -15,6 +15,7 @@ from setup_tracker import tracker_outputs
     [
         (2.0, 1.5, 0.0, 0.0, 3.0),  # an optimistic filter
         (2.0, 1.0, 2.5, 0.0, 2.5),  # a manoeuvre that would not show
+        (2.0, 1.5, 2.5, 0.0, 3.75),  # which larger errors hide longer
         (2.0, 1.0, 2.5, 0.5, 5.0),  # which has gone on at 5 m/s since
         (2.0, 1.0, np.inf, 0.0, LEVEL_MAX_M),  # that nothing bounds
     ],

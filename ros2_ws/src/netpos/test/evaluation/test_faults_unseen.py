@@ -13,7 +13,15 @@ from netpos.evaluation.faults import FAULTS
 from netpos.evaluation.faults.stream import NS, Arrival, Hit, Stream
 from netpos.evaluation.faults.tracking import Answer, answer_to
 from netpos.evaluation.pairing import Trajectory
-from netpos.messages.values import Array, Field, Odometry, RsuInfo, RsuMeasurement, TrackState
+from netpos.messages.values import (
+    Array,
+    Field,
+    Odometry,
+    RsuInfo,
+    RsuMeasurement,
+    TrackState,
+    Velocity,
+)
 from netpos.tracking import TrackerConfig
 
 PLACES = {
@@ -60,8 +68,8 @@ def measured(places: dict[str, object]) -> Stream:
     return found
 
 
-def struck(stream: Stream, rsus: str) -> Stream:
-    """With a lie of some of the RSUs about the honest device."""
+def struck(stream: Stream, rsus: str, fault: str = "creeping") -> Stream:
+    """With a fault of some of the RSUs, of which a lie is about the honest device."""
     still = np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
     stamps = [k * NS // 10 for k in range(round(10 * END_S) + 1)]
     truth = [
@@ -83,7 +91,7 @@ def struck(stream: Stream, rsus: str) -> Stream:
         scene=SCENE,
         truth={"v": Trajectory.of(truth)},
     )
-    return FAULTS["creeping"].apply(stream, hit)
+    return FAULTS[fault].apply(stream, hit)
 
 
 def heard(stream: Stream) -> Array:
@@ -140,3 +148,52 @@ def _moved(m: RsuMeasurement) -> RsuMeasurement:
     t_s, at = m.stamp_ns / NS, np.array(PLACES[m.rsu_id])
     lie_m = np.linalg.norm(honest(t_s) - at) - np.linalg.norm(other(t_s) - at)
     return replace(m, range_m=m.range_m + float(lie_m))
+
+
+def walker(*, stops: bool) -> Stream:
+    """A walker whose steps say 2 m/s to the east; ranges, with steps of 0.5 m and without noise,
+    of one who does so, or of one who ``stops`` at the start and steps on the spot."""
+    found = []
+    for k in range(1, round(10 * END_S)):
+        stamp = k * NS // 10
+        t_s = min(stamp / NS, START_S) if stops else stamp / NS
+        step = np.array([2.0, 0.0]), 4.0 * np.eye(2)
+        velocity = Velocity(stamp_ns=stamp, vue_id="v", velocity=step[0], cov=step[1])
+        found.append(Arrival(stamp, velocity))
+        if k % 10:
+            continue
+        for name, at in PLACES.items():
+            range_m = 0.5 * round(2.0 * float(np.linalg.norm(honest(t_s) - np.array(at))))
+            m = RsuMeasurement(
+                stamp_ns=stamp,
+                rsu_id=name,
+                vue_id="v",
+                expected=len(PLACES),
+                fields=Field.RANGE,
+                range_m=range_m,
+                range_var=0.04,
+            )
+            found.append(Arrival(stamp, m))
+    return found
+
+
+def test_frozen_rsus_are_those_of_a_walker_who_steps_on_the_spot() -> None:
+    """Either all RSUs are stuck or the steps are wrong. The numbers are the same, so is the
+    answer, and the second walker is where the track is."""
+    stuck = struck(walker(stops=False), "abcd", fault="freeze")
+    spot = walker(stops=True)
+    np.testing.assert_allclose(heard(stuck), heard(spot), rtol=0.0, atol=0.0)
+    ours, theirs = answer(stuck), answer(spot)
+    covered = 0
+    for one, two in zip(ours.odometry["v"], theirs.odometry["v"], strict=True):
+        np.testing.assert_array_equal(one.position, two.position)
+        status = ours.statuses["v"][one.stamp_ns]
+        assert status == theirs.statuses["v"][one.stamp_ns]
+        t_s = one.stamp_ns / NS
+        ranged = one.stamp_ns % NS == 0
+        if ranged and status.state is TrackState.TRACKING and START_S < t_s < END_S:
+            here = float(np.hypot(*(two.position - honest(START_S))[:2]))
+            assert here < status.protection_level_m
+            away = float(np.hypot(*(one.position - honest(t_s))[:2]))
+            covered += away > status.protection_level_m
+    assert covered > 2

@@ -123,8 +123,8 @@ def state(tracker: Tracker) -> list[Any]:
     estimate = [e.estimate.stamp_ns, e.estimate.mean.tobytes(), e.estimate.cov.tobytes()]
     biases = [b.sd, b.tau_s, b._slots, b._last_ns, e.bias.tobytes()]
     counts = [s.accepted, dict(s.rejected), s.rejected_in_row, s.last_accepted_ns, s.has_clock]
-    window = [list(w._nis) + list(w._dofs) for w in (s.rsus_nis, s.device_nis)]
-    return [estimate, biases, counts, e._yaw, window]
+    scales = [s.rsus_scale.weights.tobytes(), s.device_scale.weights.tobytes()]
+    return [estimate, biases, counts, e._yaw, scales]
 
 
 def config_of(name: str, **change: Any) -> dict[str, Any]:
