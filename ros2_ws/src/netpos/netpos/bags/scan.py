@@ -125,7 +125,7 @@ class _SparseFile(mmap):
 
     extents: list[tuple[int, int]]
 
-    def find(self, mark: Any, position: int = 0, end: int | None = None) -> int:  # type: ignore[override]
+    def find(self, mark: Any, position: int = 0, end: int | None = None) -> int:
         """Offset of a ``mark`` of one byte that is not zero, -1 if there is none."""
         until = len(self) if end is None else end
         begin = max(bisect(self.extents, (position,)) - 1, 0)

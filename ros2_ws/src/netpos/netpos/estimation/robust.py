@@ -91,7 +91,7 @@ def _log_mills(z: float) -> float:
 
 
 @leaf
-def _positive_normal(z: float) -> tuple[float, float]:
+def positive_normal(z: float) -> tuple[float, float]:
     """Mean and variance of a normal variable of mean z and variance 1, given that it is > 0."""
     if z < -_TAIL:
         x2 = 1.0 / (z * z)
@@ -116,7 +116,7 @@ def exponential_excess(
     sd = math.sqrt(innovation_var)
     z = innovation / sd - sd / mean_m
     probability = _probability(_log_odds(prior) + math.log(sd / mean_m) + _log_mills(z))
-    mean, variance = _positive_normal(z)
+    mean, variance = positive_normal(z)
     return _mixed(  # type: ignore[no-any-return]
         probability, sd * mean, innovation_var * variance
     )
@@ -168,7 +168,7 @@ def blocked_excess(
     (log), E [m] and V [m^2] of (M)."""
     sd = math.sqrt(innovation_var)
     z = innovation / sd - sd / mean_excess_m
-    mean, variance = _positive_normal(z)
+    mean, variance = positive_normal(z)
     likelier = math.log(sd / mean_excess_m) + _log_mills(z)
     return likelier, sd * mean, innovation_var * variance
 

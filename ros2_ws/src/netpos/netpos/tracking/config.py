@@ -15,7 +15,6 @@ from netpos.estimation.motion import table as motion
 from netpos.estimation.motion.model import MotionModel
 from netpos.messages.fields import Frames
 from netpos.tracking import shared_parameters as shared
-from netpos.tracking.learning import TAIL
 from netpos.tracking.rsus import StepErrors
 from netpos.world.geodesy import datum_of_text
 
@@ -208,8 +207,7 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
     )
     learn_errors: bool = described(
         False,
-        "learn scatter, bias and correlation of each RSU's errors; declared ones are a prior, and"
-        " robust none is student_t with 5 unless nlos_probability is set",
+        "learn scatter, bias and correlation of each RSU's errors; declared ones are a prior",
     )
     isolate_rsus: bool = described(
         True, "refuse an RSU that at least two others contradict, and a sensor that is stuck"
@@ -390,14 +388,6 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
         if one_gaussian or forms.form_of(self.filter).follows_manoeuvres:
             return 0.0
         return float(getattr(self, self.motion_models[0].manoeuvre_speed))
-
-    @property
-    def tail(self) -> tuple[str, float]:
-        """``robust`` and its parameter as the update has them: what is learned has Student tails,
-        unless late ranges have a model of their own."""
-        if self.learn_errors and self.robust == "none" and self.nlos_probability == 0.0:
-            return "student_t", TAIL
-        return self.robust, float(self.robust_parameter)
 
     @property
     def step_errors(self) -> StepErrors:

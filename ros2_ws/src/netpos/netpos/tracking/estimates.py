@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,8 @@ from netpos.estimation.mixture.epoch import Dynamics, Memory, Outcome
 from netpos.estimation.mixture.gaussians import Mixture, mode_of, moments, one_component
 from netpos.estimation.motion import NO_BIAS, Parameter
 from netpos.estimation.protection import mixture_radius
-from netpos.estimation.state import N_CORE, X
+from netpos.estimation.robust import positive_normal
+from netpos.estimation.state import N_CORE, POSITION, X
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.models import (
@@ -161,6 +163,14 @@ class Estimate:
             change_prior(self.mean, cov, index, before, after)
             self._cov_or_sqrt = engine.to_cov_or_sqrt(cov, self._options)
 
+    def cut_off_behind(self, origin: Array, front: Array) -> None:
+        """Take away what is behind a line (``cut_off_behind``); nothing happens to several
+        components."""
+        if self._components is None:
+            cov = self.cov.copy()
+            cut_off_behind(self.mean, cov, origin, front)
+            self._cov_or_sqrt = engine.to_cov_or_sqrt(cov, self._options)
+
     def predict(self, stamp_ns: int, bias: Array) -> None:
         """Move to ``stamp_ns``."""
         dt = (stamp_ns - self.stamp_ns) * 1e-9
@@ -228,6 +238,18 @@ def change_prior(mean: Array, cov: Array, index: int, before: float, after: floa
     S = Ph[index] + variance
     mean -= Ph * (mean[index] / S)
     cov -= np.outer(Ph, Ph) / S
+
+
+def cut_off_behind(mean: Array, cov: Array, origin: Array, front: Array) -> None:
+    """Moments of a Gaussian without what is behind a line, in place: mean (n,), covariance (n, n);
+    the line through ``origin`` (2,) m, with ``front`` (2,), of unit length, across it (Simon and
+    Simon 2010, eq. 13 to 20 for one constraint)."""
+    Ph = cov[:, POSITION] @ front
+    sd = math.sqrt(float(front @ Ph[POSITION]))
+    z = float(front @ (mean[POSITION] - origin)) / sd
+    left, variance = positive_normal(z)
+    mean += Ph * ((left - z) / sd)
+    cov -= np.outer(Ph, Ph) * ((1.0 - variance) / sd**2)
 
 
 def modes_of(mixture: Mixture, risk: float) -> tuple[TrackMode, ...]:

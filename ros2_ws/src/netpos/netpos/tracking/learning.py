@@ -11,8 +11,9 @@ residuals, Cook and Weisberg 1982) and neither the motion model nor what the tra
 position is in it: a track that is wrong must not take its own error for that of the RSUs. A grid
 of candidates (scale of the variance, sd of the bias, rates at which it is forgotten per second and
 per metre of way) is weighed by the likelihood of y, each candidate by a Kalman filter of its own
-for b. All errors have Student tails, here and in the update (``TrackerConfig.tail``). The scale of
-single values, for the gate, is learned apart (variational Bayes, Särkkä and Nummenmaa 2009).
+for b, with a Student tail. The update takes the mean variance and the mean sd of the bias of all
+candidates: what is not known yet makes the track less sure. The scale of single values, for the
+gate, is learned apart (variational Bayes, Särkkä and Nummenmaa 2009).
 """
 
 from __future__ import annotations
@@ -27,9 +28,10 @@ import numpy as np
 from netpos.messages.values import Array
 from netpos.tracking.shift import unshifted
 
-CORRELATION_S = 0.2
-_WINDOW_NS = 1_000_000_000
-_SCALES = 2.0 ** np.arange(-4, 7)
+WINDOW_S = 1.0
+"""Values of an RSU within it count as one until their scatter says otherwise."""
+_WINDOW_NS = round(WINDOW_S * 1e9)
+_SCALES = 2.0 ** np.arange(-9, 7)
 _SPREADS = 2.0 ** np.arange(-3, 4)
 _LASTING = [  # correlation time [s] and length [m]
     *((t, math.inf) for t in (3.0, 15.0, 75.0, 400.0)),
@@ -38,14 +40,14 @@ _LASTING = [  # correlation time [s] and length [m]
 _RATES, _RATES_PER_M = (1.0 / np.array(_LASTING)).T
 _AHEAD_S = 10.0
 _NO_BIAS = 0.3  # probability where nothing is declared
-_LOG_SCALE_SD = 1.4
+_LOG_SCALE_SD = 0.7
 _LOG_SPREAD_SD = 1.1
 _LOG_TIME_SD = 1.5
 _MEMORY = 300.0  # windows
-TAIL = 5.0
-"""Degrees of freedom of the errors, in windows and in the update."""
+_TAIL = 5.0  # degrees of freedom of the errors of windows
 _GATE_STRENGTH, _GATE_MEMORY = 20.0, 1000.0  # values
-_WITHIN_STRENGTH, _WITHIN_MEMORY = 5.0, 1000.0  # values
+_WITHIN_STRENGTH, _WITHIN_MEMORY = 5.0, 1000.0  # values, windows' worth of them
+_LEAST_STEP = 0.05  # of successive values, over their scatter
 _GAUSSIAN = 0.72  # of a variance: what the tail's distribution makes of a Gaussian's
 _ALONE = 0.05  # 1 - leverage of a row that nobody checks
 
@@ -62,7 +64,7 @@ SCALE, SPREAD, RATE, RATE_PER_M = _grid()
 Name = tuple[str, str]
 Sums = tuple[float, ...]
 """Of the rows of a window: information, and that times residual; number, residual and its square
-over the sd stated."""
+over the sd stated; half the square of the step from the value before; that value."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +79,9 @@ class ErrorModel:
     last_ns: int = -1
     last_m: float = 0.0
     scatter: tuple[float, float] = (_GATE_STRENGTH, _GATE_STRENGTH)  # sum, count
-    within: tuple[float, float] = (_WITHIN_STRENGTH, _WITHIN_STRENGTH)  # sum, count
+    within: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """Of values about the mean of their window: sum of squares over what is stated, their number
+    less one a window, half the sum of squared steps, number of windows."""
     scale: float = 1.0
     bias_sd: float = 0.0
     lasting: Array = field(default_factory=lambda: np.ones(len(_LASTING)))
@@ -89,17 +93,28 @@ class ErrorModel:
         return self.scatter[0] / self.scatter[1]
 
     @property
-    def within_scale(self) -> float:
-        """The same of values about the mean of their window."""
-        return self.within[0] / self.within[1]
+    def window_scale(self) -> float:
+        """Variance of the mean of a window over that which one value states, by how values scatter
+        within windows.
 
-    def scattering(self, gate_scale: float, within_scale: float) -> ErrorModel:
+        What is stated and not seen within windows lasts as long as they do. What is seen there is
+        first-order Gauss-Markov noise, as its steps say (von Neumann 1941): with the correlation
+        rho of successive values, the mean of n of them has (1 + rho) / (1 - rho) / n of their
+        variance.
+        """
+        total, count, steps, windows = self.within
+        seen = total / (_WITHIN_STRENGTH + count)
+        if total <= 0.0:
+            return 1.0
+        step = min(max(steps / total, _LEAST_STEP), 1.0)
+        n = 1.0 + count / windows
+        return max(1.0 - seen, 0.0) + seen * min((2.0 - step) / step / n, 1.0)
+
+    def scattering(
+        self, gate_scale: float, within: tuple[float, float, float, float]
+    ) -> ErrorModel:
         """With these as what is known of the scatter beforehand."""
-        return replace(
-            self,
-            scatter=(gate_scale * _GATE_STRENGTH, _GATE_STRENGTH),
-            within=(within_scale * _WITHIN_STRENGTH, _WITHIN_STRENGTH),
-        )
+        return replace(self, scatter=(gate_scale * _GATE_STRENGTH, _GATE_STRENGTH), within=within)
 
     @classmethod
     def declared(cls, noise_sd: float, bias_sd: float, time_s: float) -> ErrorModel:
@@ -112,7 +127,7 @@ class ErrorModel:
             shape *= np.exp(-0.5 * (np.log(np.maximum(RATE, 1e-3) * time_s) / _LOG_TIME_SD) ** 2)
             none = 0.02
         else:
-            shape = 1.0 / (1.0 + spread**2)
+            shape = spread / (1.0 + spread**2)  # half-Cauchy (Gelman 2006), per log
             none = _NO_BIAS
         share = shape / shape[biased].sum() * len(_SCALES)
         log_prior = log_prior + np.log(np.where(biased, (1.0 - none) * share, none))
@@ -124,14 +139,15 @@ class ErrorModel:
     def weighed(self, log_weights: Array) -> ErrorModel:
         """With the means of the candidates under ``log_weights`` (G,) and what the scatter within
         windows says of the scale."""
-        log_weights = log_weights - 0.5 * (np.log(SCALE / self.within_scale) / _LOG_SCALE_SD) ** 2
+        ratio = np.log(SCALE / self.window_scale) / _LOG_SCALE_SD
+        log_weights = log_weights - 0.5 * (ratio + 0.5 * _LOG_SCALE_SD) ** 2
         w = np.exp(log_weights - log_weights.max())
         w /= w.sum()
         ws = w * SPREAD
         total = float(ws.sum())
         return replace(
             self,
-            scale=float(np.exp(w @ np.log(SCALE))),
+            scale=float(w @ SCALE),
             bias_sd=self.unit * total,
             lasting=ws[len(_SCALES) :].reshape(-1, len(_LASTING)).sum(axis=0) / total,
         )
@@ -149,12 +165,13 @@ class ErrorModel:
         fade = 1.0 - 1.0 / _GATE_MEMORY
         return replace(self, scatter=(fade * total + new + ratio, fade * count + new + 1.0))
 
-    def scattered(self, total: float, count: float) -> ErrorModel:
-        """With the scatter of ``count`` + 1 values of a window about their mean."""
+    def scattered(self, total: float, count: float, steps: float) -> ErrorModel:
+        """With the scatter of ``count`` + 1 values of a window about their mean, and half the sum
+        of their squared steps."""
         fade = (1.0 - 1.0 / _WITHIN_MEMORY) ** count
-        s, n = self.within
-        new = (1.0 - fade) * _WITHIN_STRENGTH
-        return replace(self, within=(fade * s + new + total, fade * n + new + count))
+        old, windows = self.within[:3], fade * self.within[3] + 1.0
+        a, b, c = (fade * w + v for w, v in zip(old, (total, count, steps), strict=True))
+        return replace(self, within=(a, b, c, windows))
 
     def weigh(
         self, stamp_ns: int, moved_m: float, y: float, variance: float, share: float
@@ -168,9 +185,9 @@ class ErrorModel:
         v = SCALE * variance
         S = var + v
         d2 = (y - mean) ** 2 / (_GAUSSIAN * S)
-        log_likelihood = -0.5 * np.log(S) - 0.5 * (TAIL + 1.0) * np.log1p(d2 / TAIL)
+        log_likelihood = -0.5 * np.log(S) - 0.5 * (_TAIL + 1.0) * np.log1p(d2 / _TAIL)
         log_likelihood -= log_likelihood.max()
-        weight = np.minimum((TAIL + 1.0) / (TAIL + d2), 1.0)
+        weight = np.minimum((_TAIL + 1.0) / (_TAIL + d2), 1.0)
         gain = var / (var + v / (weight * share))
         return replace(
             self,
@@ -229,7 +246,7 @@ class LearnedErrors:
             if known:
                 model = model.scattering(
                     float(np.mean([other.gate_scale for other in known])),
-                    float(np.mean([other.within_scale for other in known])),
+                    tuple(np.mean([other.within for other in known], axis=0).tolist()),
                 )
             self.models[name] = model
             self._choose(name, stamp_ns)
@@ -251,10 +268,11 @@ class LearnedErrors:
         stated."""
         model = self.models[name]
         information, r = model.scale / left[2], left[0]
-        sd = math.sqrt(stated)
-        new = (information, information * r, 1.0, r / sd, r * r / stated)
+        z = r / math.sqrt(stated)
         old = self.window.get(name)
-        self.window[name] = new if old is None else tuple(map(add, old, new))
+        step = 0.0 if old is None else 0.5 * (z - old[-1]) ** 2
+        new = (information, information * r, 1.0, z, z * z, step)
+        self.window[name] = (*(new if old is None else map(add, old, new)), z)
         self.newest[name] = row
         self.models[name] = model.heard(left[1] / stated)
 
@@ -273,8 +291,8 @@ class LearnedErrors:
         variance = 1.0 / sums[:, 0]
         scatter = sums[:, 4] - sums[:, 3] ** 2 / sums[:, 2]
         models = [
-            self.models[name].scattered(float(s), float(n) - 1.0)
-            for name, s, n in zip(names, scatter, sums[:, 2], strict=True)
+            self.models[name].scattered(float(s), float(n) - 1.0, float(steps))
+            for name, s, n, steps in zip(names, scatter, sums[:, 2], sums[:, 5], strict=True)
         ]
         sd = np.sqrt([m.scale * v + m.bias_sd**2 for m, v in zip(models, variance, strict=True)])
         rows = np.array([newest[name] for name in names])

@@ -48,10 +48,9 @@ def options_of(config: TrackerConfig) -> FilterOptions:
 
 def robust_options_of(config: TrackerConfig) -> RobustOptions:
     """How the rows of a planar or spatial track are re-weighted."""
-    kind, parameter = config.tail
     return RobustOptions(
-        kind=ROBUST.index(kind),
-        parameter=parameter,
+        kind=ROBUST.index(config.robust),
+        parameter=float(config.robust_parameter),
         nlos_probability=float(config.nlos_probability),
         nlos_excess_m=float(config.nlos_mean_excess_m),
     )

@@ -18,6 +18,7 @@ from netpos.messages.values import (
     NetworkTrack,
     Odometry,
     RsuErrors,
+    RsuMeasurement,
     StepCalibration,
     TrackMode,
     Velocity,
@@ -220,6 +221,7 @@ class PlanarEstimator(Estimator):
         step = estimate.step(stamp_ns, unheard_s, past.rejected_in_row, rows, self.bias)
         if self._secondary is not None:
             self._own = self._secondary.after(self._own, stamp_ns, estimate, rows, self.bias)
+        self._keep_in_front(epoch_rows, step.accepted)
         # a smoother does not reach across: what it keeps is one Gaussian
         breaks = int(bool(estimate.modes) != was_ambiguous)
         return UpdateResult(
@@ -239,6 +241,18 @@ class PlanarEstimator(Estimator):
         estimate = self._there()
         epochs = [*((then_ns, before.rows) for then_ns, before in recent), (stamp_ns, rows)]
         return level_of_epochs(epochs, stamp_ns, estimate.prior, estimate.cov, self._options)
+
+    def _keep_in_front(self, epoch_rows: EpochRows, accepted: Array) -> None:
+        """Take away what is behind an array that hears the device, where the mean is there."""
+        estimate = self._there()
+        for item, taken in zip(epoch_rows.items, accepted.tolist(), strict=True):
+            if not taken or not isinstance(item, RsuMeasurement):
+                continue
+            rsu = self._rsus[item.rsu_id]
+            dx, dy = (estimate.mean[POSITION] - rsu.info.position[:2]).tolist()
+            if rsu.cone and not rsu.in_front(dx, dy):
+                across = math.hypot(rsu.axes[0], rsu.axes[1])
+                estimate.cut_off_behind(rsu.info.position[:2], rsu.axes[:2] / across)
 
     def learn(
         self, stamp_ns: int, rows: Array, accepted: Sequence[float]

@@ -22,7 +22,7 @@ from netpos.messages.values import (
     RsuMeasurement,
     StepCalibration,
 )
-from netpos.tracking.learning import CORRELATION_S, LearnedErrors, Name
+from netpos.tracking.learning import WINDOW_S, LearnedErrors, Name
 
 _RSU = "rsu/"
 REFERENCED = sum(int(r.field) for _, r in readings() if r.has_reference)
@@ -207,7 +207,7 @@ class BiasStates:
             name = _name(m, kind)
             declared = rsu.bias_sd(kind), info.bias_correlation_time_s
             model = learned.model(name, math.sqrt(var), *declared, m.stamp_ns)
-            tau_s = info.noise_correlation_time_s or CORRELATION_S
+            tau_s = info.noise_correlation_time_s or WINDOW_S
             correlated = self._inflation(m, tau_s, kind)
             bias[kind] = self._slot(name, model.bias_sd, model.time_s(0.0))
             inflation[kind] = model.scale * correlated

@@ -254,6 +254,9 @@ class Track:
         if fix.refused:
             state.rejected[fix.refused] += len(epoch_rows.items)
         if not fix.found:
+            for item in epoch_rows.items:  # the fix counts them
+                if isinstance(item, RsuMeasurement):
+                    state.estimator.biases.accepted(self._rsus[item.rsu_id], item)
             return ()
         state.has_clock = fix.has_clock
         return self._note_accepted(stamp_ns, epoch_rows)

@@ -20,7 +20,6 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +43,7 @@ ARRAYS: dict[str, tuple[float, float, float]] = {
 }
 
 
+# Reflections in a room have no gate that fits all: what fits badly gets a larger variance instead.
 # A walking person: v^2 / T for 0.5 m/s and turns of some seconds, sqrt(0.05) m/s^2/sqrt(Hz), which
 # leaves nothing for manoeuvres.
 TRACKER = {
@@ -54,24 +54,14 @@ TRACKER = {
     "coverage_radius_m": 6.0,
     "initial_position_sd_max_m": 2.0,
     "gate_probability": 1.0,
+    "robust": "student_t",
+    "learn_errors": True,
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ArrayErrors:
-    """Error model of one array, in direction cosines (the arrays measure cone angles).
-
-    Found without the truth: each array's residual against the position the filter itself
-    estimates, pooled over arrays and runs, has an autocorrelation of two exponentials. The fast
-    one is the noise and its correlation time, the slow one the bias.
-    """
-
-    azimuth_cosine_sd: float = 0.07
-    elevation_cosine_sd: float = 0.17
-    azimuth_cosine_bias_sd: float = 0.10
-    elevation_cosine_bias_sd: float = 0.15
-    bias_correlation_time_s: float = 3.0
-    noise_correlation_time_s: float = 1.0
+# Data sheets of such arrays say 5 deg in front of them: of a linear array, an error of the
+# direction cosine that is the same in every direction. What else an array has is learned.
+COSINE_SD = math.radians(5.0)
 
 
 def import_ble_aoa(
@@ -80,7 +70,6 @@ def import_ble_aoa(
     *,
     run: str | None = None,
     vue_id: str = "vue_1",
-    errors: ArrayErrors | None = None,
 ) -> dict[str, int]:
     """Write one run as a bag: /rsu/info, /rsu/measurements and /VUE/ground_truth (10 Hz).
 
@@ -98,14 +87,13 @@ def import_ble_aoa(
     BagError  missing file, several runs and none chosen, or a line that cannot be understood
     FileExistsError  ``bag`` exists
     """
-    errors = errors or ArrayErrors()
     beacons = _beacon_file(Path(path), run)
     skipped: Counter[str] = Counter()
-    measurements = _measurements(beacons, vue_id, errors, skipped)
+    measurements = _measurements(beacons, vue_id, skipped)
     truth = _truth(_truth_file(beacons), vue_id, skipped)
     counts = write_values(
         bag,
-        rsus=[_info(rsu_id, errors) for rsu_id in ARRAYS],
+        rsus=[_info(rsu_id) for rsu_id in ARRAYS],
         measurements=measurements,
         truth=truth,
         tracker=TRACKER,
@@ -149,35 +137,29 @@ def _beacon_file(path: Path, run: str | None) -> Path:
     return files[run] if run is not None else next(iter(files.values()))
 
 
-def _info(rsu_id: str, errors: ArrayErrors) -> RsuInfo:
+def _info(rsu_id: str) -> RsuInfo:
     x, y, facing = ARRAYS[rsu_id]
     return RsuInfo(
         rsu_id=rsu_id,
         position=np.array([x, y, ARRAY_HEIGHT_M]),
         quaternion=yaw_quaternion(math.radians(facing)),
-        azimuth_bias_sd_rad=errors.azimuth_cosine_bias_sd,
-        elevation_bias_sd_rad=errors.elevation_cosine_bias_sd,
-        bias_correlation_time_s=errors.bias_correlation_time_s,
-        noise_correlation_time_s=errors.noise_correlation_time_s,
         angle_convention=AngleConvention.CONE,
     )
 
 
-def _measurements(
-    file: Path, vue_id: str, errors: ArrayErrors, skipped: Counter[str]
-) -> list[RsuMeasurement]:
+def _measurements(file: Path, vue_id: str, skipped: Counter[str]) -> list[RsuMeasurement]:
     measurements: list[RsuMeasurement] = []
     tag = ""
     for row in read_rows(file, 8, skipped, header=False):
         with row:
             if tag and row.values[1] != tag:
                 raise row.error(f"tag {row.values[1]}, but the run is of tag {tag}")
-            measurements.append(_measured(row, vue_id, errors))
+            measurements.append(_measured(row, vue_id))
             tag = row.values[1]
     return measurements
 
 
-def _measured(row: Row, vue_id: str, errors: ArrayErrors) -> RsuMeasurement:
+def _measured(row: Row, vue_id: str) -> RsuMeasurement:
     if row.values[7] not in ARRAYS:
         raise row.error(f"anchor {row.values[7]!r} is none of {', '.join(ARRAYS)}")
     azimuth = -_angle(row, 3, "azimuth", 89.0)
@@ -189,9 +171,9 @@ def _measured(row: Row, vue_id: str, errors: ArrayErrors) -> RsuMeasurement:
         fields=Field.AZIMUTH | Field.ELEVATION,
         rssi_dbm=row.rssi_dbm(2),
         azimuth_rad=azimuth,
-        azimuth_var=(errors.azimuth_cosine_sd / math.cos(azimuth)) ** 2,
+        azimuth_var=(COSINE_SD / math.cos(azimuth)) ** 2,
         elevation_rad=elevation,
-        elevation_var=(errors.elevation_cosine_sd / math.cos(elevation)) ** 2,
+        elevation_var=(COSINE_SD / math.cos(elevation)) ** 2,
     )
 
 

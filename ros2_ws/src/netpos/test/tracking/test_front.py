@@ -1,0 +1,75 @@
+"""What is behind an array that hears a device is cut off, against samples and in a track."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.estimates import cut_off_behind
+from netpos.tracking.rsus import Rsu
+from netpos.tracking.tracker import Tracker
+
+WALLS = {"west": (0.0, 0.0, 0.0), "north": (3.0, 3.0, -90.0), "south": (3.0, -3.0, 90.0)}
+SD = 0.05
+
+
+@pytest.mark.parametrize("ahead_m", [-3.0, -0.5, 0.0, 1.0])
+def test_the_moments_are_those_of_the_samples_in_front(ahead_m: float) -> None:
+    rng = np.random.default_rng(11)
+    root = np.tril(rng.normal(0.0, 0.6, (7, 7))) + np.eye(7)
+    origin, front = np.array([2.0, -1.0]), np.array([math.cos(0.7), math.sin(0.7)])
+    mean, cov = rng.normal(0.0, 1.0, 7), root @ root.T
+    mean[:2] = origin + ahead_m * front + 0.4 * np.array([-front[1], front[0]])
+    samples = mean + rng.normal(size=(2_000_000, 7)) @ root.T
+    kept = samples[(samples[:, :2] - origin) @ front > 0.0]
+    cut_off_behind(mean, cov, origin, front)
+    error_sd = np.sqrt(np.diag(np.cov(kept.T)) / len(kept))
+    assert (np.abs(mean - kept.mean(axis=0)) < 5.0 * error_sd).all()
+    np.testing.assert_allclose(cov, np.cov(kept.T), atol=0.05 * np.abs(cov).max())
+
+
+def _info(name: str) -> RsuInfo:
+    x, y, facing = WALLS[name]
+    half = math.radians(facing) / 2.0
+    return RsuInfo(
+        rsu_id=name,
+        position=np.array([x, y, 1.0]),
+        quaternion=np.array([0.0, 0.0, math.sin(half), math.cos(half)]),
+        angle_convention=AngleConvention.CONE,
+    )
+
+
+def _azimuth(info: RsuInfo, place: Array) -> float:
+    along = Rsu.of(info).axes.reshape(3, 3)[1]
+    offset = place - info.position
+    return math.asin(float(along @ offset) / float(np.linalg.norm(offset)))
+
+
+def test_a_device_is_not_behind_the_wall_of_an_array_that_hears_it() -> None:
+    """Two arrays with an error see it half a metre behind the wall of the third."""
+    infos = [_info(name) for name in WALLS]
+    tracker = Tracker(TrackerConfig(device_height_m=1.0, gate_probability=1.0, isolate_rsus=False))
+    for info in infos:
+        tracker.add_rsu(info)
+    places = []
+    for k in range(100):
+        for info in infos:
+            seen = 0.3 if info.rsu_id == "west" else max(1.5 - 0.03 * k, -0.5)
+            tracker.add(
+                RsuMeasurement(
+                    stamp_ns=1_000_000_000 + 100_000_000 * k,
+                    rsu_id=info.rsu_id,
+                    vue_id="vue_1",
+                    sequence=k,
+                    expected=3,
+                    fields=Field.AZIMUTH,
+                    azimuth_rad=_azimuth(info, np.array([seen, 0.0, 1.0])),
+                    azimuth_var=SD**2,
+                )
+            )
+        places += [o.odometry.position[0] for o in tracker.process() if o.odometry is not None]
+    assert len(places) > 80
+    assert min(places) > 0.0
