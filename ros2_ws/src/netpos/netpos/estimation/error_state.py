@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netpos.estimation.compile import kernel
+from netpos.estimation.fusion import W_GAIN, fuse
 from netpos.estimation.gate import gate_groups, select_rows
 from netpos.estimation.measurement import (
     GATE_VARIANCE,
@@ -145,10 +146,13 @@ def correct(
     index, nis = select_rows(rows, innovation, S, gate_nis, accepted)
     if index.size == 0:
         return 0.0, 0
-    prior, error = nav.copy(), np.zeros(n)
+    prior, error, use, work = nav.copy(), np.zeros(n), np.zeros(m), np.empty((W_GAIN + 1, n))
+    use[index] = 1.0
     posterior = cov
     for _ in range(ITERATIONS):
-        step, posterior = _sequential(cov, rows, index, variance, H, innovation, error)
+        step, posterior = np.zeros(n), cov.copy()
+        about = innovation + H @ error  # linearised about the last error
+        fuse(step, posterior, about, H, variance, use, work)
         change = 0.0
         for i in range(3):
             change = max(change, abs(step[i] - error[i]))
@@ -182,31 +186,6 @@ def _times(P: Array, h: Array) -> Array:
             for i in range(n):
                 out[i] += P[i, k] * h[k]
     return out
-
-
-@kernel
-def _sequential(
-    cov: Array,
-    rows: Array,
-    index: Stamps,
-    variance: Array,
-    H: Array,
-    innovation: Array,
-    error: Array,
-) -> tuple[Array, Array]:
-    """Error and covariance after the rows ``index`` one by one, linearised about ``error``."""
-    n = cov.shape[0]
-    P, step = cov.copy(), np.zeros(n)
-    for i in index:
-        h = H[i]
-        gain = _times(P, h)
-        s = _dot(h, gain) + variance[i]
-        residual = innovation[i] + _dot(h, error) - _dot(h, step)
-        for a in range(n):
-            step[a] += gain[a] / s * residual
-            for b in range(n):
-                P[a, b] -= gain[a] * gain[b] / s
-    return step, P
 
 
 @kernel

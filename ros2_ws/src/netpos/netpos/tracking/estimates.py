@@ -13,7 +13,13 @@ from netpos.estimation.forms.table import form_of
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.mixture import epoch as mixtures
 from netpos.estimation.mixture.epoch import Dynamics, Memory, Outcome
-from netpos.estimation.mixture.gaussians import Mixture, mode_of, moments, one_component
+from netpos.estimation.mixture.gaussians import (
+    Mixture,
+    fuse_value,
+    mode_of,
+    moments,
+    one_component,
+)
 from netpos.estimation.motion import NO_BIAS, Parameter
 from netpos.estimation.protection import mixture_radius
 from netpos.estimation.robust import positive_normal
@@ -233,11 +239,9 @@ def change_prior(mean: Array, cov: Array, index: int, before: float, after: floa
     if gained >= 0.0:
         cov[index, index] += gained
         return
-    variance = after * after * before * before / -gained
-    Ph = cov[:, index].copy()
-    S = Ph[index] + variance
-    mean -= Ph * (mean[index] / S)
-    cov -= np.outer(Ph, Ph) / S
+    h = np.zeros(mean.size)
+    h[index] = 1.0
+    fuse_value(mean, cov, h, -mean[index], after * after * before * before / -gained)
 
 
 def cut_off_behind(mean: Array, cov: Array, origin: Array, front: Array) -> None:

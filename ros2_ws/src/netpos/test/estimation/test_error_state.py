@@ -68,6 +68,16 @@ def test_correct_is_the_information_form() -> None:
     np.testing.assert_array_equal(cov, cov.T)
 
 
+def test_a_fix_far_surer_than_the_prior_leaves_its_own_variance() -> None:
+    """Sixteen digits between the two: P - K S K' would leave nothing, or less."""
+    nav, cov = start(), np.eye(ERR)
+    cov[ERR_POSITION, ERR_POSITION] = 1e8 * np.eye(3)
+    rows = place_rows(nav[NAV_POSITION].copy(), 1e-8 * np.eye(3), (0.0, 0.0, 0.0))
+    correct(nav, cov, rows, OPEN, np.zeros(1))
+    np.testing.assert_allclose(cov[ERR_POSITION, ERR_POSITION], 1e-8 * np.eye(3), rtol=1e-6)
+    assert np.linalg.eigvalsh(cov).min() > 0.0
+
+
 def test_a_row_outside_the_gate_changes_nothing() -> None:
     rng = np.random.default_rng(2)
     nav, cov = start(), spd(rng)

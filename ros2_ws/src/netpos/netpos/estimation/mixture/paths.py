@@ -22,7 +22,7 @@ from netpos.estimation.mixture.candidates import (
     first_of,
     log_likelihood,
 )
-from netpos.estimation.mixture.gaussians import Mixture
+from netpos.estimation.mixture.gaussians import Mixture, fuse_value
 from netpos.estimation.mixture.reduction import reduced
 from netpos.estimation.mixture.ring import RING_MERGE_COST
 from netpos.estimation.mixture.turns import add_explanations, may_turn, turn
@@ -90,11 +90,12 @@ def _fuse_blocked(
 ) -> float:
     """Fuse the range ``rows[i]`` of a blocked path in place, by the moments of its excess; its
     NIS."""
-    innovation = predicted.innovation[i] - path.excess
-    variance = rows[i, VARIANCE] + predicted.prior_var[i] + predicted.second_order_var[i]
-    gain = predicted.HP[i, : mean.size] / variance
-    mean += gain * innovation
-    cov -= np.outer(gain, gain) * (variance - path.excess_var)
+    n, innovation = mean.size, predicted.innovation[i] - path.excess
+    noise = rows[i, VARIANCE] + predicted.second_order_var[i]
+    variance = noise + predicted.prior_var[i]
+    gain = predicted.HP[i, :n] / variance
+    fuse_value(mean, cov, predicted.H[i, :n].copy(), innovation, noise)
+    cov += np.outer(gain, gain) * path.excess_var
     return float(innovation * innovation / variance)
 
 
