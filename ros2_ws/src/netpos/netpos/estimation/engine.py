@@ -43,6 +43,7 @@ class FilterOptions(NamedTuple):
     robust: RobustOptions
     models: int  # motion models that interact; 1: none
     sector_slip: float  # least probability of a sector of a phase; 0: they are no components
+    learns_density: bool  # of the white acceleration (``accel_density``)
     of_form: Array  # what the form has of its own (``FilterForm.parameters``)
     gate_nis: Array  # (GATE_SIZE,) largest accepted NIS for 0, 1, ... degrees of freedom
 
@@ -100,6 +101,7 @@ class Run(NamedTuple):
     groups: Array
     radius: Array
     undetected_m: Array
+    accel_density: Array
 
 
 @kernel

@@ -12,6 +12,7 @@ from netpos.estimation.engine import Run
 from netpos.estimation.measurement import BIAS
 from netpos.estimation.mixture.epoch import run_epochs
 from netpos.estimation.mixture.gaussians import Mixture, one_component
+from netpos.estimation.motion import Parameter
 from netpos.estimation.report import run_levels
 from netpos.estimation.state import N_CORE
 from netpos.evaluation.metrics import NS
@@ -79,7 +80,7 @@ class Followed(NamedTuple):
 
 
 def _empty_run(epochs: int, n: int) -> Run:
-    figures = np.zeros((5, epochs))
+    figures = np.zeros((6, epochs))
     return Run(np.full((epochs, n), np.nan), np.full((epochs, n, n), np.nan), *figures)
 
 
@@ -127,17 +128,20 @@ class Follower:
         run = _empty_run(count, self.first_bias + epochs.bias.shape[1])
         level, tracked = np.full(count, np.nan), np.zeros(count, dtype=np.bool_)
         motions, imu = self._run_motions(count, samples is not None), _buffer(samples)
+        varies = len(motions) > 1
         start: tuple[int, Mixture] | None = (0, one_component(mean, cov))
         losses = 0
         while start is not None:
             first, fix = start
             part, part_run = epochs.since(first, fixed=losses > 0), _part(run, first)
-            part_motions = motions[first:] if imu is not None else motions
+            part_motions = motions[first:] if varies else motions
             if imu is None and fix.log_weights.size == 1:
                 done = self._compiled(part, fix.means[0], fix.covs[0], part_run)
             else:
                 done = self._stepped(part, fix, part_run, imu, part_motions)
             end = first + done
+            if self._options.learns_density:
+                part_motions[:done, Parameter.ACCEL] = part_run.accel_density[:done]
             whole = _part(part_run, 0, done)
             level[first:end] = run_levels(part.measured, whole, self._options)
             lost = end < count
@@ -151,9 +155,10 @@ class Follower:
         )
 
     def _run_motions(self, count: int, driven: bool) -> Array:
-        """(1 or N, Parameter): the N of a run that the IMU drives are filled on the way. Of models
-        that interact, bound and level know one: straight on."""
-        if driven:
+        """(1 or N, Parameter): the N of a run that the IMU drives, or the density of which is
+        learned, are filled on the way. Of models that interact, bound and level know one:
+        straight on."""
+        if driven or self._options.learns_density:
             return np.tile(self._motions[0], (count, 1))
         return self._motions[1:2] if self._config.interacts else self._motions
 
@@ -196,6 +201,7 @@ class Follower:
                 heard_ns = stamp if run.dof[k] else heard_ns
             run.means[k], run.covs[k] = augmented(estimate.mean, estimate.cov, sd)
             run.radius[k] = estimate.radius(0.0)
+            run.accel_density[k] = estimate.motion[Parameter.ACCEL]
             if imu is not None:
                 motions[k] = estimate.motion
             if rejected >= config.max_rejected_epochs:

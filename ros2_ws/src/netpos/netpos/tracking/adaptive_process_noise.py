@@ -43,19 +43,21 @@ class AdaptiveProcessNoise:
         twin.config, twin._explained, twin._last = self.config, self._explained, self._last.copy()
         return twin
 
-    def density(self, stamp_ns: int, velocities: Iterable[Velocity] = ()) -> float | None:
+    def density(
+        self, stamp_ns: int, free_density: float, velocities: Iterable[Velocity] = ()
+    ) -> float:
         """Density [m/s^2/sqrt(Hz)] for the prediction to ``stamp_ns``, where ``velocities`` are
-        reported; None: the motion model's own."""
+        reported; ``free_density``: of a device of which they say nothing."""
         config = self.config
         if config.steady_accel_density_mps2_sqrthz == 0.0 or config.use_imu:
-            return None
+            return free_density
         opened = max((self._change(velocity) for velocity in velocities), default=0.0)
         known = [
             float(np.trace(last.cov)) / 2.0
             for last in self._last.values()
             if stamp_ns - last.stamp_ns <= _LASTS_S * 1e9
         ]
-        free = config.accel_density_mps2_sqrthz**2
+        free = free_density**2
         steady = config.steady_accel_density_mps2_sqrthz**2 + min(known, default=free) / _LASTS_S
         return math.sqrt(min(steady, free) + opened)
 

@@ -61,10 +61,11 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
         "continuous | werner (fokin2020:eq.4) | white_acceleration (eq.36)",
     )
     accel_density_mps2_sqrthz: float = real(
-        0.5,
-        1e-6,
+        0.0,
+        0.0,
         1e3,
-        "continuous: density of the white acceleration between manoeuvres [m/s^2/sqrt(Hz)]",
+        "continuous: density of the white acceleration between manoeuvres [m/s^2/sqrt(Hz)]; 0:"
+        " learned on the way, from 0.5 on; interacting: 0.5",
     )
     steady_accel_density_mps2_sqrthz: float = real(
         0.0,
@@ -352,6 +353,16 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
                 "motion_model strapdown takes no step velocities; leave step_length_factor_sd and"
                 " step_heading_offset_sd_rad at 0"
             )
+
+    @property
+    def learns_density(self) -> bool:
+        """Whether the density of the white acceleration is learned on the way: of one model that
+        has one and no IMU."""
+        models = self.motion_models
+        if self.accel_density_mps2_sqrthz > 0.0 or len(models) != 1:
+            return False
+        has_one = models[0].is_driven_by_white_acceleration and models[0].accel_density is None
+        return has_one and self.process_noise == "continuous" and not self.is_linear
 
     @property
     def use_imu(self) -> bool:

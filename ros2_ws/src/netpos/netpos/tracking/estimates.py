@@ -8,6 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from netpos.estimation import engine
+from netpos.estimation.accel_density import (
+    AccelDensity,
+    density_of,
+    learn,
+    move,
+    resized,
+    unknown_density,
+)
 from netpos.estimation.engine import EpochInput
 from netpos.estimation.forms.table import form_of
 from netpos.estimation.measurement import GROUP
@@ -63,14 +71,20 @@ class Estimate:
         self._factored = not form_of(config.filter).carries_cov
         self._dynamics = dynamics_of(config, NO_BIAS)
         self._motion: Array = self._dynamics.motions[0]
+        self._declared = float(self._motion[Parameter.ACCEL])
         self._components: Mixture | None = None  # replaced, never changed; None: one component
         self._modes: tuple[TrackMode, ...] | None = ()  # None: not yet asked for
         mean, cov = start_state(config, mean, cov)
         self.mean, self._cov_or_sqrt = mean.copy(), engine.to_cov_or_sqrt(cov, self._options)
         if self._options.models > 1:
             self._components = mixtures.a_component_each(mean, cov, self._dynamics)
+        self._learned = self._unknown()
+        self._accel_is_set = False
         self._rows = 0
         self._make_room(4)
+
+    def _unknown(self) -> AccelDensity | None:
+        return unknown_density(self.mean.size) if self._options.learns_density else None
 
     @property
     def motion(self) -> Array:
@@ -83,15 +97,41 @@ class Estimate:
         self._motion[Parameter.SPEED_INCREMENT] = speed_mps
         self._motion[Parameter.GYRO] = gyro_density
 
+    @property
+    def accel_density(self) -> float:
+        """Density of the white acceleration [m/s^2/sqrt(Hz)] from ``stamp_ns`` on: declared, or
+        learned up to there."""
+        if self._learned is None:
+            return self._declared
+        return float(density_of(self._learned))
+
     def set_process_noise(self, accel_density: float) -> None:
-        """Set the density of the white acceleration [m/s^2/sqrt(Hz)] from ``stamp_ns`` on."""
+        """Set the density of the white acceleration [m/s^2/sqrt(Hz)] from ``stamp_ns`` up to the
+        next epoch."""
         self._motion[Parameter.ACCEL] = accel_density
+        self._accel_is_set = True
 
     def set_config(self, config: TrackerConfig) -> None:
         """Go on with other live parameters (``live_parameters``)."""
-        self._options = options_of(config)
+        learned, self._options = self._options.learns_density, options_of(config)
+        if learned != self._options.learns_density:
+            self._learned = self._unknown()
         self._dynamics.motions[:, Parameter.ACCEL] = motions_of(config)[:, Parameter.ACCEL]
+        self._declared = float(self._motion[Parameter.ACCEL])
         self._modes = () if self._components is None else None
+
+    def _move_learned(self, dt_s: float, bias: Array) -> None:
+        """Take the density that is learned, and move what it depends on with the state."""
+        if self._learned is None:
+            return
+        if not self._accel_is_set:
+            self._motion[Parameter.ACCEL] = density_of(self._learned)
+        self._accel_is_set = False
+        move(self._learned, self.mean, dt_s, self._motion, bias)
+
+    def _learn(self, turned: float) -> None:
+        if self._learned is not None:
+            learn(self._learned, *self.prior, self.mean, self.cov, turned)
 
     def _with(self, bias: Array) -> Dynamics:
         return Dynamics(self._dynamics.motions, self._dynamics.sojourn_s, bias)
@@ -159,6 +199,8 @@ class Estimate:
         else:
             mean, cov = augmented(self.mean, self.cov, sd)
             self.mean, self._cov_or_sqrt = mean, engine.to_cov_or_sqrt(cov, self._options)
+        if self._learned is not None:
+            self._learned = resized(self._learned, self.mean.size)
         self._make_room(self._rows)
 
     def change_prior(self, index: int, before: float, after: float) -> None:
@@ -181,6 +223,7 @@ class Estimate:
         """Move to ``stamp_ns``."""
         dt = (stamp_ns - self.stamp_ns) * 1e-9
         self.stamp_ns = stamp_ns
+        self._move_learned(dt, bias)
         if self._components is None:
             engine.predict(self.mean, self._cov_or_sqrt, dt, self._motion, bias, self._options)
         elif dt > 0.0:
@@ -194,7 +237,9 @@ class Estimate:
         if m > self._rows:
             self._make_room(m)
         memory = self._memory
-        epoch = EpochInput((stamp_ns - self.stamp_ns) * 1e-9, unheard_s, rejected_in_row, rows)
+        dt_s = (stamp_ns - self.stamp_ns) * 1e-9
+        epoch = EpochInput(dt_s, unheard_s, rejected_in_row, rows)
+        self._move_learned(dt_s, bias)
         found: Outcome = mixtures.advance(
             self.mean,
             self._cov_or_sqrt,
@@ -206,6 +251,7 @@ class Estimate:
             memory,
         )
         self.stamp_ns = stamp_ns
+        self._learn(found.turned)
         if found.begun:
             self._turn_ns = stamp_ns
         several = found.components.log_weights.size > 1
@@ -222,6 +268,8 @@ class Estimate:
         twin.mean, twin._cov_or_sqrt = self.mean.copy(), self._cov_or_sqrt.copy()
         twin._dynamics = self._dynamics._replace(motions=self._dynamics.motions.copy())
         twin._motion = twin._dynamics.motions[0]
+        if self._learned is not None:
+            twin._learned = resized(self._learned, self.mean.size)
         return twin
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from netpos.estimation.accel_density import START
 from netpos.estimation.chi_square import chi_square_bound
 from netpos.estimation.conditioning import RobustOptions
 from netpos.estimation.engine import GATE_SIZE, FilterOptions
@@ -41,6 +42,7 @@ def options_of(config: TrackerConfig) -> FilterOptions:
         robust=robust_options_of(config),
         models=max(len(config.motion_models), 1),
         sector_slip=float(config.sector_slip_probability) if by_sectors(config) else 0.0,
+        learns_density=config.learns_density,
         of_form=np.array([float(getattr(config, name)) for name in form.parameters]),
         gate_nis=gate_thresholds(config.gate_probability),
     )
@@ -72,7 +74,7 @@ def dynamics_of(config: TrackerConfig, bias: Array) -> Dynamics:
 
 def _motion_of(config: TrackerConfig, model: MotionModel, extras: int, idle: float) -> Array:
     c = SPEED_OF_LIGHT_MPS
-    accel = config.accel_density_mps2_sqrthz
+    accel = config.accel_density_mps2_sqrthz or START
     if model.accel_density is not None:
         accel = getattr(config, model.accel_density)
     elif config.process_noise == "white_acceleration":

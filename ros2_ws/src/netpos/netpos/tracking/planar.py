@@ -83,7 +83,7 @@ class PlanarEstimator(Estimator):
         self._shared, self._lives = shared, count(1)
         self._options, self._extra_sd = options_of(config), initial_extra_sd(config)
         self._use_imu, self._calibrates_steps = config.use_imu, config.calibrates_steps
-        self._steady = config.steady_accel_density_mps2_sqrthz > 0.0
+        self._steady = config.steady_accel_density_mps2_sqrthz > 0.0 and not config.use_imu
         self._secondary = Secondary(vue_id, config) if config.network else None
         self.recorder = PosteriorRecorder.of(vue_id, config)
         self._forget()
@@ -209,9 +209,8 @@ class PlanarEstimator(Estimator):
             estimate.set_imu_increment(yaw, speed, gyro)
         if self._steady:
             velocities = (item for item in items if isinstance(item, Velocity))
-            density = self._process_noise.density(stamp_ns, velocities)
-            if density is not None:
-                estimate.set_process_noise(density)
+            free = estimate.accel_density
+            estimate.set_process_noise(self._process_noise.density(stamp_ns, free, velocities))
         return estimate
 
     def update(self, stamp_ns: int, epoch_rows: EpochRows, past: Past) -> UpdateResult:

@@ -17,7 +17,6 @@ FREE, STEADY = 1.0, 0.1
 
 def process_noise(**settings: Any) -> AdaptiveProcessNoise:
     given = {
-        "accel_density_mps2_sqrthz": FREE,
         "steady_accel_density_mps2_sqrthz": STEADY,
         "gate_probability": 0.9999,
     }
@@ -37,9 +36,7 @@ def report(time_s: float, vx: float, sd: float = 0.05, source: str = "step_veloc
 def after(walk: AdaptiveProcessNoise, *reports: Velocity) -> float:
     found = 0.0
     for item in reports:
-        density = walk.density(item.stamp_ns, [item])
-        assert density is not None
-        found = density
+        found = walk.density(item.stamp_ns, FREE, [item])
     return found
 
 
@@ -57,9 +54,9 @@ def test_an_unknown_velocity_is_as_free_as_any() -> None:
 def test_what_was_said_lasts_a_second() -> None:
     walk = process_noise()
     after(walk, report(1.0, 1.0))
-    assert walk.density(2 * NS) == pytest.approx(math.hypot(STEADY, 0.05))
-    assert walk.density(2 * NS + 1) == FREE
-    assert process_noise().density(NS) == FREE
+    assert walk.density(2 * NS, FREE) == pytest.approx(math.hypot(STEADY, 0.05))
+    assert walk.density(2 * NS + 1, FREE) == FREE
+    assert process_noise().density(NS, FREE) == FREE
 
 
 def test_a_change_beyond_the_errors_is_a_jump_at_some_time_since() -> None:
@@ -79,15 +76,15 @@ def test_errors_explain_what_the_gate_accepts(distance2: float, opens: bool) -> 
 def test_sources_are_compared_with_themselves() -> None:
     walk = process_noise()
     after(walk, report(1.0, 1.0), report(1.05, 0.0, source="other"), report(1.1, 1.0))
-    assert walk.density(round(1.1 * NS)) == pytest.approx(math.hypot(STEADY, 0.05))
+    assert walk.density(round(1.1 * NS), FREE) == pytest.approx(math.hypot(STEADY, 0.05))
     assert after(walk, report(1.2, 1.0, source="other")) > 1.0
 
 
 def test_off_or_with_an_imu_the_motion_model_has_its_own() -> None:
     off = process_noise(steady_accel_density_mps2_sqrthz=0.0)
-    assert off.density(NS, [report(1.0, 1.0)]) is None
+    assert off.density(NS, 0.7, [report(1.0, 1.0)]) == 0.7
     driven = process_noise(motion_model="inertial")
-    assert driven.density(NS, [report(1.0, 1.0)]) is None
+    assert driven.density(NS, 0.7, [report(1.0, 1.0)]) == 0.7
 
 
 @pytest.mark.parametrize(

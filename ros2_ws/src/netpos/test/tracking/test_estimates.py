@@ -264,7 +264,7 @@ def test_interacting_models_in_one_kernel_are_the_same(name: str) -> None:
     times = np.array([0.0, 0.1, 0.2, 0.3, 1.9, 2.0])
     stamps = T0 + np.round(times * 1e9).astype(np.int64)
     rows = [fix(1.0 + 3.0 * t + 500.0 * (t == 0.2), 2.0 + 4.0 * t) for t in times]
-    run = Run(np.empty((6, 7)), np.empty((6, 7, 7)), *np.empty((5, 6)))
+    run = Run(np.empty((6, 7)), np.empty((6, 7, 7)), *np.empty((6, 6)))
     epochs = Epochs(stamps, np.arange(0, 14, 2), np.vstack(rows))
     done = run_epochs(
         epochs,

@@ -74,6 +74,7 @@ def test_options_hold_what_the_parameters_say() -> None:
         robust=RobustOptions(ROBUST.index("student_t"), 5.5, 0.1, 33.0),
         models=1,
         sector_slip=1e-6,
+        learns_density=True,
         of_form=options.of_form,
         gate_nis=options.gate_nis,
     )

@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netpos.estimation.accel_density import density_of, learn, unknown_density
+from netpos.estimation.accel_density import move as move_density
 from netpos.estimation.compile import kernel
 from netpos.estimation.conditioning import Robust, RobustOptions
 from netpos.estimation.engine import (
@@ -48,6 +50,7 @@ from netpos.estimation.mixture.sectors import (
     reduced_by_sector,
 )
 from netpos.estimation.mixture.turns import add_explanations, may_turn, turn
+from netpos.estimation.motion import Parameter
 from netpos.estimation.predicted import note_innovations, predict_rows
 from netpos.estimation.protection import (
     FusedEpoch,
@@ -248,12 +251,14 @@ def note_turn(found: Update, motion: Array, options: FilterOptions) -> None:
 class Outcome(NamedTuple):
     """What came of an epoch of a track: its components; NIS of the rows accepted and their number;
     how far [m] a manoeuvre that this epoch does not show may have taken the device (not a number
-    where the posterior is not sound); whether a component "it has turned" has begun."""
+    where the posterior is not sound); the probability that the device has turned; whether a
+    component "it has turned" has begun."""
 
     components: Mixture
     nis: float
     used: int
     undetected_m: float
+    turned: float
     begun: bool
 
 
@@ -308,7 +313,8 @@ def _finish(
     x: Array, S: Array, epoch: EpochInput, options: FilterOptions, memory: Memory
 ) -> float:
     """Fill the innovations of an epoch that the estimate ``x`` (n,), ``S`` (n, n) has had, from
-    the rows as its prediction saw them; ``Outcome.undetected_m``."""
+    the rows as its prediction saw them; ``Outcome.undetected_m``. ``memory.step.met_cov`` becomes
+    the covariance of the estimate."""
     step, rows = memory.step, epoch.rows
     write_cov(options.filter, S, step.met_cov)
     if not is_sound(x, step.met_cov):
@@ -349,11 +355,11 @@ def advance(
     if not several:
         if rows.shape[0] == 0:
             predict(x, S, epoch.dt_s, dynamics.motions[0], dynamics.bias, options)
-            return Outcome(components, 0.0, 0, 0.0, False)
+            return Outcome(components, 0.0, 0, 0.0, 0.0, False)
         enough, nis, used = _by_one(x, S, epoch, since_turn_s, dynamics, options, step)
         if enough:
             undetected_m = _finish(x, S, epoch, options, memory)
-            return Outcome(components, nis, used, undetected_m, False)
+            return Outcome(components, nis, used, undetected_m, 0.0, False)
         components = one_component(step.prior_mean, step.prior_cov)
     else:
         components = moved_to_epoch(components, epoch, dynamics, options)
@@ -361,7 +367,7 @@ def advance(
         mean, cov = moments(components)
         x[:] = mean
         write_cov_or_sqrt(options.filter, cov, S)
-        return Outcome(components, 0.0, 0, 0.0, False)
+        return Outcome(components, 0.0, 0, 0.0, 0.0, False)
     step.prior_mean[:], step.prior_cov[:] = moments(components)
     write_cov_or_sqrt(options.filter, step.prior_cov, step.prior_cov_or_sqrt)
     found = apply_epoch(components, epoch, options, since_turn_s, step.accepted)
@@ -372,7 +378,8 @@ def advance(
     x[:] = mean
     write_cov_or_sqrt(options.filter, cov, S)
     undetected_m = _finish(x, S, epoch, options, memory)
-    return Outcome(found.components, found.nis, found.used, undetected_m, found.begun)
+    nis, used, turned = found.nis, found.used, found.turned
+    return Outcome(found.components, nis, used, undetected_m, turned, found.begun)
 
 
 @kernel
@@ -394,6 +401,7 @@ def run_epochs(
     memory = memory_of(mean.size, max(np.diff(row_start).max(), 1))
     x, S = mean.copy(), cov_or_sqrt_of(cov, options)
     components, rejected_in_row = a_component_each(x, cov, dynamics), 0
+    learned, motion = unknown_density(x.size), dynamics.motions[0]
     last_ns = heard_ns = turn_ns = stamps_ns[0]
     for k in range(stamps_ns.size):
         now_ns = stamps_ns[k]
@@ -401,8 +409,15 @@ def run_epochs(
         dt, unheard_s = (now_ns - last_ns) * 1e-9, (now_ns - heard_ns) * 1e-9
         epoch = EpochInput(dt, unheard_s, rejected_in_row, rows)
         since_turn_s, last_ns = (now_ns - turn_ns) * 1e-9, now_ns
+        if options.learns_density:
+            motion[Parameter.ACCEL] = density_of(learned)
+            move_density(learned, x, dt, motion, dynamics.bias)
+        run.accel_density[k] = motion[Parameter.ACCEL]
         found = advance(x, S, components, epoch, since_turn_s, dynamics, options, memory)
         components = found.components
+        if options.learns_density and rows.shape[0] > 0:
+            step = memory.step
+            learn(learned, step.prior_mean, step.prior_cov, x, step.met_cov, found.turned)
         turn_ns = now_ns if found.begun else turn_ns
         run.nis[k], run.dof[k], run.groups[k], run.radius[k] = found.nis, found.used, 0, 0.0
         run.undetected_m[k] = run.undetected_m[k - 1] if k > 0 else 0.0

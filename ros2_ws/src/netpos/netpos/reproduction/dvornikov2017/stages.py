@@ -133,7 +133,7 @@ class Pass:
         n = self._epochs.size
         mean = np.zeros(8)
         mean[TRACK_STATES] = start
-        run = Run(np.empty((n, 8)), np.empty((n, 8, 8)), *np.empty((5, n)))
+        run = Run(np.empty((n, 8)), np.empty((n, 8, 8)), *np.empty((6, n)))
         epochs = Epochs(self._epochs, self._row_start, position_rows(fixes, self._sd))
         dynamics = dynamics_of(self._setting.tracker, NO_BIAS)
         run_epochs(epochs, mean, self._start_cov, dynamics, self._options, run)

@@ -140,13 +140,13 @@ class Setup:
         for k, stamp in enumerate(self.stamps_ns.tolist()):
             epoch_rows = rows[k] if self.heard[k] else _alone(rows[k, 2:])
             velocity = reported(stamp, epoch_rows[-2:])
-            density = process_noise.density(stamp, [velocity])
+            free = self.config.accel_density_mps2_sqrthz
+            density = process_noise.density(stamp, free, [velocity])
             if estimate is None:
                 start.hear(velocity)
                 estimate = start.add(stamp, epoch_rows, np.zeros(len(epoch_rows)))
             else:
-                if density is not None:
-                    estimate.set_process_noise(density)
+                estimate.set_process_noise(density)
                 if k == wrong_at:
                     estimate = _moved(self.config, estimate, epoch_rows)
                 unheard_s = (stamp - last_ns) / NS

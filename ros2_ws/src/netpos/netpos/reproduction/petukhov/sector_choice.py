@@ -152,9 +152,9 @@ class Setup:
         process_noise = AdaptiveProcessNoise(self.config)
         for k in range(1, len(rows)):
             stamp_ns = NS + round(self.times_s[k] * NS)
-            density = process_noise.density(stamp_ns, [reported(stamp_ns, rows[k, 2:])])
-            if density is not None:
-                estimate.set_process_noise(density)
+            free = self.config.accel_density_mps2_sqrthz
+            velocities = [reported(stamp_ns, rows[k, 2:])]
+            estimate.set_process_noise(process_noise.density(stamp_ns, free, velocities))
             estimate.step(stamp_ns, INTERVAL_S, 0, rows[k], NO_BIAS)
             s = int(step[k])  # the last epoch of the step stays
             probable, claimed[s] = self._sector(estimate, rows[k, 1])
