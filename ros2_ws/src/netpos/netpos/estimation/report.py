@@ -54,13 +54,16 @@ def _unheard_s(epochs: Epochs, run: Run) -> Array:
 
 
 def _rows_of_groups(epochs: Epochs, run: Run, options: FilterOptions) -> tuple[Array, Array]:
-    """Number of accepted rows (N,) of the epochs; number of refused groups, rows of each, and
-    their gate (N, 3)."""
+    """Number of accepted rows (N,) of the epochs; number of groups that their gate refused, rows
+    of each, and the gate (N, 3)."""
     row_start, rows = epochs.row_start[: run.nis.size + 1], epochs.rows
-    groups = rows[row_start[1:] - 1, GROUP].astype(int) + 1
-    size = np.diff(row_start) // groups
+    count = np.diff(row_start)
+    groups = np.where(count > 0, rows[row_start[1:] - 1, GROUP].astype(int) + 1, 1)
+    size = count // groups
     gate_nis = options.gate_nis[np.minimum(size, GATE_SIZE - 1)]
-    return run.groups * size, np.column_stack([groups - run.groups, size, gate_nis])
+    gated = (count > 0) & np.isfinite(gate_nis)
+    refused = np.where(gated, groups - run.groups, 0.0)
+    return run.groups * size, np.column_stack([refused, size, gate_nis])
 
 
 @kernel

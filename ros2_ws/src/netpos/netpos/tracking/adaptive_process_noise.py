@@ -9,7 +9,7 @@ square of the change as its variance.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -49,17 +49,20 @@ class AdaptiveProcessNoise:
         """Density [m/s^2/sqrt(Hz)] for the prediction to ``stamp_ns``, where ``velocities`` are
         reported; ``free_density``: of a device of which they say nothing."""
         config = self.config
+        opened = max((self._change(velocity) for velocity in velocities), default=0.0)
         if config.steady_accel_density_mps2_sqrthz == 0.0 or config.use_imu:
             return free_density
-        opened = max((self._change(velocity) for velocity in velocities), default=0.0)
-        known = [
-            float(np.trace(last.cov)) / 2.0
-            for last in self._last.values()
-            if stamp_ns - last.stamp_ns <= _LASTS_S * 1e9
-        ]
+        known = [float(np.trace(last.cov)) / 2.0 for last in self._lately(stamp_ns)]
         free = free_density**2
         steady = config.steady_accel_density_mps2_sqrthz**2 + min(known, default=free) / _LASTS_S
         return math.sqrt(min(steady, free) + opened)
+
+    def hears(self, stamp_ns: int) -> bool:
+        """Whether a velocity reported before still holds at ``stamp_ns``."""
+        return any(True for _ in self._lately(stamp_ns))
+
+    def _lately(self, stamp_ns: int) -> Iterator[Velocity]:
+        return (v for v in self._last.values() if stamp_ns - v.stamp_ns <= _LASTS_S * 1e9)
 
     def _change(self, velocity: Velocity) -> float:
         """Spectral density of the acceleration [m^2/s^3] that the change since the last report of

@@ -43,6 +43,8 @@ from netpos.tracking.models import (
     start_state,
 )
 
+_FARTHEST_BEHIND_SD = 5.0  # one Gaussian error in three million
+
 
 class Step(NamedTuple):
     """What came of an epoch: NIS of the accepted rows and their number; 1 or 0 of each group
@@ -79,7 +81,7 @@ class Estimate:
         if self._options.models > 1:
             self._components = mixtures.a_component_each(mean, cov, self._dynamics)
         self._learned = self._unknown()
-        self._accel_is_set = False
+        self._accel_is_set, self._learns = False, True
         self._rows = 0
         self._make_room(4)
 
@@ -99,15 +101,19 @@ class Estimate:
 
     @property
     def accel_density(self) -> float:
-        """Density of the white acceleration [m/s^2/sqrt(Hz)] from ``stamp_ns`` on: declared, or
-        learned up to there."""
-        if self._learned is None:
-            return self._declared
-        return float(density_of(self._learned))
+        """Density of the white acceleration [m/s^2/sqrt(Hz)] from ``stamp_ns`` on where none is
+        set: declared, or learned up to there."""
+        return self._declared if self._learned is None else float(density_of(self._learned))
+
+    @property
+    def declared_density(self) -> float:
+        """Density of the white acceleration [m/s^2/sqrt(Hz)] of a device of which nothing is
+        learned."""
+        return self._declared
 
     def set_process_noise(self, accel_density: float) -> None:
         """Set the density of the white acceleration [m/s^2/sqrt(Hz)] from ``stamp_ns`` up to the
-        next epoch."""
+        next epoch, from which none is learned."""
         self._motion[Parameter.ACCEL] = accel_density
         self._accel_is_set = True
 
@@ -121,16 +127,19 @@ class Estimate:
         self._modes = () if self._components is None else None
 
     def _move_learned(self, dt_s: float, bias: Array) -> None:
-        """Take the density that is learned, and move what it depends on with the state."""
-        if self._learned is None:
-            return
-        if not self._accel_is_set:
-            self._motion[Parameter.ACCEL] = density_of(self._learned)
+        """Take the density that is set, learned or declared, and move what is learned with the
+        state."""
+        learned, self._learns = self._learned, not self._accel_is_set
         self._accel_is_set = False
-        move(self._learned, self.mean, dt_s, self._motion, bias)
+        if self._learns:
+            self._motion[Parameter.ACCEL] = self.accel_density
+        if learned is not None and self._learns:
+            move(learned, self.mean, dt_s, self._motion, bias)
+        elif learned is not None:
+            self._learned = AccelDensity(learned.theta, *unknown_density(self.mean.size)[1:])
 
     def _learn(self, turned: float) -> None:
-        if self._learned is not None:
+        if self._learned is not None and self._learns:
             learn(self._learned, *self.prior, self.mean, self.cov, turned)
 
     def _with(self, bias: Array) -> Dynamics:
@@ -295,10 +304,13 @@ def change_prior(mean: Array, cov: Array, index: int, before: float, after: floa
 def cut_off_behind(mean: Array, cov: Array, origin: Array, front: Array) -> None:
     """Moments of a Gaussian without what is behind a line, in place: mean (n,), covariance (n, n);
     the line through ``origin`` (2,) m, with ``front`` (2,), of unit length, across it (Simon and
-    Simon 2010, eq. 13 to 20 for one constraint)."""
+    Simon 2010, eq. 13 to 20 for one constraint). Nothing happens where the mean is more than
+    ``_FARTHEST_BEHIND_SD`` behind it: that contradicts the estimate, it does not cut it."""
     Ph = cov[:, POSITION] @ front
     sd = math.sqrt(float(front @ Ph[POSITION]))
     z = float(front @ (mean[POSITION] - origin)) / sd
+    if z < -_FARTHEST_BEHIND_SD:
+        return
     left, variance = positive_normal(z)
     mean += Ph * ((left - z) / sd)
     cov -= np.outer(Ph, Ph) * ((1.0 - variance) / sd**2)

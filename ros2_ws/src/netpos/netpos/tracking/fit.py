@@ -67,14 +67,16 @@ def fits(innovations: Array, gate: Array) -> bool:
 def refused_groups(
     epoch_rows: EpochRows, accepted: Sequence[float], gate: Array
 ) -> list[tuple[int, float]]:
-    """Rows and gate of each group of an epoch that was refused."""
+    """Rows and gate of each group of an epoch that its gate refused; one that is open refuses
+    nothing."""
     if 0.0 not in accepted:
         return []
     sizes = np.bincount(epoch_rows.rows[:, GROUP].astype(int), minlength=len(accepted))
+    limits = gate[np.minimum(sizes, gate.size - 1)]
     return [
-        (size, float(gate[min(size, gate.size - 1)]))
-        for size, taken in zip(sizes.tolist(), accepted, strict=True)
-        if not taken
+        (size, limit)
+        for size, limit, taken in zip(sizes.tolist(), limits.tolist(), accepted, strict=True)
+        if not taken and math.isfinite(limit)
     ]
 
 

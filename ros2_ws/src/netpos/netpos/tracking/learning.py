@@ -35,12 +35,13 @@ _SCALES = 2.0 ** np.arange(-9, 7)
 _SPREADS = 2.0 ** np.arange(-3, 4)
 _LASTING = [  # correlation time [s] and length [m]
     *((t, math.inf) for t in (3.0, 15.0, 75.0, 400.0)),
-    *((400.0, d) for d in (1.0, 4.0, 16.0)),
+    *((400.0, d) for d in (0.25, 1.0, 4.0, 16.0)),
 ]
 _RATES, _RATES_PER_M = (1.0 / np.array(_LASTING)).T
 _AHEAD_S = 10.0
 _NO_BIAS = 0.3  # probability where nothing is declared
 _LOG_SCALE_SD = 0.7
+_LARGEST_OVERSTATED = 4.0  # of variances: no more is believed without seeing it within windows
 _LOG_SPREAD_SD = 1.1
 _LOG_TIME_SD = 1.5
 _MEMORY = 300.0  # windows
@@ -85,7 +86,7 @@ class ErrorModel:
     scale: float = 1.0
     bias_sd: float = 0.0
     lasting: Array = field(default_factory=lambda: np.ones(len(_LASTING)))
-    """Weights (7,) of how long the bias lasts."""
+    """Weights (8,) of how long the bias lasts."""
 
     @property
     def gate_scale(self) -> float:
@@ -102,13 +103,28 @@ class ErrorModel:
         rho of successive values, the mean of n of them has (1 + rho) / (1 - rho) / n of their
         variance.
         """
-        total, count, steps, windows = self.within
+        total, count, _, windows = self.within
         seen = total / (_WITHIN_STRENGTH + count)
         if total <= 0.0:
             return 1.0
-        step = min(max(steps / total, _LEAST_STEP), 1.0)
-        n = 1.0 + count / windows
+        step, n = self._step, 1.0 + count / windows
         return max(1.0 - seen, 0.0) + seen * min((2.0 - step) / step / n, 1.0)
+
+    @property
+    def _step(self) -> float:
+        """Half the mean squared step from value to value over their variance within windows: 1 of
+        white noise, 1 less their correlation."""
+        total, _, steps, _ = self.within
+        return min(max(steps / total, _LEAST_STEP), 1.0) if total > 0.0 else _LEAST_STEP
+
+    @property
+    def least_scale(self) -> float:
+        """What is stated is believed to a quarter of ``window_scale`` where successive values have
+        half of their variance or more in common: what changes that slowly may change more slowly
+        still. Down to nothing where they have nothing in common."""
+        count = self.within[1]
+        common = 1.0 - self._step * count / (_WITHIN_STRENGTH + count)
+        return min(2.0 * common, 1.0) * self.window_scale / _LARGEST_OVERSTATED
 
     def scattering(
         self, gate_scale: float, within: tuple[float, float, float, float]
@@ -141,6 +157,7 @@ class ErrorModel:
         windows says of the scale."""
         ratio = np.log(SCALE / self.window_scale) / _LOG_SCALE_SD
         log_weights = log_weights - 0.5 * (ratio + 0.5 * _LOG_SCALE_SD) ** 2
+        log_weights = np.where(self.least_scale > SCALE, -np.inf, log_weights)
         w = np.exp(log_weights - log_weights.max())
         w /= w.sum()
         ws = w * SPREAD

@@ -83,7 +83,6 @@ class PlanarEstimator(Estimator):
         self._shared, self._lives = shared, count(1)
         self._options, self._extra_sd = options_of(config), initial_extra_sd(config)
         self._use_imu, self._calibrates_steps = config.use_imu, config.calibrates_steps
-        self._steady = config.steady_accel_density_mps2_sqrthz > 0.0 and not config.use_imu
         self._secondary = Secondary(vue_id, config) if config.network else None
         self.recorder = PosteriorRecorder.of(vue_id, config)
         self._forget()
@@ -207,10 +206,11 @@ class PlanarEstimator(Estimator):
             blind = uncovered_s > _IMU_HOLE_S
             gyro = _BLIND_GYRO if blind else self._config.gyro_noise_density
             estimate.set_imu_increment(yaw, speed, gyro)
-        if self._steady:
-            velocities = (item for item in items if isinstance(item, Velocity))
-            free = estimate.accel_density
-            estimate.set_process_noise(self._process_noise.density(stamp_ns, free, velocities))
+        velocities = [item for item in items if isinstance(item, Velocity)]
+        if velocities or self._process_noise.hears(stamp_ns):
+            free = estimate.declared_density
+            density = self._process_noise.density(stamp_ns, free, velocities)
+            estimate.set_process_noise(density)
         return estimate
 
     def update(self, stamp_ns: int, epoch_rows: EpochRows, past: Past) -> UpdateResult:

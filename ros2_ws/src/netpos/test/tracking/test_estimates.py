@@ -98,6 +98,7 @@ def test_filterpy_says_the_same(
             filter=name,
             motion_model=model,
             manoeuvre_speed_sd_mps=0.0,
+            accel_density_mps2_sqrthz=0.5,
             clock_offset_sd_s=3e-8,
             clock_drift_sd=1e-8,
         )

@@ -31,6 +31,15 @@ def test_the_moments_are_those_of_the_samples_in_front(ahead_m: float) -> None:
     np.testing.assert_allclose(cov, np.cov(kept.T), atol=0.05 * np.abs(cov).max())
 
 
+@pytest.mark.parametrize(("ahead_sd", "cut"), [(-4.9, True), (-5.1, False), (-40.0, False)])
+def test_what_contradicts_the_estimate_does_not_cut_it(ahead_sd: float, cut: bool) -> None:
+    mean, cov = np.array([ahead_sd, 0.0, 1.0, 0.0, 0.0, 0.0]), np.eye(6)
+    cut_off_behind(mean, cov, np.zeros(2), np.array([1.0, 0.0]))
+    assert bool(mean[0] > 0.0) is cut
+    assert bool(cov[0, 0] < 1.0) is cut
+    assert np.linalg.eigvalsh(cov).min() > 0.0
+
+
 def _info(name: str) -> RsuInfo:
     x, y, facing = WALLS[name]
     half = math.radians(facing) / 2.0

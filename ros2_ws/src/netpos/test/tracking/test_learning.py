@@ -65,23 +65,25 @@ def test_white_noise_is_learned_as_scatter_without_a_bias(factor: float) -> None
     for seed in range(3):
         learned = learned_of(slow_and_white(seed, 120, sd, 0.0, 1.0), 0.1)
         for model in learned.models.values():
-            assert factor / 1.6 < 5.0 * model.scale < factor * 1.6  # of five values a window
+            expected = factor / 5.0  # of five values a window
+            assert expected / 1.6 < model.scale < expected * 1.6
             assert factor / 1.3 < model.gate_scale < factor * 1.3
             assert model.bias_sd < 0.35 * sd
 
 
 @pytest.mark.parametrize("bias_sd", [0.1, 0.3, 0.5])
 def test_a_bias_is_learned_with_its_sd_and_its_time(bias_sd: float) -> None:
-    """Within a factor of 2.5: a bias twice as large that lasts four times as long changes by as
-    much in a second, and ten correlation times of four RSUs do not tell them apart. How much it
-    changes in a second: within a factor of 2."""
+    """Within a factor of 2, of 3 where it is no larger than the noise: a bias twice as large that
+    lasts four times as long changes by as much in a second, and ten correlation times of four RSUs
+    do not tell them apart. How much it changes in a second: within a factor of 2."""
     spreads, times = [], []
     for seed in range(6):
         learned = learned_of(slow_and_white(seed, 300, 0.1, bias_sd, 30.0), 0.1)
         spreads += [m.bias_sd for m in learned.models.values()]
         times += [m.time_s(0.0) for m in learned.models.values()]
     found = np.sqrt(np.mean(np.square(spreads)))
-    assert bias_sd / 2.5 < found < 2.5 * bias_sd
+    factor = 3.0 if bias_sd <= 0.1 else 2.0
+    assert bias_sd / factor < found < factor * bias_sd
     assert 0.5 < found / bias_sd / math.sqrt(np.median(times) / 30.0) < 2.0
     assert 10.0 < np.median(times) < 150.0
 

@@ -189,7 +189,12 @@ def test_an_emission_that_is_unknown_every_time_tracks_like_differences() -> Non
     rng = np.random.default_rng(3)
     found = {}
     for kind in ("time", "difference"):
-        made = tracker(clock_white_density=1e-4, clock_offset_sd_s=1e-3, coverage_radius_m=100.0)
+        made = tracker(
+            clock_white_density=1e-4,
+            clock_offset_sd_s=1e-3,
+            coverage_radius_m=100.0,
+            accel_density_mps2_sqrthz=0.5,
+        )
         rng = np.random.default_rng(3)
         outputs = []
         for k in range(100):
