@@ -12,7 +12,7 @@ import numpy as np
 from netpos.estimation.measurement import BIAS, GATE_VARIANCE, GROUP, Kind
 from netpos.estimation.rows import UNCOUPLED, Coupling, rsu_axes, rsu_place, scalar_kinds
 from netpos.estimation.sensors.table import BY_KIND, SENSORS, readings
-from netpos.estimation.state import N_CORE, X
+from netpos.estimation.state import N_CORE, VELOCITY
 from netpos.estimation.unexplained import unexplained
 from netpos.messages.values import (
     AngleConvention,
@@ -22,7 +22,7 @@ from netpos.messages.values import (
     RsuMeasurement,
     StepCalibration,
 )
-from netpos.tracking.learning import WINDOW_S, LearnedErrors, Name
+from netpos.tracking.learning import WINDOW_S, LearnedErrors, Name, speed_beyond_noise
 
 _RSU = "rsu/"
 REFERENCED = sum(int(r.field) for _, r in readings() if r.has_reference)
@@ -239,7 +239,7 @@ class BiasStates:
                 continue
             stated = float(row[GATE_VARIANCE]) / learned.models[name].gate_scale
             learned.hear(name, row, said, stated)
-        speed = math.hypot(mean[X.VX], mean[X.VY])
+        speed = speed_beyond_noise(mean[VELOCITY], cov[VELOCITY, VELOCITY])
         learned.move(stamp_ns, speed)
         concluded = learned.conclude(stamp_ns, mean, height_m)
         self.sd, self.tau_s = self.sd.copy(), self.tau_s.copy()

@@ -6,10 +6,13 @@ import math
 
 import numpy as np
 import pytest
-from netpos.estimation.measurement import Kind
+from netpos.estimation.measurement import ROW_WIDTH, Kind
+from netpos.estimation.state import VELOCITY
 from netpos.messages.values import AngleConvention, Field, RsuInfo, RsuMeasurement
+from netpos.tracking.learning import LearnedErrors, speed_beyond_noise
 from netpos.tracking.rsus import BiasStates, Rsu
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi
 
 ALL = Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE
 
@@ -176,3 +179,31 @@ def test_a_copy_goes_its_own_way() -> None:
     one = twin.coupling(second, measured())
     assert one.bias == states.coupling(second, measured()).bias
     assert len(twin.sd) == len(states.sd)
+
+
+def test_the_noise_of_a_speed_is_no_speed() -> None:
+    """Of a device that stands: E sqrt(u) where u > 2, of u with a chi-square distribution with 2
+    degrees of freedom; of one that moves fast it is the speed."""
+    rng, sd = np.random.default_rng(1), 0.3
+    cov = sd**2 * np.eye(2)
+    standing = [speed_beyond_noise(v, cov) for v in rng.normal(0.0, sd, (20_000, 2))]
+    expected = sd * chi(2).expect(lambda r: r, lb=math.sqrt(2.0))
+    assert np.mean(standing) == pytest.approx(expected, rel=0.03)
+    assert speed_beyond_noise(np.array([3.0, 4.0]), cov) == 5.0
+    assert speed_beyond_noise(np.array([0.3, -0.3]), cov) == 0.0
+
+
+def test_errors_last_while_a_device_stands() -> None:
+    """An estimated speed within its noise is no way on which errors could have changed."""
+    states, rsu = BiasStates(learned=LearnedErrors()), Rsu.of(info())
+    states.learned_coupling(rsu, measured(Field.RANGE), np.ones(1), states.learned)
+    nothing = np.zeros((0, ROW_WIDTH)), np.ones(0)
+    lasts = []
+    for k, speed in enumerate([0.2, 0.2, 2.0]):
+        mean = np.zeros(7)
+        mean[VELOCITY] = speed, 0.0
+        states.learn((k + 1) * 10**9, nothing, (mean, 0.2**2 * np.eye(7)), 0.0)
+        lasts.append(states.tau_s[0])
+    model = states.learned.models["rsu/a", "RANGE"]
+    assert lasts[:2] == [model.time_s(0.0)] * 2
+    assert lasts[2] == model.time_s(2.0) < 0.5 * lasts[0]
