@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,6 +37,7 @@ from ekf_tracker.parameters import Parameters
 
 _COPY_S = 2.0
 _TELL_S = 2.0  # a word in the log about what is refused
+_TOPICS_A_SECOND = 10  # devices whose topics are made, or given back: each costs the others 10 ms
 
 
 class EkfTrackerNode(EstimatingNode):
@@ -60,6 +62,7 @@ class EkfTrackerNode(EstimatingNode):
         tracker = Tracker(config, parameters.rsu_list)
         self._network = config.network
         self._told_refusal_s = -_TELL_S
+        self._topics_made: Counter[int] = Counter()
         self._poses: dict[str, tuple[Any, float]] = {}
         datum = Datum(*config.datum_values) if config.datum_values is not None else None
         self._begin(tracker, publish_tf=parameters.publish_tf, frames=config.frames, datum=datum)
@@ -143,7 +146,7 @@ class EkfTrackerNode(EstimatingNode):
         refused = self._add(measurement)
         for vue_id in self.tracker.take_left():
             self._remove_device(vue_id)
-        if refused is None and measurement.vue_id not in self._outputs:
+        if refused is None and measurement.vue_id not in self._outputs and self._has_time():
             self._add_device(measurement.vue_id)
 
     def _add(self, item: Any) -> str | None:
@@ -159,6 +162,12 @@ class EkfTrackerNode(EstimatingNode):
                 f"{item.vue_id}: refused a {type(item).__name__}: {reason}{source}"
             )
         return reason
+
+    def _has_time(self) -> bool:
+        """Whether the topics of another new device may be made in this second."""
+        second = int(time.monotonic())
+        self._topics_made = Counter({second: self._topics_made[second] + 1})
+        return self._topics_made[second] <= _TOPICS_A_SECOND
 
     def _add_device(self, vue_id: str) -> None:
         self._add_outputs(vue_id, self._network, smoothed=self.tracker.config.fixed_lag_s > 0.0)
@@ -236,14 +245,15 @@ class EkfTrackerNode(EstimatingNode):
         """Give back the topics of devices that are silent for so long that their track starts
         anew; of those of which nothing was ever taken nothing is told any more."""
         now_ns, limit_ns = self.get_clock().now().nanoseconds, 1e9 * self.tracker.config.max_gap_s
-        for vue_id in self._silent_s().keys() & self._seen_ns.keys() - self._kept:
-            if now_ns - self._seen_ns[vue_id][1] <= limit_ns:
-                continue
-            status = self._statuses.get(vue_id)
-            if status is None or not status.accepted:
-                self._remove_device(vue_id)
-            elif vue_id in self._outputs:
+        silent = self._silent_s().keys() & self._seen_ns.keys() - self._kept
+        over = [v for v in silent if now_ns - self._seen_ns[v][1] > limit_ns]
+        taken = {v for v in over if v in self._statuses and self._statuses[v].accepted}
+        due = [v for v in over if v not in taken or v in self._outputs]
+        for vue_id in due[:_TOPICS_A_SECOND]:
+            if vue_id in taken:
                 self._give_back(vue_id)
+            else:
+                self._remove_device(vue_id)
 
     def _subject(self) -> str:
         """Whose diagnostics they are: of which namespace, of which network."""

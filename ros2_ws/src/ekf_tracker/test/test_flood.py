@@ -108,6 +108,24 @@ def test_a_device_that_is_silent_gives_its_topics_back(
     assert {"vue_1", "car"} <= after(11.0)
 
 
+def test_many_new_devices_get_their_topics_one_after_the_other(
+    make: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To make them takes the time of the others: ten in a second, whoever they are."""
+    node = make()
+    know_rsus(node)
+    now_s = [1000.1]
+    monkeypatch.setattr("ekf_tracker.node.time.monotonic", lambda: now_s[0])
+    for k in range(25):
+        arrive(node, "/rsu/measurements", measurement("a", 0.1, f"new_{k}"))
+    assert len(node._outputs) == 1 + 10
+    now_s[0] = 1001.1
+    for k in range(25):
+        arrive(node, "/rsu/measurements", measurement("a", 0.2, f"new_{k}"))
+    assert len(node._outputs) == 1 + 20
+    assert len(node.tracker._tracks) == 25
+
+
 def test_a_device_that_was_silent_makes_room_and_its_topics_go(make: Any) -> None:
     node = make(max_devices=1, max_gap_s=1.0)
     know_rsus(node)
