@@ -77,8 +77,8 @@ def live_rows(figures: dict[str, Any]) -> list[Result]:
             count["sent"],
             0.0,
             unit="messages",
-            note=f"Not recorded: {unrecorded} measurements, {unheard} odometry; below 0: more than"
-            " were sent, so somebody else speaks in this ROS domain.",
+            note=f"Not recorded: {unrecorded} measurements, {unheard} odometry (below 0: sent by"
+            " others).",
         ),
         _growth(f"{what}: memory of the recorder", samples, "recorder_memory_mb"),
     ]
