@@ -17,7 +17,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 try:
-    from graph import Graph, claim_domain
+    from graph import Graph
+    from netpos.bench.domains import claim_domain
     from netpos_node import choose_profiles
 except ImportError as error:
     pytest.exit(f"{error}: run the tests by `make test`, or `source env.sh` first", returncode=4)

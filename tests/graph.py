@@ -6,15 +6,12 @@ Nothing here sleeps a guessed time: every wait polls a condition and fails with 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
-import random
 import signal
 import subprocess
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -26,7 +23,6 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-DOMAINS = range(1, 102)  # above 101 the ports of a domain may be taken by the system
 POLL_S = 0.02
 START_S = 60.0  # a first start may have to compile kernels
 
@@ -36,21 +32,6 @@ LATCHED = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
-
-
-@contextlib.contextmanager
-def claim_domain() -> Iterator[int]:
-    """Yield a domain id that nobody else who asks here holds, in this or any other process."""
-    for domain in random.sample(DOMAINS, len(DOMAINS)):
-        path = Path(tempfile.gettempdir()) / f"netpos-test-domain-{domain}.lock"
-        with path.open("w") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                continue
-            yield domain
-            return
-    raise RuntimeError(f"all ROS domains {DOMAINS.start} to {DOMAINS.stop - 1} are in use")
 
 
 def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = 20.0) -> Any:

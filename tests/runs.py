@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from graph import Graph, Process, claim_domain
+from graph import Graph, Process
 from netpos.bags import BagReader, codec, typestore
+from netpos.bench.domains import claim_domain
 from netpos.messages.fields import stamp_ns
 from netpos.messages.topics import RSU_INFO, RSU_MEASUREMENTS, of_vue
 from netpos.messages.values import TrackState

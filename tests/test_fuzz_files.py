@@ -54,9 +54,9 @@ def test_contents_that_once_failed(bag: Path, seed: int) -> None:
     assert fuzz.one_content(bag, seed).endswith((": refused", ": done"))
 
 
-@pytest.mark.parametrize("seed", [174, 278])
+@pytest.mark.parametrize("seed", [174, 278, 20560, 32871])
 def test_scenarios_that_once_failed(seed: int) -> None:
-    """Both: a beacon_interval_s of 1e308."""
+    """A beacon_interval_s of 1e308, twice; a speed whose square is no number; a list as a key."""
     assert fuzz.one_yaml(seed) == "refused"
 
 

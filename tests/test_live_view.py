@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from graph import LATCHED, Collector, Graph, Process, claim_domain, wait_until
+from graph import LATCHED, Collector, Graph, Process, wait_until
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMsg
+from netpos.bench.domains import claim_domain
 from netpos.messages.fields import stamp_ns
 from netpos.scenario import load_scenario
 from netpos.scenario.build import buildings_of

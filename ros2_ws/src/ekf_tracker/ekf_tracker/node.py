@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,8 +14,6 @@ from netpos.messages import topics
 from netpos.messages.values import RsuMeasurement as Measurement
 from netpos.scenario.settings import change_fact, tracker_fact
 from netpos.tracking import Tracker, TrackOutput
-from netpos.tracking.admission import NOT_ALLOWED, TOO_MANY
-from netpos.tracking.rate_limit import RATE
 from netpos.tracking.validation import explanation
 from netpos.tracking.warm_up import warm_up, warm_up_anchors, warm_up_components
 from netpos.world.geodesy import Datum
@@ -38,6 +37,7 @@ from ekf_tracker.parameters import Parameters
 
 _COPY_S = 2.0
 _TELL_S = 2.0  # a word in the log about what is refused
+_TOPICS_A_SECOND = 10  # devices whose topics are made, or given back: each costs the others 10 ms
 
 
 class EkfTrackerNode(EstimatingNode):
@@ -62,6 +62,7 @@ class EkfTrackerNode(EstimatingNode):
         tracker = Tracker(config, parameters.rsu_list)
         self._network = config.network
         self._told_refusal_s = -_TELL_S
+        self._topics_made: Counter[int] = Counter()
         self._poses: dict[str, tuple[Any, float]] = {}
         datum = Datum(*config.datum_values) if config.datum_values is not None else None
         self._begin(tracker, publish_tf=parameters.publish_tf, frames=config.frames, datum=datum)
@@ -73,6 +74,7 @@ class EkfTrackerNode(EstimatingNode):
         if self._network:
             self._track_pub = self._offer(NetworkTrack, topics.tracks_of(self._network))
         self._offers.append(self.create_service(Trigger, "~/accept_rsus", self._on_accept_rsus))
+        self._kept = frozenset(parameters.vue_ids)
         for vue_id in parameters.vue_ids:
             self._add_device(vue_id)
 
@@ -144,8 +146,7 @@ class EkfTrackerNode(EstimatingNode):
         refused = self._add(measurement)
         for vue_id in self.tracker.take_left():
             self._remove_device(vue_id)
-        new = measurement.vue_id not in self._outputs and topics.is_vue_id(measurement.vue_id)
-        if new and refused not in (NOT_ALLOWED, TOO_MANY, RATE):
+        if refused is None and measurement.vue_id not in self._outputs and self._has_time():
             self._add_device(measurement.vue_id)
 
     def _add(self, item: Any) -> str | None:
@@ -162,8 +163,16 @@ class EkfTrackerNode(EstimatingNode):
             )
         return reason
 
+    def _has_time(self) -> bool:
+        """Whether the topics of another new device may be made in this second."""
+        second = int(time.monotonic())
+        self._topics_made = Counter({second: self._topics_made[second] + 1})
+        return self._topics_made[second] <= _TOPICS_A_SECOND
+
     def _add_device(self, vue_id: str) -> None:
         self._add_outputs(vue_id, self._network, smoothed=self.tracker.config.fixed_lag_s > 0.0)
+        self._told_s.setdefault(vue_id, time.monotonic())
+        self._seen_ns.setdefault(vue_id, (0, self.get_clock().now().nanoseconds))
         if self.is_active:
             self._listen_to(vue_id)
 
@@ -208,6 +217,9 @@ class EkfTrackerNode(EstimatingNode):
         self._add(sample)
 
     def _publish_one(self, output: TrackOutput) -> None:
+        if output.status.vue_id not in self._outputs:  # nothing sound of it has come yet
+            self._note(output.status)
+            return
         super()._publish_one(output)
         if self._errors_pub is not None:
             for errors in output.errors:
@@ -216,8 +228,10 @@ class EkfTrackerNode(EstimatingNode):
             self._track_pub.publish(network_track_to_msg(CODEC, output.track))
 
     def _publish_diagnostics(self) -> None:
+        self._release_silent()
         silent_s = self._silent_s()
-        for vue_id, stamp_ns in self._now_ns(silent_s.keys() & self._seen_ns.keys()).items():
+        known = silent_s.keys() & self._seen_ns.keys() & self._outputs.keys()
+        for vue_id, stamp_ns in self._now_ns(known).items():
             coasting = self.tracker.coasting(vue_id, stamp_ns)
             if coasting is not None:
                 self._publish_status(coasting.status)
@@ -226,6 +240,20 @@ class EkfTrackerNode(EstimatingNode):
         )
         newest_ns = max((status.stamp_ns for status in self._statuses.values()), default=0)
         self._diagnostics_pub.publish(diagnostics_to_msg(findings, newest_ns, self._subject()))
+
+    def _release_silent(self) -> None:
+        """Give back the topics of devices that are silent for so long that their track starts
+        anew; of those of which nothing was ever taken nothing is told any more."""
+        now_ns, limit_ns = self.get_clock().now().nanoseconds, 1e9 * self.tracker.config.max_gap_s
+        silent = self._silent_s().keys() & self._seen_ns.keys() - self._kept
+        over = [v for v in silent if now_ns - self._seen_ns[v][1] > limit_ns]
+        taken = {v for v in over if v in self._statuses and self._statuses[v].accepted}
+        due = [v for v in over if v not in taken or v in self._outputs]
+        for vue_id in due[:_TOPICS_A_SECOND]:
+            if vue_id in taken:
+                self._give_back(vue_id)
+            else:
+                self._remove_device(vue_id)
 
     def _subject(self) -> str:
         """Whose diagnostics they are: of which namespace, of which network."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from ekf_tracker.node import EkfTrackerNode
-from feed import DOMAIN, arrive, keep, know_rsus, measurement
-from nodes import nodes_of
+from feed import DOMAIN, T0, arrive, drive, keep, know_rsus, measurement
+from nodes import Kept, nodes_of
+from rclpy.time import Time
 
 
 @pytest.fixture
@@ -46,20 +48,94 @@ def test_a_flood_makes_no_device_known(make: Any) -> None:
     assert not {"device_2", "device_3"} & set(node._outputs)
 
 
+def topics_of(node: EkfTrackerNode, device: str) -> set[str]:
+    published = dict(node.get_publisher_names_and_types_by_node("ekf_tracker", "/"))
+    heard = dict(node.get_subscriber_names_and_types_by_node("ekf_tracker", "/"))
+    return {name for name in (*published, *heard) if name.startswith(f"/{device}/")}
+
+
+def test_a_device_of_which_nothing_sound_came_has_no_topics(make: Any) -> None:
+    """It has a line in the diagnostics, until it is silent."""
+    node = make()
+    know_rsus(node)
+    for k in range(20):
+        arrive(node, "/rsu/measurements", measurement("a", 0.1 * k, "made_up", rsu_id="nobody"))
+    assert not topics_of(node, "made_up")
+    (line,) = [s for s in said(node) if s.name == "ekf_tracker: made_up"]
+    assert "unknown_rsu" in line.message
+    for name in ("a", "b", "c"):
+        arrive(node, "/rsu/measurements", measurement(name, 2.0, "made_up"))
+    assert {"/made_up/odometry", "/made_up/initialpose"} <= topics_of(node, "made_up")
+
+
+def said(node: EkfTrackerNode) -> list[Any]:
+    """The lines of the diagnostics of a tick."""
+    node._diagnostics_pub = Kept()
+    node._on_diagnostics_tick()
+    return list(node._diagnostics_pub.messages[-1].status)
+
+
+def test_a_device_that_is_silent_gives_its_topics_back(
+    make: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After the time that ends its track, by the node's clock; it has them again when it is heard
+    again. One of which nothing was ever taken is forgotten, one that was asked for keeps them."""
+    node = make(max_gap_s=10.0, use_sim_time=True)
+    know_rsus(node)
+    drive(node, range(5), "car")
+    drive(node, range(5))
+    arrive(node, "/rsu/measurements", measurement("a", 0.1, "made_up", rsu_id="nobody"))
+    arrive(node, "/rsu/measurements", measurement("a", 0.1, "once", expected=0))
+    assert "once" in node._outputs
+    begun_s = time.monotonic()
+
+    def after(seconds: float) -> set[str]:
+        node.get_clock().set_ros_time_override(Time(nanoseconds=T0 + round(1e9 * seconds)))
+        monkeypatch.setattr(
+            "netpos_node.estimating.time.monotonic", lambda: begun_s + max(seconds, 0.0)
+        )
+        return {s.name.removeprefix("ekf_tracker: ") for s in said(node)}
+
+    assert {"vue_1", "car", "made_up"} <= after(0.0)
+    assert {"vue_1", "car", "made_up"} <= after(9.9)
+    assert "/car/odometry" in topics_of(node, "car")
+    assert after(10.1) & {"vue_1", "car", "made_up"} == {"vue_1", "car"}
+    assert not topics_of(node, "car")
+    assert not topics_of(node, "once")
+    assert {"/vue_1/odometry", "/vue_1/initialpose"} <= topics_of(node, "vue_1")
+    drive(node, range(105, 110), "car")
+    assert {"/car/odometry", "/car/initialpose"} <= topics_of(node, "car")
+    assert {"vue_1", "car"} <= after(11.0)
+
+
+def test_many_new_devices_get_their_topics_one_after_the_other(
+    make: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To make them takes the time of the others: ten in a second, whoever they are."""
+    node = make()
+    know_rsus(node)
+    now_s = [1000.1]
+    monkeypatch.setattr("ekf_tracker.node.time.monotonic", lambda: now_s[0])
+    for k in range(25):
+        arrive(node, "/rsu/measurements", measurement("a", 0.1, f"new_{k}"))
+    assert len(node._outputs) == 1 + 10
+    now_s[0] = 1001.1
+    for k in range(25):
+        arrive(node, "/rsu/measurements", measurement("a", 0.2, f"new_{k}"))
+    assert len(node._outputs) == 1 + 20
+    assert len(node.tracker._tracks) == 25
+
+
 def test_a_device_that_was_silent_makes_room_and_its_topics_go(make: Any) -> None:
     node = make(max_devices=1, max_gap_s=1.0)
     know_rsus(node)
 
-    def topics_of(device: str) -> set[str]:
-        published = dict(node.get_publisher_names_and_types_by_node("ekf_tracker", "/"))
-        heard = dict(node.get_subscriber_names_and_types_by_node("ekf_tracker", "/"))
-        return {name for name in (*published, *heard) if name.startswith(f"/{device}/")}
-
     arrive(node, "/rsu/measurements", measurement("a", 0.0, "first"))
-    assert {"/first/odometry", "/first/track_status", "/first/initialpose"} <= topics_of("first")
+    wanted = {"/first/odometry", "/first/track_status", "/first/initialpose"}
+    assert wanted <= topics_of(node, "first")
     arrive(node, "/rsu/measurements", measurement("a", 0.5, "second"))
-    assert not topics_of("second")
+    assert not topics_of(node, "second")
     arrive(node, "/rsu/measurements", measurement("a", 2.0, "second"))
-    assert "/second/odometry" in topics_of("second")
-    assert not topics_of("first")
+    assert "/second/odometry" in topics_of(node, "second")
+    assert not topics_of(node, "first")
     assert list(node.tracker._tracks) == ["second"]

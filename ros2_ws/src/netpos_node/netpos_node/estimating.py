@@ -372,7 +372,13 @@ class EstimatingNode(LifecycleNode):
         return topics.to_resolve(topics.of_vue(vue_id, name, network))
 
     def _remove_device(self, vue_id: str) -> None:
-        """Give back the topics of a device that is no longer tracked."""
+        """Give back the topics of a device that is no longer tracked, and tell nothing of it."""
+        self._give_back(vue_id)
+        for told in (self._statuses, self._told_s, self._seen_ns, self._odoms):
+            told.pop(vue_id, None)
+
+    def _give_back(self, vue_id: str) -> None:
+        """Give back the topics of a device."""
         for publisher in (*self._outputs.pop(vue_id, ()), self._fix_pubs.pop(vue_id, None)):
             if publisher is not None:
                 self.destroy_publisher(publisher)
@@ -383,8 +389,6 @@ class EstimatingNode(LifecycleNode):
         self._inputs = [entry for entry in self._inputs if entry[0] not in mine]
         for subscription in mine:
             self.destroy_subscription(subscription)
-        for told in (self._statuses, self._told_s, self._seen_ns, self._odoms):
-            told.pop(vue_id, None)
 
     def _publish(self, outputs: list[TrackOutput]) -> None:
         for output in outputs:
@@ -394,7 +398,7 @@ class EstimatingNode(LifecycleNode):
         vue_id = output.status.vue_id
         if vue_id not in self._outputs:
             self._add_outputs(vue_id, output.network)
-        self._statuses[vue_id], self._told_s[vue_id] = output.status, time.monotonic()
+        self._note(output.status)
         odometry_pub, clock_pub, status_pub, *smoothed_pub = self._outputs[vue_id]
         if output.odometry is not None:
             odometry_pub.publish(self._cdr.odometry(output.odometry))
@@ -407,6 +411,10 @@ class EstimatingNode(LifecycleNode):
         status_pub.publish(self._cdr.track_status(output.status))
         for odometry in output.smoothed:
             smoothed_pub[0].publish(self._cdr.odometry(odometry))
+
+    def _note(self, status: TrackStatus) -> None:
+        """Keep the newest status of a device, for the diagnostics."""
+        self._statuses[status.vue_id], self._told_s[status.vue_id] = status, time.monotonic()
 
     def _fix(self, odometry: Estimated, datum: Datum) -> Any:
         frame = self._frames.base_of(odometry.vue_id)

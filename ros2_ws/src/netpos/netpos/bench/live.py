@@ -17,6 +17,7 @@ from netpos.bench.common import (
     growth_exponent,
     within,
 )
+from netpos.bench.domains import claim_domain
 
 _TIMEOUT_S = 150.0
 _STOP_S = 15.0
@@ -39,12 +40,12 @@ def executable(package: str, name: str) -> Path:
     )
 
 
-def surroundings() -> dict[str, str]:
-    """Environment of the processes: a private domain on this host."""
+def surroundings(domain: int) -> dict[str, str]:
+    """Environment of the processes: a domain on this host."""
     environment = {k: v for k, v in os.environ.items() if k != "ROS_LOCALHOST_ONLY"}
     return {
         **environment,
-        "ROS_DOMAIN_ID": str(1 + os.getpid() % 101),
+        "ROS_DOMAIN_ID": str(domain),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     }
 
@@ -56,15 +57,18 @@ def probe(*arguments: str, timeout_s: float | None = None) -> dict[str, Any]:
     """
     tracker = executable("ekf_tracker", "ekf_tracker")
     command = [str(executable("netpos_bringup", "bench_probe")), "--tracker", str(tracker)]
-    with subprocess.Popen(
-        [*command, *arguments],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=surroundings(),
-        start_new_session=True,
-    ) as process:
+    with (
+        claim_domain() as domain,
+        subprocess.Popen(
+            [*command, *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=surroundings(domain),
+            start_new_session=True,
+        ) as process,
+    ):
         try:
             out, error = process.communicate(timeout=timeout_s or _TIMEOUT_S)
         except BaseException as reason:

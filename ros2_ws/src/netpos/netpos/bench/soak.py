@@ -72,12 +72,13 @@ def live_rows(figures: dict[str, Any]) -> list[Result]:
         *rows,
         within(
             f"{what}: messages not handled, or not in the recording",
-            count["sent"] - count["handled"] + unrecorded + unheard,
+            abs(count["sent"] - count["handled"]) + abs(unrecorded) + abs(unheard),
             "measurements sent",
             count["sent"],
             0.0,
             unit="messages",
-            note=f"Not recorded: {unrecorded} measurements, {unheard} odometry.",
+            note=f"Not recorded: {unrecorded} measurements, {unheard} odometry (below 0: sent by"
+            " others).",
         ),
         _growth(f"{what}: memory of the recorder", samples, "recorder_memory_mb"),
     ]

@@ -128,25 +128,28 @@ def _compose(path: Path, text: str) -> yaml.MappingNode:
         raise ScenarioError(f"{path}: {error}") from error
     if not isinstance(node, yaml.MappingNode):
         raise ScenarioError(f"{path}: a scenario is a mapping of keys to values")
-    _refuse_repeated_keys(path, node)
+    _check_keys(path, node)
     return node
 
 
-def _refuse_repeated_keys(path: Path, node: yaml.Node) -> None:
+def _check_keys(path: Path, node: yaml.Node) -> None:
+    """Refuse keys that are given twice, or are no words."""
     if isinstance(node, yaml.SequenceNode):
         for item in node.value:
-            _refuse_repeated_keys(path, item)
+            _check_keys(path, item)
     if not isinstance(node, yaml.MappingNode):
         return
     seen: dict[str, int] = {}
     for key, value in node.value:
         line = key.start_mark.line + 1
+        if not isinstance(key, yaml.ScalarNode):
+            raise ScenarioError(f"{path}: line {line}: a key is a word, no list and no mapping")
         if key.value in seen:
             raise ScenarioError(
                 f"{path}: line {line}: {key.value} was given already in line {seen[key.value]}"
             )
         seen[key.value] = line
-        _refuse_repeated_keys(path, value)
+        _check_keys(path, value)
 
 
 def _change(content: Any, dotted: str, value: object) -> None:

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 MESSAGES_MAX = 20_000_000
 """Limit for a whole run, a few GB of arrays and of bag; chosen, not measured."""
+STEPS_MAX = 1_000_000
+"""Of a walk: a week of walking. Each step is an object."""
 
 
 def route_duration_s(device: Device) -> float:
@@ -48,6 +50,13 @@ def messages_of(device: Device, heard: int, limit_s: float) -> float:
 
 def check_motion(device: Device) -> None:
     """Raise ValueError if the motion alone (of the whole route) does not fit into memory."""
+    if device.gait is not None:
+        walked = route_duration_s(device) * device.gait.cadence_hz
+        if walked > STEPS_MAX:
+            raise ValueError(
+                f"the route takes about {walked:.3g} steps, at most {STEPS_MAX:.0e} are walked: "
+                "shorten it or raise gait.step_length_m"
+            )
     steps = route_duration_s(device) / device.beacon_interval_s
     if device.wander_density_mps2_sqrthz is not None and steps > MESSAGES_MAX:
         raise ValueError(

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from netpos.messages.fields import MAP_FRAME, bad_stamp, malformed_nanosec
-from netpos.messages.values import Field, ImuSample, RsuMeasurement
+from netpos.messages.values import Field, GroundSpeed, ImuSample, RsuMeasurement, Velocity
 from netpos.tracking.rate_limit import RATE
 from netpos.tracking.sequencer import Item
 from netpos.tracking.validation import explanation
@@ -111,6 +111,8 @@ class Refusals:
         if isinstance(item, RsuMeasurement):
             _count(self._rsus, item.rsu_id, reason, sentence)
             sentence = f"{sentence} (from {item.rsu_id})"
+        elif isinstance(item, Velocity | GroundSpeed):
+            sentence = f"{sentence} (from {item.source})"
         _count(self._devices, item.vue_id, reason, sentence)
         return sentence
 

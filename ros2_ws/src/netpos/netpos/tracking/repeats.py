@@ -9,8 +9,13 @@ larger one counts:
   smallest difference between successive values among the first ones is no smaller.
 - What is usual: the share of messages that were repeats before this run, by Laplace's rule of
   succession, for the first repeat; the share of repeats that a repeat followed for the others.
-  Repeats of a device that stands come in runs. An IMU declares no noise with its samples: for it
-  this alone counts.
+  Repeats of a device that stands come in runs. For what the device reports this alone counts: an
+  IMU declares no noise with its samples, and what dead reckoning declares is the noise of a step,
+  not of a message.
+
+A velocity is compared with its covariance, which grows with the age of the step. One that is no
+larger than its standard deviation says that the device rests: it is not judged, because it may
+rest for hours.
 
 A run of repeats is too long from the first one on for which the product of the chances is below
 1e-9. It ends with the next other value.
@@ -25,7 +30,7 @@ from functools import lru_cache
 from operator import attrgetter
 
 from netpos.estimation.sensors.table import readings
-from netpos.messages.values import Field, ImuSample, RsuMeasurement
+from netpos.messages.values import Field, GroundSpeed, ImuSample, RsuMeasurement, Velocity
 
 REPEATED = "repeated"
 """Reason for the refusal."""
@@ -34,6 +39,7 @@ _REMEMBERED = 1000  # messages behind what is usual: older ones fade
 _COMPARED = 200  # messages whose differences are looked at
 _SOURCES_MAX = 1000
 _POSITION = int(Field.POSITION)
+_OF_IMU, _OF_VELOCITY = 0, -1  # in place of the fields of a measurement
 _READINGS = {int(reading.field): reading for _, reading in reversed(readings())}
 
 
@@ -109,23 +115,29 @@ class _Source:
 
 
 class Repeats:
-    """The runs of repeats of every RSU and device, by the quantities measured, and of every IMU.
-    By the order of the messages of one source alone, which a recording keeps."""
+    """The runs of repeats of every RSU and device, by the quantities measured, and of what every
+    device reports. By the order of the messages of one source alone, which a recording keeps."""
 
     def __init__(self) -> None:
         self._sources: dict[tuple[str, str, int], _Source] = {}
 
-    def stuck(self, item: RsuMeasurement | ImuSample) -> bool:
+    def stuck(self, item: RsuMeasurement | ImuSample | Velocity | GroundSpeed) -> bool:
         """Take note of a sound measurement; whether it is one repeat too many."""
+        if isinstance(item, RsuMeasurement):
+            fields = int(item.fields)
+            source = self._source((item.rsu_id, item.vue_id, fields))
+            repeats = source.hear(item.reference_rsu_id, _values(fields)(item), item.stamp_ns)
+            return source.is_unusual(repeats) and source.is_unlikely(repeats, _sds(item))
         if isinstance(item, ImuSample):
             values = (*item.angular_velocity.tolist(), *item.specific_force.tolist())
-            source = self._source(("", item.vue_id, 0))
-            repeats = source.hear("", values, item.stamp_ns)
-            return source.is_unusual(repeats)
-        fields = int(item.fields)
-        source = self._source((item.rsu_id, item.vue_id, fields))
-        repeats = source.hear(item.reference_rsu_id, _values(fields)(item), item.stamp_ns)
-        return source.is_unusual(repeats) and source.is_unlikely(repeats, _sds(item))
+            source = self._source(("", item.vue_id, _OF_IMU))
+        else:
+            velocity, variances = _reported(item)
+            if sum(v * v for v in velocity) <= sum(variances[:2]):
+                return False
+            values = (*velocity, *variances)
+            source = self._source((item.source, item.vue_id, _OF_VELOCITY))
+        return source.is_unusual(source.hear("", values, item.stamp_ns))
 
     def _source(self, key: tuple[str, str, int]) -> _Source:
         source = self._sources.get(key)
@@ -134,6 +146,14 @@ class Repeats:
                 del self._sources[next(iter(self._sources))]
             source = self._sources[key] = _Source()
         return source
+
+
+def _reported(item: Velocity | GroundSpeed) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Velocity, and its variances with the covariance last."""
+    if isinstance(item, GroundSpeed):
+        return (item.speed_mps,), (item.speed_var,)
+    (x, y), ((xx, xy), (_, yy)) = item.velocity.tolist(), item.cov.tolist()
+    return (x, y), (xx, yy, xy)
 
 
 @lru_cache(256)

@@ -379,7 +379,7 @@ class Tracker:
                 return validation.pose_fault(item, self._config.map_frame)
 
     def _repeated(self, item: Item | ImuSample) -> str | None:
-        if not (self._config.isolate_rsus and isinstance(item, RsuMeasurement | ImuSample)):
+        if not self._config.isolate_rsus or isinstance(item, InitialPose):
             return None
         return REPEATED if self._repeats.stuck(item) else None
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from netpos.bench import bench
 from netpos.bench.common import LeftOut, Row, Unavailable
+from netpos.bench.domains import claim_domain
 from netpos.bench.live import (
     executable,
     latency_rows,
@@ -173,7 +174,10 @@ def test_a_file_that_is_no_program_is_no_executable(prefix: Prefix) -> None:
 def test_the_processes_keep_to_this_host(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", "250")
     monkeypatch.setenv("ROS_LOCALHOST_ONLY", "0")
-    environment = surroundings()
-    assert 1 <= int(environment["ROS_DOMAIN_ID"]) <= 101
+    with claim_domain() as ours, claim_domain() as theirs:
+        assert ours != theirs
+        assert {ours, theirs} <= set(range(1, 102))
+    environment = surroundings(17)
+    assert environment["ROS_DOMAIN_ID"] == "17"
     assert environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
     assert "ROS_LOCALHOST_ONLY" not in environment

@@ -197,3 +197,51 @@ def test_frozen_rsus_are_those_of_a_walker_who_steps_on_the_spot() -> None:
             away = float(np.hypot(*(one.position - honest(t_s))[:2]))
             covered += away > status.protection_level_m
     assert covered > 2
+
+
+def carried(*, walks: bool) -> Stream:
+    """A device that rests until the start; then a moving walkway carries it to the east, or, where
+    it ``walks``, steps do so. Ranges each second; dead reckoning says rest, or the truth."""
+    rng, found = np.random.default_rng(4), []
+    for k in range(1, round(10 * END_S)):
+        stamp = k * NS // 10
+        east_m = max(stamp / NS - START_S, 0.0)
+        stepping = walks and east_m > 0.0
+        velocity = np.array([1.0, 0.0]) if stepping else np.zeros(2)
+        said = Velocity(stamp_ns=stamp, vue_id="v", velocity=velocity, cov=0.01 * np.eye(2))
+        found.append(Arrival(stamp, said))
+        if k % 10:
+            continue
+        for name, at in PLACES.items():
+            place = honest(0.0) + np.array([east_m, 0.0, 0.0])
+            range_m = float(np.linalg.norm(place - np.array(at))) + 0.1 * rng.standard_normal()
+            m = RsuMeasurement(
+                stamp_ns=stamp,
+                rsu_id=name,
+                vue_id="v",
+                expected=len(PLACES),
+                fields=Field.RANGE,
+                range_m=range_m,
+                range_var=0.01,
+            )
+            found.append(Arrival(stamp, m))
+    return found
+
+
+def said_by_steps(stream: Stream) -> list[tuple[int, list[float], list[list[float]]]]:
+    reported = [a.what for a in stream if isinstance(a.what, Velocity)]
+    return [(v.stamp_ns, v.velocity.tolist(), v.cov.tolist()) for v in reported]
+
+
+def test_steps_that_are_stuck_at_rest_are_those_of_a_walker_who_is_carried() -> None:
+    """A source that is stuck while the device rests goes on saying that it rests. So does that of
+    a person on a moving walkway, which is sound: message by message they are the same."""
+    stuck = struck(carried(walks=True), "", fault="device_frozen")
+    walkway = carried(walks=False)
+    assert said_by_steps(stuck) == said_by_steps(walkway) != said_by_steps(carried(walks=True))
+    np.testing.assert_array_equal(heard(stuck), heard(walkway))
+    ours, theirs = answer(stuck), answer(walkway)
+    assert ours.refused == theirs.refused
+    for one, two in zip(ours.odometry["v"], theirs.odometry["v"], strict=True):
+        np.testing.assert_array_equal(one.position, two.position)
+        assert ours.statuses["v"][one.stamp_ns] == theirs.statuses["v"][two.stamp_ns]

@@ -5,6 +5,7 @@ The data are not redistributed: set NETPOS_DATA, or keep them in ``<repo>/../sha
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from dataclasses import replace
@@ -25,6 +26,8 @@ from netpos.inertial import loaders
 from netpos.inertial.pdr import PedestrianDeadReckoning
 from netpos.inertial.pdr_config import PdrConfig, Placement
 from netpos.inertial.pdr_output import StepEvent
+from netpos.messages.values import Velocity
+from netpos.tracking.repeats import Repeats
 from vqf import VQF
 
 Array = np.ndarray
@@ -177,6 +180,39 @@ def test_attitude_against_optical_reference(name: str, magnetic: bool, limit_deg
     heading, tilt = (float(np.degrees(np.sqrt(np.mean(e**2)))) for e in errors)
     assert heading < limit_deg
     assert tilt < 1.5
+
+
+@pytest.mark.parametrize(
+    ("relative", "placement"),
+    [
+        ("steps_phone/user2_armband.csv", "carried"),
+        ("waist_imu/HA_001/data.mat", "waist"),
+        ("waist_imu/HA_002/data.mat", "waist"),
+        ("pdr_phone/site1_F1.txt", "carried"),
+    ],
+)
+def test_a_velocity_is_never_repeated_with_its_covariance(
+    relative: str, placement: Placement
+) -> None:
+    """Only rest is: a step is held, but its covariance grows. So no honest step looks stuck."""
+    path = data_file(relative)
+    load = getattr(loaders, f"load_{Path(relative).parts[0]}")
+    imu = load(path).imu
+    rates = np.zeros_like(imu.specific_force)
+    rates = imu.angular_velocity if imu.angular_velocity is not None else rates
+    core, repeats, said = PedestrianDeadReckoning(PdrConfig.of(placement)), Repeats(), []
+    for stamp, rate, force in zip(imu.stamp_ns.tolist(), rates, imu.specific_force, strict=True):
+        out = core.add_imu(stamp, rate, force)
+        if out is None or out.velocity is None:
+            continue
+        velocity, cov = out.velocity.velocity, out.velocity.covariance
+        said.append((*velocity.tolist(), *cov.ravel().tolist()))
+        reported = Velocity(stamp_ns=stamp, vue_id="v", velocity=velocity, cov=cov)
+        assert not repeats.stuck(reported)
+    moving = [v for v in said if any(v[:2])]
+    assert len(moving) > 500
+    assert len(set(moving)) == len(moving)
+    assert sum(a == b for a, b in itertools.pairwise(said)) > 90  # at rest
 
 
 def test_loaders_name_an_absent_path(tmp_path: Path) -> None:

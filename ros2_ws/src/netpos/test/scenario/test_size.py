@@ -55,6 +55,16 @@ def test_too_large(changes: dict[str, Any], words: str) -> None:
         load_scenario("fast_pass", changes=changes)
 
 
+@pytest.mark.timeout(20)
+def test_a_walk_of_a_million_kilometres() -> None:
+    changes: dict[str, Any] = {"devices.0.route.width_m": 1e9}
+    with pytest.raises(ScenarioError, match=r"about 6\.27e\+09 steps, at most 1e\+06 are walked"):
+        load_scenario("pedestrian_walk", changes=changes)
+    changes = {"devices.0.gait.step_length_m": 1e-9}
+    with pytest.raises(ScenarioError, match="step_length_m"):
+        load_scenario("pedestrian_walk", changes=changes)
+
+
 def test_a_long_route_that_is_cut_short_is_fine() -> None:
     changes = {"devices.0.route.points": [[0.0, -10.0], [1e9, -10.0]], "max_duration_s": 5.0}
     scenario = load_scenario("fast_pass", changes=changes)

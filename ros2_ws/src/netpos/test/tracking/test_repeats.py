@@ -6,7 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from netpos.messages.values import Field, ImuSample, RsuInfo, RsuMeasurement
+from netpos.messages.values import (
+    Field,
+    GroundSpeed,
+    ImuSample,
+    RsuInfo,
+    RsuMeasurement,
+    Velocity,
+)
 from netpos.tracking import Tracker, TrackerConfig
 from netpos.tracking.diagnosis import Level
 from netpos.tracking.repeats import Repeats
@@ -219,6 +226,124 @@ def test_a_stuck_imu_is_left_out() -> None:
         reason = tracker.add(moved)
         assert (reason == "repeated") == (k > 104)
     assert tracker.rejected()["v"] == {"imu_repeated": 95}
+
+
+def stepped(k: int, east: float, north: float, var: float = 0.04) -> Velocity:
+    """What dead reckoning says, 10 times a second."""
+    velocity, cov = np.array([east, north]), var * np.eye(2)
+    return Velocity(stamp_ns=NS + k * NS // 10, vue_id="v", velocity=velocity, cov=cov)
+
+
+def steps(number: int, seed: int) -> list[tuple[float, float]]:
+    """Velocities of a walker, each of a step that lasts 0.4 to 0.8 s."""
+    rng, said = np.random.default_rng(seed), []
+    while len(said) < number:
+        heading, speed = 0.3 * rng.standard_normal(), 1.2 + 0.1 * rng.standard_normal()
+        east, north = float(speed * np.cos(heading)), float(speed * np.sin(heading))
+        said += [(east, north)] * int(rng.integers(4, 9))
+    return said[:number]
+
+
+def test_a_velocity_that_is_held_with_a_growing_covariance_is_no_repeat() -> None:
+    repeats = Repeats()
+    for k in range(500):
+        assert not repeats.stuck(stepped(k, 1.0 + 0.1 * (k // 250), 0.2, var=0.04 + 1e-4 * k))
+
+
+def test_steps_that_repeat_too_often_are_refused() -> None:
+    """98 that differ in value or covariance, as of an RSU: the fifth repeat in a row."""
+    repeats = Repeats()
+    for k, (east, north) in enumerate(steps(99, seed=11)):
+        assert not repeats.stuck(stepped(k, east, north, var=0.04 + 1e-3 * k))
+    said = [repeats.stuck(stepped(99 + k, 1.0, 0.5)) for k in range(9)]
+    assert said == [False] * 5 + [True] * 4
+    assert not repeats.stuck(stepped(108, 1.0, 0.4))
+
+
+def test_a_source_that_holds_every_step_with_its_covariance_is_believed() -> None:
+    """Most of its messages are repeats; then it is stuck."""
+    repeats = Repeats()
+    said = [repeats.stuck(stepped(k, *v)) for k, v in enumerate(steps(20_000, seed=12))]
+    assert not any(said)
+    stuck = [repeats.stuck(stepped(20_000 + k, 0.9, 0.1)) for k in range(300)]
+    assert 50 < stuck.index(True) < 150
+
+
+def test_a_pedometer_with_one_speed_and_rounded_headings_is_believed() -> None:
+    """It says the same on every straight leg, most of which last half a minute."""
+    repeats, rng, k = Repeats(), np.random.default_rng(13), 0
+    for _ in range(300):
+        heading = np.deg2rad(15.0 * rng.integers(24))
+        for _ in range(int(rng.geometric(1.0 / 300.0))):
+            east, north = float(1.2 * np.cos(heading)), float(1.2 * np.sin(heading))
+            assert not repeats.stuck(stepped(k, east, north))
+            k += 1
+    assert k > 50_000
+
+
+def test_who_rests_may_rest_for_hours() -> None:
+    """And nothing is learned from it: a step that is stuck later is refused as soon as ever."""
+    repeats, k = Repeats(), 0
+    for east, north in steps(99, seed=11):
+        assert not repeats.stuck(stepped(k, east, north, var=0.04 + 1e-3 * k))
+        k += 1
+    for _ in range(36_000):
+        assert not repeats.stuck(stepped(k, 2e-15, 0.0))
+        k += 1
+    said = [repeats.stuck(stepped(k + j, 1.0, 0.5)) for j in range(9)]
+    assert said == [False] * 5 + [True] * 4
+
+
+@pytest.mark.parametrize(("var", "judged"), [(0.499, True), (0.501, False)])
+def test_rest_is_a_velocity_within_its_standard_deviation(var: float, judged: bool) -> None:
+    repeats = Repeats()
+    for k, (east, north) in enumerate(steps(99, seed=11)):
+        repeats.stuck(stepped(k, 2.0 * east, 2.0 * north, var=0.04 + 1e-3 * k))
+    said = [repeats.stuck(stepped(99 + k, 0.6, 0.8, var)) for k in range(20)]
+    assert any(said) == judged
+
+
+def test_a_ground_speed_is_judged_likewise() -> None:
+    repeats, rng = Repeats(), np.random.default_rng(14)
+    speeds = [*(10.0 + rng.standard_normal(99)).tolist(), *[0.0] * 500, *[9.0] * 9]
+    said = [
+        repeats.stuck(
+            GroundSpeed(stamp_ns=NS + k * NS // 10, vue_id="v", speed_mps=s, speed_var=0.01)
+        )
+        for k, s in enumerate(speeds)
+    ]
+    assert said == [False] * (99 + 500 + 5) + [True] * 4
+
+
+def walked(seconds: tuple[float, float], **parameters: object) -> Tracker:
+    """A tracker after so many seconds of a walk to the north, with ranges each second and steps;
+    then so many to the east, in which the steps are stuck at what was said last."""
+    tracker = Tracker(TrackerConfig(hold_s=0.0, **parameters))  # type: ignore[arg-type]
+    for name, (x, y) in PLACES.items():
+        tracker.add_rsu(RsuInfo(rsu_id=name, position=np.array([x, y, 0.0])))
+    rng, (healthy, stuck) = np.random.default_rng(15), (round(10 * s) for s in seconds)
+    said = (0.0, 0.0)
+    for k in range(healthy + stuck):
+        north, east = 0.1 * min(k, healthy), 0.1 * max(k - healthy, 0)
+        at = np.array([20.0 + east, 5.0 + north])
+        if k < healthy:
+            said = 0.05 * float(rng.standard_normal()), 1.0 + 0.05 * float(rng.standard_normal())
+        tracker.add(stepped(k, *said, var=0.01))
+        for name, place in PLACES.items() if k % 10 == 0 else ():
+            range_m = float(np.hypot(*(at - place))) + 0.1 * float(rng.standard_normal())
+            tracker.add(replace(ranged(range_m, k, 0.1, name), expected=3))
+        tracker.process()
+    return tracker
+
+
+def test_the_tracker_refuses_stuck_steps() -> None:
+    assert not walked((15.0, 0.0)).rejected()["v"]["repeated"]
+    tracker = walked((10.0, 8.0))
+    assert tracker.rejected()["v"]["repeated"] == 80 - 4
+    words = tracker.refusals.of_device("v").words()
+    assert "repeated: its values stay the same" in words
+    assert words.endswith("(from step_velocity)")
+    assert not walked((10.0, 8.0), isolate_rsus=False).rejected()["v"]["repeated"]
 
 
 def test_the_memory_has_an_end() -> None:

@@ -1,0 +1,31 @@
+"""ROS domains of this machine, each for one user at a time."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import random
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+DOMAINS = range(1, 102)
+"""Above 101 the ports of a domain may be taken by the system."""
+
+
+@contextlib.contextmanager
+def claim_domain() -> Iterator[int]:
+    """Yield a domain id that nobody else who asks here holds, in this or any other process.
+
+    Raises ``RuntimeError`` where all are in use.
+    """
+    for domain in random.sample(DOMAINS, len(DOMAINS)):
+        path = Path(tempfile.gettempdir()) / f"netpos-domain-{domain}.lock"
+        with path.open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            yield domain
+            return
+    raise RuntimeError(f"all ROS domains {DOMAINS.start} to {DOMAINS.stop - 1} are in use")
