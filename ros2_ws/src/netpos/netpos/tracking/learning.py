@@ -62,6 +62,7 @@ def _grid() -> Array:
 
 SCALE, SPREAD, RATE, RATE_PER_M = _grid()
 
+
 def speed_beyond_noise(velocity: Array, cov: Array) -> float:
     """Speed [m/s] of an estimate (2,) with ``cov`` (2, 2) m^2/s^2, 0 where it is no larger than
     its standard deviation. A device that stands has an estimated speed, too: as a way it would be
