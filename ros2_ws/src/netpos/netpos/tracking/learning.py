@@ -35,7 +35,7 @@ _SCALES = 2.0 ** np.arange(-9, 7)
 _SPREADS = 2.0 ** np.arange(-3, 4)
 _LASTING = [  # correlation time [s] and length [m]
     *((t, math.inf) for t in (3.0, 15.0, 75.0, 400.0)),
-    *((400.0, d) for d in (0.25, 1.0, 4.0, 16.0)),
+    *((t, d) for t in (75.0, 400.0) for d in (0.25, 1.0, 4.0, 16.0)),
 ]
 _RATES, _RATES_PER_M = (1.0 / np.array(_LASTING)).T
 _AHEAD_S = 10.0
@@ -95,7 +95,7 @@ class ErrorModel:
     scale: float = 1.0
     bias_sd: float = 0.0
     lasting: Array = field(default_factory=lambda: np.ones(len(_LASTING)))
-    """Weights (8,) of how long the bias lasts."""
+    """Weights (12,) of how long the bias lasts."""
 
     @property
     def gate_scale(self) -> float:
