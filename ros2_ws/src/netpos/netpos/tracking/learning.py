@@ -62,15 +62,6 @@ def _grid() -> Array:
 
 SCALE, SPREAD, RATE, RATE_PER_M = _grid()
 
-
-def speed_beyond_noise(velocity: Array, cov: Array) -> float:
-    """Speed [m/s] of an estimate (2,) with ``cov`` (2, 2) m^2/s^2, 0 where it is no larger than
-    its standard deviation. A device that stands has an estimated speed, too: as a way it would be
-    metres a minute, on which the errors of RSUs would seem to change."""
-    square = float(velocity @ velocity)
-    return math.sqrt(square) if square > float(cov[0, 0] + cov[1, 1]) else 0.0
-
-
 Name = tuple[str, str]
 Sums = tuple[float, ...]
 """Of the rows of a window: information, and that times residual; number, residual and its square

@@ -31,6 +31,7 @@ from operator import attrgetter
 
 from netpos.estimation.sensors.table import readings
 from netpos.messages.values import Field, GroundSpeed, ImuSample, RsuMeasurement, Velocity
+from netpos.tracking.rest import rests
 
 REPEATED = "repeated"
 """Reason for the refusal."""
@@ -132,10 +133,10 @@ class Repeats:
             values = (*item.angular_velocity.tolist(), *item.specific_force.tolist())
             source = self._source(("", item.vue_id, _OF_IMU))
         else:
-            velocity, variances = _reported(item)
-            if sum(v * v for v in velocity) <= sum(variances[:2]):
+            velocity, variances, covariance = _reported(item)
+            if rests(velocity, variances):
                 return False
-            values = (*velocity, *variances)
+            values = (*velocity, *variances, covariance)
             source = self._source((item.source, item.vue_id, _OF_VELOCITY))
         return source.is_unusual(source.hear("", values, item.stamp_ns))
 
@@ -148,12 +149,14 @@ class Repeats:
         return source
 
 
-def _reported(item: Velocity | GroundSpeed) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Velocity, and its variances with the covariance last."""
+def _reported(
+    item: Velocity | GroundSpeed,
+) -> tuple[tuple[float, ...], tuple[float, ...], float]:
+    """Velocity and its variances, by axis, and the covariance of the two axes."""
     if isinstance(item, GroundSpeed):
-        return (item.speed_mps,), (item.speed_var,)
+        return (item.speed_mps,), (item.speed_var,), 0.0
     (x, y), ((xx, xy), (_, yy)) = item.velocity.tolist(), item.cov.tolist()
-    return (x, y), (xx, yy, xy)
+    return (x, y), (xx, yy), xy
 
 
 @lru_cache(256)

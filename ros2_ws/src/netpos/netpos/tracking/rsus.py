@@ -22,7 +22,8 @@ from netpos.messages.values import (
     RsuMeasurement,
     StepCalibration,
 )
-from netpos.tracking.learning import WINDOW_S, LearnedErrors, Name, speed_beyond_noise
+from netpos.tracking.learning import WINDOW_S, LearnedErrors, Name
+from netpos.tracking.rest import rests
 
 _RSU = "rsu/"
 REFERENCED = sum(int(r.field) for _, r in readings() if r.has_reference)
@@ -239,7 +240,9 @@ class BiasStates:
                 continue
             stated = float(row[GATE_VARIANCE]) / learned.models[name].gate_scale
             learned.hear(name, row, said, stated)
-        speed = speed_beyond_noise(mean[VELOCITY], cov[VELOCITY, VELOCITY])
+        velocity = mean[VELOCITY].tolist()
+        still = rests(velocity, cov.diagonal()[VELOCITY].tolist())
+        speed = 0.0 if still else math.hypot(*velocity)
         learned.move(stamp_ns, speed)
         concluded = learned.conclude(stamp_ns, mean, height_m)
         self.sd, self.tau_s = self.sd.copy(), self.tau_s.copy()

@@ -9,10 +9,9 @@ import pytest
 from netpos.estimation.measurement import ROW_WIDTH, Kind
 from netpos.estimation.state import VELOCITY
 from netpos.messages.values import AngleConvention, Field, RsuInfo, RsuMeasurement
-from netpos.tracking.learning import LearnedErrors, speed_beyond_noise
+from netpos.tracking.learning import LearnedErrors
 from netpos.tracking.rsus import BiasStates, Rsu
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi
 
 ALL = Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE
 
@@ -179,18 +178,6 @@ def test_a_copy_goes_its_own_way() -> None:
     one = twin.coupling(second, measured())
     assert one.bias == states.coupling(second, measured()).bias
     assert len(twin.sd) == len(states.sd)
-
-
-def test_the_noise_of_a_speed_is_no_speed() -> None:
-    """Of a device that stands: E sqrt(u) where u > 2, of u with a chi-square distribution with 2
-    degrees of freedom; of one that moves fast it is the speed."""
-    rng, sd = np.random.default_rng(1), 0.3
-    cov = sd**2 * np.eye(2)
-    standing = [speed_beyond_noise(v, cov) for v in rng.normal(0.0, sd, (20_000, 2))]
-    expected = sd * chi(2).expect(lambda r: r, lb=math.sqrt(2.0))
-    assert np.mean(standing) == pytest.approx(expected, rel=0.03)
-    assert speed_beyond_noise(np.array([3.0, 4.0]), cov) == 5.0
-    assert speed_beyond_noise(np.array([0.3, -0.3]), cov) == 0.0
 
 
 def test_errors_last_while_a_device_stands() -> None:
