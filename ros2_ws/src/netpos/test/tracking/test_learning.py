@@ -29,9 +29,12 @@ def seen_from(side: list[float]) -> Array:
     return linear_rows(np.zeros(1), np.eye(1), H, 0)[0]
 
 
-def learned_of(errors: Array, stated_sd: float, rate_hz: int = 5) -> LearnedErrors:
+def learned_of(
+    errors: Array, stated_sd: float, rate_hz: int = 5, speeds: Array | None = None
+) -> LearnedErrors:
     """What is learned of four RSUs to the four sides of a device whose place is known: errors
-    (n, 4) m, ``rate_hz`` a second, of which those of a window count as one."""
+    (n, 4) m, ``rate_hz`` a second, of which those of a window count as one; ``speeds`` (n,) m/s,
+    of none: 0."""
     learned = LearnedErrors()
     for name in NAMES:
         learned.model(name, stated_sd, 0.0, 0.0)
@@ -41,21 +44,33 @@ def learned_of(errors: Array, stated_sd: float, rate_hz: int = 5) -> LearnedErro
             variance = learned.models[name].scale * stated_sd**2 * rate_hz
             left = [error, error**2, variance]
             learned.hear(name, seen_from(side), left, stated_sd**2)
-        learned.move(stamp_ns, 0.0)
+        learned.move(stamp_ns, 0.0 if speeds is None else float(speeds[k]))
         learned.conclude(stamp_ns, np.zeros(6), 0.0)
     return learned
+
+
+def stop_and_go(seconds: int, rate_hz: int = 5) -> Array:
+    """Speeds (n,) m/s: 1 for five seconds, 0 for fifteen, and again."""
+    return np.where(np.arange(seconds * rate_hz) // rate_hz % 20 < 5, 1.0, 0.0)
 
 
 def slow_and_white(
     seed: int, seconds: int, noise_sd: float, bias_sd: float, time_s: float, rate_hz: int = 5
 ) -> Array:
     """(n, 4) m: first-order Gauss-Markov biases and white noise."""
-    rng, n = np.random.default_rng(seed), seconds * rate_hz
-    decay = math.exp(-1.0 / rate_hz / time_s)
+    decays = np.full(seconds * rate_hz, math.exp(-1.0 / rate_hz / time_s))
+    return gauss_markov(seed, noise_sd, bias_sd, decays)
+
+
+def gauss_markov(seed: int, noise_sd: float, bias_sd: float, decays: Array) -> Array:
+    """(n, 4) m: biases of which ``decays`` (n,) is left since the value before, and white
+    noise."""
+    rng, n = np.random.default_rng(seed), len(decays)
     bias = np.empty((n, 4))
     bias[0] = rng.normal(0.0, bias_sd, 4)
     for k in range(1, n):
-        bias[k] = decay * bias[k - 1] + rng.normal(0.0, bias_sd * math.sqrt(1 - decay**2), 4)
+        new_sd = bias_sd * math.sqrt(1 - decays[k] ** 2)
+        bias[k] = decays[k] * bias[k - 1] + rng.normal(0.0, new_sd, 4)
     return bias + rng.normal(0.0, noise_sd, (n, 4))
 
 
@@ -86,6 +101,23 @@ def test_a_bias_is_learned_with_its_sd_and_its_time(bias_sd: float) -> None:
     assert bias_sd / factor < found < factor * bias_sd
     assert 0.5 < found / bias_sd / math.sqrt(np.median(times) / 30.0) < 2.0
     assert 10.0 < np.median(times) < 150.0
+
+
+@pytest.mark.parametrize("length_m", [1.0, 4.0])
+@pytest.mark.parametrize("time_s", [60.0, math.inf])
+def test_a_bias_of_a_place_is_learned_with_how_long_it_lasts_there(
+    time_s: float, length_m: float
+) -> None:
+    """Errors that change with the place, and within a minute or never: within a factor of 2."""
+    speeds, times, spreads = stop_and_go(600), [], []
+    decays = np.exp(-0.2 / time_s - 0.2 * speeds / length_m)
+    for seed in range(4):
+        learned = learned_of(gauss_markov(seed, 0.1, 0.3, decays), 0.1, speeds=speeds)
+        times += [model.time_s(0.0) for model in learned.models.values()]
+        spreads += [model.bias_sd for model in learned.models.values()]
+    time_s = min(time_s, 400.0)  # the longest that is told apart
+    assert time_s / 2.0 < np.median(times) < time_s * 2.0
+    assert 0.15 < np.median(spreads) < 0.6
 
 
 @pytest.mark.parametrize(("time_s", "values"), [(0.0, 40.0), (0.1, 5.6)])
