@@ -1,11 +1,11 @@
 """Learned error models against the truth told, over a grid of simulated errors.
 
-    python scripts/error_grid.py [--seeds N] [--json FILE]
+    python scripts/error_grid.py [--seeds N] [--first-seed N] [--only ROW...] [--json FILE]
 
 RSUs around a yard measure ranges of one device 5 times a second. Their errors are white noise, a
 first-order Gauss-Markov bias each, and late paths; what they declare is wrong. ``told`` is the
-tracker that was told noise, bias and correlation time (of the mean speed, where the bias changes
-with the place), ``learned`` the one that learns from what is declared, ``declared`` the one that
+tracker that was told noise, bias and correlation time (the mean one, where the bias changes with
+the place), ``learned`` the one that learns from what is declared, ``declared`` the one that
 believes it. Figures are of the time after 30 s: RMSE and NEES of the position (2 is expected), all
 seeds together.
 """
@@ -26,7 +26,7 @@ from netpos.tracking.tracker import Tracker
 
 RATE_HZ, DURATION_S, SETTLED_S = 5.0, 90.0, 30.0
 NOISE_SD_M = 0.1
-_GO_S, _STOP_AND_GO_S = 5.0, 20.0
+GO_S, STOP_AND_GO_S = 5.0, 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,14 +66,13 @@ def cases() -> Iterator[Case]:
 
 
 def walk(case: Case, times: Array) -> Array:
-    """(n, 2) m: a loop of 8 m radius at 1 m/s, or a place."""
+    """(n, 2) m: a loop of 8 m by 5 m at 1 m/s or less, all the time or by turns, or a place."""
     if not case.moving:
         return np.tile([2.0, -1.5], (times.size, 1))
-    angle = times / 8.0
     if math.isfinite(case.length_m):
-        angle = (
-            _GO_S * (times // _STOP_AND_GO_S) + np.minimum(times % _STOP_AND_GO_S, _GO_S)
-        ) / 8.0
+        rounds, begun_s = np.divmod(times, STOP_AND_GO_S)
+        times = GO_S * rounds + np.minimum(begun_s, GO_S)
+    angle = times / 8.0
     return np.column_stack([8.0 * np.cos(angle), 5.0 * np.sin(angle)])
 
 
@@ -83,6 +82,14 @@ def anchors(case: Case) -> Array:
     return np.column_stack([15.0 * np.cos(angle), 12.0 * np.sin(angle), np.full(case.rsus, 3.0)])
 
 
+def decays(case: Case, places: Array) -> Array:
+    """(n - 1,): what is left of a bias from one of ``places`` (n, 2) to the next."""
+    way_m = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    per_s = math.inf if case.time_s == 0.0 else 1.0 / case.time_s
+    left: Array = np.exp(-per_s / RATE_HZ - way_m / case.length_m)
+    return left
+
+
 def ranges(case: Case, seed: int) -> tuple[Array, Array]:
     """True places (n, 2) and ranges (n, rsus) of one run."""
     rng = np.random.default_rng(seed)
@@ -90,28 +97,24 @@ def ranges(case: Case, seed: int) -> tuple[Array, Array]:
     places, rsus = walk(case, times), anchors(case)
     distance = np.linalg.norm(np.column_stack([places, 0 * times])[:, None] - rsus, axis=2)
     noise_sd, bias_sd = math.sqrt(case.variance) * NOISE_SD_M, case.bias * NOISE_SD_M
-    time_s = case.time_s or 1e-9
-    way = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    decays = np.exp(-1.0 / RATE_HZ / time_s - way / case.length_m)
     bias = np.empty_like(distance)
     bias[0] = rng.normal(0.0, bias_sd, case.rsus)
-    for k, decay in enumerate(decays.tolist(), start=1):
+    for k, decay in enumerate(decays(case, places).tolist(), start=1):
         step_sd = bias_sd * math.sqrt(1.0 - decay**2)
         bias[k] = decay * bias[k - 1] + rng.normal(0.0, step_sd, case.rsus)
     late = rng.exponential(3.0, distance.shape) * (rng.random(distance.shape) < case.blocked)
     return places, distance + bias + rng.normal(0.0, noise_sd, distance.shape) + late
 
 
-def run(case: Case, seed: int, *, told: bool, learn: bool) -> tuple[Array, Array]:
-    """Errors (n, 2) m and NEES (n,) after 30 s; an epoch without an estimate is not a number."""
-    places, measured = ranges(case, seed)
+def tracker_of(case: Case, places: Array, *, told: bool, learn: bool) -> tuple[Tracker, float]:
+    """A tracker that knows the RSUs, and the variance [m^2] that they state. ``told``: noise, bias
+    and its correlation time on the way along ``places`` (n, 2) are the true ones."""
     variance = (case.variance if told else 1.0) * NOISE_SD_M**2
-    white = case.time_s == 0.0
-    if told and white:
+    time_s = 0.0
+    if told and case.time_s > 0.0:
+        time_s = -1.0 / (RATE_HZ * float(np.log(decays(case, places)).mean()))
+    elif told:
         variance += (case.bias * NOISE_SD_M) ** 2
-    slow = told and not white and case.bias > 0.0
-    speed_mps = _GO_S / _STOP_AND_GO_S if math.isfinite(case.length_m) else 0.0
-    time_s = 1.0 / (1.0 / case.time_s + speed_mps / case.length_m) if not white else 0.0
     tracker = Tracker(
         TrackerConfig(
             accel_density_mps2_sqrthz=0.3,
@@ -126,10 +129,17 @@ def run(case: Case, seed: int, *, told: bool, learn: bool) -> tuple[Array, Array
             RsuInfo(
                 rsu_id=f"a{i}",
                 position=position,
-                range_bias_sd_m=case.bias * NOISE_SD_M if slow else 0.0,
-                bias_correlation_time_s=time_s if slow else 0.0,
+                range_bias_sd_m=case.bias * NOISE_SD_M if time_s > 0.0 else 0.0,
+                bias_correlation_time_s=time_s if case.bias > 0.0 else 0.0,
             )
         )
+    return tracker, variance
+
+
+def run(case: Case, seed: int, *, told: bool, learn: bool) -> tuple[Array, Array]:
+    """Errors (n, 2) m and NEES (n,) after 30 s; an epoch without an estimate is not a number."""
+    places, measured = ranges(case, seed)
+    tracker, variance = tracker_of(case, places, told=told, learn=learn)
     errors, nees = [], []
     for k, (place, row) in enumerate(zip(places, measured, strict=True)):
         stamp_ns = round(1e9 * (1.0 + k / RATE_HZ))
