@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
+from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.state import POSITION
 from netpos.messages.values import (
     Array,
@@ -248,6 +249,12 @@ class Estimator(ABC):
     def modes(self) -> tuple[TrackMode, ...]:
         """Where the device may be while that is not decided; none where it is."""
         return ()
+
+    @property
+    def components(self) -> Mixture | None:
+        """What the estimate is made of, over the states of ``estimation.state``; None where it is
+        one Gaussian of errors (spatial)."""
+        return None
 
     def radius(self, level_m: float) -> float:
         """Radius [m] that holds ``level_m`` and all other places where the device may be."""

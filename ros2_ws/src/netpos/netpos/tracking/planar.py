@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from netpos.estimation.measurement import VARIANCE
-from netpos.estimation.mixture.gaussians import moments, one_component
+from netpos.estimation.mixture.gaussians import Mixture, moments, one_component
 from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import (
     Array,
@@ -273,6 +273,10 @@ class PlanarEstimator(Estimator):
     @property
     def modes(self) -> tuple[TrackMode, ...]:
         return self._there().modes
+
+    @property
+    def components(self) -> Mixture:
+        return self._there().components
 
     def radius(self, level_m: float) -> float:
         return self._there().radius(level_m)

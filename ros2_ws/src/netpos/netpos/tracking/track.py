@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from netpos.estimation.chi_square import chi_square_bound
+from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.report import level_of
 from netpos.messages.values import (
     InitialPose,
@@ -91,6 +92,12 @@ class Track:
     def has_estimate(self) -> bool:
         """Whether there was a first fix."""
         return self._state.estimator.estimate is not None
+
+    @property
+    def components(self) -> Mixture | None:
+        """The weighted Gaussians of the last epoch's posterior; None without an estimate, or where
+        it is one in space."""
+        return self._state.estimator.components if self.has_estimate else None
 
     def status_at(self, stamp_ns: int) -> TrackStatus:
         """Status at a later instant, had nothing been heard until then; nothing changes."""

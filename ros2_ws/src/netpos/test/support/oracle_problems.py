@@ -29,6 +29,7 @@ DRIFT = (25e-6, 30e-6)  # mean and sd of a clock nobody knows
 CLOCK_DENSITIES = (1e-10, 2.5e-7)
 KNOWN_CLOCK, KNOWN_CLOCK_DENSITIES = (3e-9, 1e-9), (1e-10, 1e-10)
 WAVELENGTH_M, TURNS = 0.05, 4.0
+NEVER = 1e-12  # the least probability that the tracker takes
 PHASE_SCALE, PHASE_SD = 2.0 * math.pi * TURNS, math.radians(6.0)
 
 
@@ -315,6 +316,7 @@ def phase_sectors(rng: np.random.Generator, share: float = 1.0) -> Case:
     length = TURNS * WAVELENGTH_M
     rsu = RsuInfo(rsu_id="rsu", position=np.zeros(3), baseline_m=length, wavelength_m=WAVELENGTH_M)
     config = _config(start, motion, coverage_radius_m=start.position_sd)
+    config["sector_slip_probability"] = NEVER
     case = Case(config=config, rsus=(rsu,), start=start, motion=motion)
     times = _every(0.0, 5.0 * share, 10.0)
     moments = [t for t in (0.0, 0.5, 1.0, 2.0, 3.0, 5.0) if t <= 5.0 * share]

@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.protection import protection_level
 from netpos.evaluation.consistency import MeanTest, nees_over_runs
 from netpos.messages.values import Array
 from netpos.tracking import Tracker, TrackerConfig
-from oracle_problems import PROBLEMS, Case, Step, draw
+from oracle_problems import PROBLEMS, VUE, Case, Step, draw
 from particle_filter import ParticleFilter
 from posterior import Cloud, Modes
 from scipy.stats import kstest
@@ -60,21 +61,46 @@ def posteriors(case: Case, particles: int, seed: int) -> Iterator[tuple[Step, Cl
             yield step, cloud, oracle.least_effective
 
 
-def tracked(case: Case) -> dict[int, tuple[Array, Array]]:
-    """Position (2,) and covariance (2, 2) the tracker reports, by stamp."""
-    tracker = Tracker(TrackerConfig(**case.config))
+class Tracked(NamedTuple):
+    """A posterior of the tracker: position (2,) and covariance (2, 2) that it reports, and
+    positions (``_DRAWS``, 2) drawn from its mixture."""
+
+    mean: Array
+    cov: Array
+    drawn: Array
+
+
+def tracked(case: Case, seed: int) -> dict[int, Tracked]:
+    """What the tracker makes of the scored steps of a case, by stamp."""
+    tracker, rng = Tracker(TrackerConfig(**case.config)), np.random.default_rng(seed)
     for info in case.rsus:
         tracker.add_rsu(info)
-    outputs = []
+    found = {}
     for step in case.steps:
         for item in step.items:
             reason = tracker.add(item)
             if reason is not None:
                 raise ValueError(f"the tracker refused an item of the simulation: {reason}")
-        outputs += tracker.process()
-    outputs += tracker.flush()
-    odometry = (o.odometry for o in outputs if o.odometry is not None)
-    return {o.stamp_ns: (o.position[:2], o.pose_cov[:2, :2]) for o in odometry}
+        for output in (*tracker.process(), *tracker.flush()):
+            odometry = output.odometry
+            if step.scored and odometry is not None:
+                mean, cov = odometry.position[:2], odometry.pose_cov[:2, :2]
+                drawn = _draws(tracker.track(VUE).components, rng)
+                found[odometry.stamp_ns] = Tracked(mean, cov, drawn)
+    return found
+
+
+def _draws(components: Mixture | None, rng: np.random.Generator) -> Array:
+    """Positions (``_DRAWS``, 2) from a mixture."""
+    assert components is not None
+    weights = np.exp(components.log_weights)
+    counts = rng.multinomial(_DRAWS, weights / weights.sum())
+    return np.concatenate(
+        [
+            rng.multivariate_normal(mean[:2], cov[:2, :2], count)
+            for mean, cov, count in zip(components.means, components.covs, counts, strict=True)
+        ]
+    )
 
 
 def apart(mean: Array, cloud: Cloud) -> float:
@@ -87,17 +113,16 @@ def _nees(error: Array, cov: Array) -> float:
     return float(error @ np.linalg.solve(cov, error))
 
 
-def _beside(moment: Moment, truth: Array, cloud: Cloud, modes: Modes, told: Any) -> None:
+def _beside(moment: Moment, truth: Array, cloud: Cloud, modes: Modes, tracked: Tracked) -> None:
     """Add the tracker's figures."""
-    mean, cov = told
+    mean, cov, drawn = tracked
     error = truth - mean
-    radius = protection_level(cov, 1.0 - SHARE)
+    radius = float(np.quantile(np.hypot(*(drawn - mean).T), SHARE))
     moment.tracker_error, moment.tracker_nees = math.hypot(*error), _nees(error, cov)
     moment.tracker_inside = float(math.hypot(*error) < radius)
     moment.mean_apart = apart(mean, cloud)
     moment.trace_ratio = float(np.trace(cov) / np.trace(cloud.cov))
     moment.radius_ratio = radius / cloud.radius(SHARE)
-    drawn = np.random.default_rng(moment.seed).multivariate_normal(mean, cov, _DRAWS)
     moment.modes_apart = float(np.abs(modes.shares_of(drawn) - modes.weights).max())
 
 
@@ -124,15 +149,15 @@ def alone(problem: int, seed: int, particles: int, share: float = 1.0) -> list[M
 def compare(problem: int, seed: int, particles: int, share: float = 1.0) -> list[Moment]:
     """Every scored moment of one run of both filters."""
     case = draw(problem, seed, share)
-    told, moments = tracked(case), []
+    ours, moments = tracked(case, seed), []
     count = particles * PROBLEMS[problem].factor
     for step, cloud, _ in posteriors(case, count, seed):
         modes = Modes(cloud)
         moment = _moment(problem, seed, step, cloud)
         moment.modes = len(modes.weights)
         stamp = step.items[-1].stamp_ns
-        if stamp in told:
-            _beside(moment, step.truth[:2], cloud, modes, told[stamp])
+        if stamp in ours:
+            _beside(moment, step.truth[:2], cloud, modes, ours[stamp])
         moments.append(moment)
     return moments
 
