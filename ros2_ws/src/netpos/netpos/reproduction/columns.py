@@ -29,6 +29,8 @@ def track_rows(name: str, routes: Routes, *, judged: bool = False) -> Iterator[R
     ok = share == 0.0 if judged else None
     label = f"{name}: routes with an error above 5 m or lost"
     yield Row(name=label, unit="1", paper=None, ours=share, ok=ok)
+    label = f"{name}: routes with an error above 5 m at the posterior bound, at least"
+    yield shown(label, "1", routes.astray_at_bound / routes.runs)
     yield shown(f"{name}: routes", "1", float(routes.runs))
     yield shown(f"{name}: tracks lost per route", "1", routes.losses / routes.runs)
     yield shown(f"{name}: availability", "1", routes.availability)

@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from netpos.estimation.compile import kernel
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
-from netpos.estimation.state import X
+from netpos.estimation.protection import gaussian_tail
+from netpos.estimation.state import POSITION, X
 from netpos.evaluation.consistency import MeanTest, nees_over_runs
 from netpos.evaluation.metrics import MIN_SPEED_FOR_HEADING_MPS, NS, SKIP_EPOCHS
 from netpos.evaluation.work import Work
@@ -30,7 +31,9 @@ BINS = 10_000
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tally:
     """Sums over the scored estimates of one run; errors in m, ns and rad. epochs: as many as would
-    be scored were there always a track; losses: how often the track was lost."""
+    be scored were there always a track; losses: how often the track was lost; bound_above:
+    probability that an error with the covariance of the posterior bound is above ``DIVERGED_M`` in
+    the epoch in which the bound is largest."""
 
     n: int
     epochs: int
@@ -51,6 +54,7 @@ class Tally:
     ready_s: float | None
     speed_max: float
     losses: int
+    bound_above: float
 
     @property
     def astray(self) -> bool:
@@ -62,12 +66,14 @@ class Routes(NamedTuple):
     """What became of the tracks of an experiment.
 
     runs; losses: tracks lost in all of them; astray: runs with a loss or an error above 5 m;
-    availability: share of the epochs to be scored that have a track.
+    astray_at_bound: how many of these an unbiased filter with the posterior bound would have, on
+    average and at least; availability: share of the epochs to be scored that have a track.
     """
 
     runs: int
     losses: int
     astray: int
+    astray_at_bound: float
     availability: float
 
     @classmethod
@@ -77,6 +83,7 @@ class Routes(NamedTuple):
             runs=len(tallies),
             losses=sum(t.losses for t in tallies),
             astray=sum(t.astray for t in tallies),
+            astray_at_bound=sum(t.bound_above for t in tallies),
             availability=sum(t.n for t in tallies) / max(sum(t.epochs for t in tallies), 1),
         )
 
@@ -142,6 +149,7 @@ def tally(track: Track, position_sd_max_m: float, histogram: Ints, skip: int) ->
     elapsed = (track.stamps_ns - track.stamps_ns[0]) / NS
     speed = np.hypot(track.truth[:, X.VX], track.truth[:, X.VY])
     level = track.level[scored]
+    bound = track.bound[scored, POSITION, POSITION]
     return Tally(
         n=int(n),
         epochs=max(scored.size - skip, 0),
@@ -162,7 +170,17 @@ def tally(track: Track, position_sd_max_m: float, histogram: Ints, skip: int) ->
         ready_s=float(elapsed[ready[0]]) if ready.size else None,
         speed_max=float(speed.max()),
         losses=track.losses,
+        bound_above=_largest_tail(bound),
     )
+
+
+def _largest_tail(covs: Array) -> float:
+    """Probability that an error is above ``DIVERGED_M``, of the largest of covariances (N, 2, 2);
+    0 of none."""
+    if not covs.size:
+        return 0.0
+    largest = covs[int(np.argmax(np.trace(covs, axis1=1, axis2=2)))]
+    return float(gaussian_tail(largest[0, 0], largest[0, 1], largest[1, 1], DIVERGED_M))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

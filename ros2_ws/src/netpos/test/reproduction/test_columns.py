@@ -56,7 +56,8 @@ def test_of_an_estimator_that_loses_all_only_the_loss_is_known() -> None:
     far = replace(SHORT, changes=(*SHORT.changes, ("devices.0.initial_pose_sd_m", 5000.0)))
     with Work(2, 1, 1) as work:
         columns = in_columns(work, far, defaults=False)
-    assert columns.baseline == Routes(runs=2, losses=2, astray=2, availability=0.0)
+    lost = Routes(runs=2, losses=2, astray=2, astray_at_bound=0.0, availability=0.0)
+    assert columns.baseline == lost
     assert columns.defaults is None
 
     def make(summary: Summary, *paper: float) -> Iterator[Row]:
@@ -75,8 +76,10 @@ def test_of_an_estimator_that_loses_all_only_the_loss_is_known() -> None:
 
 @pytest.mark.parametrize(("astray", "ok"), [(0, True), (1, False)])
 def test_no_route_may_go_astray_where_that_is_judged(astray: int, ok: bool) -> None:
-    routes = Routes(runs=4, losses=2 * astray, astray=astray, availability=0.9)
+    routes = Routes(
+        runs=4, losses=2 * astray, astray=astray, astray_at_bound=0.2, availability=0.9
+    )
     first, *rest = track_rows("x", routes, judged=True)
     assert (first.ours, first.ok) == (astray / 4, ok)
-    assert [row.ours for row in rest] == [4.0, astray / 2, 0.9]
+    assert [row.ours for row in rest] == [0.05, 4.0, astray / 2, 0.9]
     assert next(track_rows("x", routes)).ok is None

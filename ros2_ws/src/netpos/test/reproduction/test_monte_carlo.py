@@ -20,6 +20,7 @@ from netpos.reproduction.monte_carlo import (
     tally,
 )
 from netpos.tracking import Tracker
+from scipy.stats import norm
 
 C = 299_792_458.0
 SKIP = 20
@@ -58,6 +59,17 @@ def _summary(tracks: list[Track], position_sd_max_m: float = 1.0) -> Summary:
     return Summary.of(METIS, [Batch(tallies=tallies, histogram=histogram)])
 
 
+def test_routes_above_5_m_that_the_bound_leaves() -> None:
+    """Of the largest bound of each route; a bound of one axis is the tail of a normal error."""
+    first, second = _track(1, 60), _track(2, 60)
+    bound = np.zeros((60, 6, 6))
+    bound[30, 0, 0], bound[40, 1, 1] = 3.0**2, 2.0**2
+    bound[5, 0, 0] = 10.0**2  # left out with the first epochs
+    routes = _summary([replace(first, bound=bound), second]).routes
+    assert routes.astray_at_bound == pytest.approx(2.0 * norm.sf(5.0 / 3.0), rel=1e-3)
+    assert _summary([second]).routes.astray_at_bound < 1e-30
+
+
 def test_figures_of_two_runs() -> None:
     tracks = [_track(1, 120), _track(2, 60)]
     error = np.vstack([(t.mean - t.truth)[SKIP:] for t in tracks])
@@ -86,7 +98,7 @@ def test_figures_of_two_runs() -> None:
     assert ours.exceeded_runs == 2
     assert ours.level_m == pytest.approx(0.8)
     assert ours.rate_hz == pytest.approx(4.0)
-    assert ours.routes == (2, 0, 0, 1.0)
+    assert ours.routes._replace(astray_at_bound=0.0) == (2, 0, 0, 0.0, 1.0)
 
 
 def test_heading_counts_where_the_vehicle_moves() -> None:
