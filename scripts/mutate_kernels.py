@@ -58,7 +58,7 @@ TESTS_OF = {
     "smooth": "test_smooth.py",
     "space": "test_space.py sensors/test_models.py",
     "space_conditioning": "test_space_conditioning.py",
-    "estimation/forms/srukf": "../test_srukf.py ../test_engine_parts.py -knot+ten_thousand",
+    "estimation/forms/srukf": "../test_ukf.py ../test_engine_parts.py -knot+ten_thousand",
     **{
         f"estimation/sensors/{name}": "test_models.py ../test_measurement.py ../test_space.py "
         "../test_measurement_curvature.py ../test_measurement_phase.py ../test_step_velocity.py"
