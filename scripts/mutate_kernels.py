@@ -2,7 +2,7 @@
 
     python scripts/mutate_kernels.py [ROOM|ROOM.KERNEL ...]
 
-A room is a module of ``estimation``, or another with its folder before it, as ``tracking/fit``
+A room is a module of ``estimation``, or another with its folder before it, as ``tracking/output``
 (``TESTS_OF`` lists them; all where none is named). The kernels run as plain Python here
 (NUMBA_DISABLE_JIT), so that a change needs no compiling. Exit code 1 where a change survives.
 """
@@ -56,9 +56,8 @@ TESTS_OF = {
     "rows": "test_measurement_rows.py test_measurement_phase.py",
     "sigma": "test_ukf.py",
     "smooth": "test_smooth.py",
-    "space": "test_space.py sensors/test_models.py",
-    "space_conditioning": "test_space_conditioning.py",
-    "estimation/forms/srukf": "../test_srukf.py ../test_engine_parts.py -knot+ten_thousand",
+    "space": "test_space.py test_space_conditioning.py sensors/test_models.py",
+    "estimation/forms/srukf": "../test_ukf.py ../test_engine_parts.py -knot+ten_thousand",
     **{
         f"estimation/sensors/{name}": "test_models.py ../test_measurement.py ../test_space.py "
         "../test_measurement_curvature.py ../test_measurement_phase.py ../test_step_velocity.py"
@@ -72,7 +71,7 @@ TESTS_OF = {
     "estimation/mixture/window": "../../tracking/test_initialise_fit.py",
     "tracking/output": "test_output.py",
     "phase_fix": "test_phase_fix.py",
-    "protection": "test_protection.py",
+    "protection": "test_protection.py test_protection_epochs.py",
     "report": "test_report.py",
     "estimation/mixture/mixing": "../test_mixing.py -knot+stop_straight_turn",
     **{

@@ -18,7 +18,7 @@ import pytest
 import yaml
 from netpos import messages, scenario
 from netpos.bags import BagError, BagReader, BagWriter, codec
-from netpos.estimation.first_compilation import SENTENCE
+from netpos.estimation.compile import SENTENCE
 from netpos.scenario.recording import Recording
 from netpos.tracking.tracker import Tracker
 

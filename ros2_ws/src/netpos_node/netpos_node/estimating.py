@@ -44,8 +44,8 @@ from netpos_node import (
 )
 
 if TYPE_CHECKING:
-    from netpos.tracking.map_to_odom import MapToOdom
     from netpos.world.geodesy import Datum
+    from netpos.world.map_to_odom import MapToOdom
 
 _SILENCE_S = 2.0  # long: a stalled machine must not look like the end of the measurements
 _PATIENCE_S = 30.0
@@ -433,7 +433,7 @@ class EstimatingNode(LifecycleNode):
 
     def _odom_of(self, vue_id: str) -> MapToOdom:
         if vue_id not in self._odoms:
-            from netpos.tracking.map_to_odom import MapToOdom  # noqa: PLC0415 - brings SciPy
+            from netpos.world.map_to_odom import MapToOdom  # noqa: PLC0415 - brings SciPy
 
             self._odoms[vue_id] = MapToOdom()
         return self._odoms[vue_id]

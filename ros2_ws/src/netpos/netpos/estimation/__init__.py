@@ -18,6 +18,6 @@ cached on disk.
 ``smooth``       Rauch-Tung-Striebel smoothing
 """
 
-from netpos.estimation.first_compilation import tell_first_compilation
+from netpos.estimation.compile import tell_first_compilation
 
 tell_first_compilation()

@@ -6,12 +6,15 @@ nothing else is relaxed: sums keep their order, NaN and infinity their meaning.
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numba import config, njit, types
-from numba.core import cgutils
+from numba.core import cgutils, event
 from numba.extending import intrinsic
 from numba.np import arrayobj
 
@@ -82,3 +85,30 @@ def _python_array(*shape: int) -> Any:
 local_array: Callable[..., Any] = (
     _python_array if config.DISABLE_JIT else intrinsic(prefer_literal=True)(_local_array)
 )
+
+
+SENTENCE = (
+    "netpos: compiling kernels for this machine; once, some seconds for each kind of tracker\n"
+)
+
+
+class _Once(event.Listener):  # type: ignore[misc]
+    """Tells of the first compilation and no other."""
+
+    def on_start(self, _: event.Event) -> None:
+        event.unregister(event_kind, self)
+        sys.stderr.write(SENTENCE)
+        sys.stderr.flush()
+
+    def on_end(self, _: event.Event) -> None:
+        """Nothing is told."""
+
+
+event_kind = "numba:compile"
+
+
+def tell_first_compilation() -> None:
+    """Have the first compilation told on stderr, where no kernel has been compiled before."""
+    folder = os.environ.get("NUMBA_CACHE_DIR", "")
+    if folder and not any(Path(folder).rglob("*.nbi")):
+        event.register(event_kind, _Once())

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from netpos.estimation.compile import kernel
 from netpos.estimation.factor import factor
 from netpos.estimation.measurement import VARIANCE, linearise, second_order_variance
-from netpos.estimation.predicted import PredictedRows
+from netpos.estimation.predicted import PredictedRows, note_innovations, predicted_rows
 from netpos.messages.values import Array
 
 Ints = npt.NDArray[np.int64]
@@ -88,3 +88,12 @@ def neg2_log_likelihood(
         distance += innovation[i] ** 2
         size += math.log(2.0 * math.pi * L[i, i] ** 2)
     return distance, size
+
+
+@kernel
+def innovations_with_sd(mean: Array, cov: Array, rows: Array, height_m: float) -> Array:
+    """Innovation of each row (m, ROW_WIDTH) at ``mean`` (n,) and its standard deviation under
+    ``cov`` (n, n): (m, 2)."""
+    innovations = np.empty((rows.shape[0], 2))
+    note_innovations(rows, predicted_rows(mean, cov, rows, height_m), innovations)
+    return innovations

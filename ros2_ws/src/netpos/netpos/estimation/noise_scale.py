@@ -50,7 +50,7 @@ class NoiseScale:
 
         Exact for a circular error, and nearly so (above all where it is large) for any other.
         """
-        factor: float = _inflation(self.weights, risk)
+        factor: float = _factor(self.weights, risk)
         return factor
 
     @staticmethod
@@ -81,7 +81,7 @@ def _log_refused(rows: int, gate_nis: float) -> Array:
 
 
 @leaf
-def _add_epoch(weights: Array, nis: float, dof: float, censored: Array) -> None:
+def _add(weights: Array, nis: float, dof: float, censored: Array) -> None:
     """One step of the recursion, in place. censored : (len(SCALES2),) log-likelihood of what was
     refused."""
     true = weights[0]
@@ -124,22 +124,12 @@ def _factor(weights: Array, risk: float) -> float:
 
 
 @kernel
-def _add(weights: Array, nis: float, dof: float, censored: Array) -> None:
-    _add_epoch(weights, nis, dof, censored)
-
-
-@kernel
-def _inflation(weights: Array, risk: float) -> float:
-    return float(_factor(weights, risk))
-
-
-@kernel
 def _of_run(nis: Array, dof: Array, censored: Array, risk: float) -> Array:
     weights, factors = np.zeros(SCALES2.size), np.ones(nis.size)
     weights[0], factor = 1.0, 1.0
     for k in range(nis.size):
         if dof[k] > 0.0 or censored[k, 0] < 0.0:
-            _add_epoch(weights, nis[k], dof[k], censored[k])
+            _add(weights, nis[k], dof[k], censored[k])
             factor = _factor(weights, risk)
         factors[k] = factor
     return factors

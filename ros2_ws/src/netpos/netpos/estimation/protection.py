@@ -8,6 +8,7 @@ an optimistic filter (``noise_scale``) and a manoeuvre not yet noticed (``manoeu
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,10 +18,16 @@ from netpos.estimation.engine import FilterOptions
 from netpos.estimation.factor import eigenvalues
 from netpos.estimation.fusion import W_GAIN, fuse
 from netpos.estimation.manoeuvre import add_manoeuvre, detection_delay_s
-from netpos.estimation.measurement import GROUP, VARIANCE, curvature_variance, innovation_row
+from netpos.estimation.measurement import (
+    GATE_VARIANCE,
+    GROUP,
+    VARIANCE,
+    curvature_variance,
+    innovation_row,
+)
 from netpos.estimation.mixture.gaussians import Mixture
-from netpos.estimation.predicted import PredictedRows
-from netpos.estimation.state import X
+from netpos.estimation.predicted import PredictedRows, predicted_rows
+from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array
 
 _ANGLES = 16
@@ -29,6 +36,7 @@ _WEIGHT = np.append(np.append(0.5, np.ones(_ANGLES - 1)), 0.5) / _ANGLES
 _ITERATIONS = 20
 _NEGLIGIBLE = 40.0  # exponent of a term too small for the sum's digits
 RISK_MIN, RISK_MAX = 1e-15, 0.5
+_BLIND = 1e-12  # share of the information along the line that rows see best
 
 
 @leaf
@@ -69,11 +77,11 @@ def radius_limit(xx: float, xy: float, yy: float, risk: float) -> float:
     return math.sqrt(-2.0 * math.log(risk) * max(large, 0.0))
 
 
-def protection_level(cov2: Array, risk: float, inflation: float = 1.0) -> float:
+def protection_level(cov2: Array, risk: float) -> float:
     """Radius [m] of the circle round the estimate that the position error leaves with probability
     ``risk``.
 
-    cov2 : (2, 2) m^2, may be singular; inflation : factor on the sd
+    cov2 : (2, 2) m^2, may be singular
 
     With whitened polar coordinates P(|e| > r) is the mean over phi of exp(-r^2 / 2 (a cos^2 phi +
     b sin^2 phi)), a and b the eigenvalues (for b = 0 Craig's form of the Gaussian tail): smooth
@@ -82,17 +90,14 @@ def protection_level(cov2: Array, risk: float, inflation: float = 1.0) -> float:
     Between the limits sd isf(risk / 2) of an error along a line and sd sqrt(-2 ln risk) of a
     circular one; monotone in ``cov2`` and ``risk``.
 
-    Raises ``ValueError`` for a covariance that is none, a risk outside [1e-15, 0.5], an inflation
-    below 1.
+    Raises ``ValueError`` for a covariance that is none or a risk outside [1e-15, 0.5].
     """
     if not RISK_MIN <= risk <= RISK_MAX:
         raise ValueError(f"risk must be in [{RISK_MIN:g}, {RISK_MAX:g}], got {risk!r}")
-    if not 1.0 <= inflation < math.inf:
-        raise ValueError(f"inflation must be finite and >= 1, got {inflation!r}")
     radius: float = radius_of(cov2, risk)
     if math.isnan(radius):
         raise ValueError(f"cov2 must be a finite covariance, got {np.asarray(cov2).tolist()}")
-    return inflation * radius
+    return radius
 
 
 @leaf
@@ -234,3 +239,51 @@ def apply_about(
             for b in range(n):
                 P[a, b] = prior_cov[a, b]
         fuse(x, P, innovation, H[:m], variance, use, work)
+
+
+def level_of_epochs(
+    recent: Sequence[tuple[int, Array]],
+    stamp_ns: int,
+    prediction: tuple[Array, Array],
+    cov: Array,
+    options: FilterOptions,
+) -> float:
+    """Radius [m] as ``manoeuvre_level``, of the newest epochs together: as few as see every
+    direction, inf where all do not, or there is no gate. One range, or one angle, says nothing
+    across its line: a turn along it stays unnoticed for ever.
+
+    recent : stamps and rows (m, ROW_WIDTH), oldest first, the newest of ``stamp_ns``
+    prediction : mean (n,) and covariance (n, n) at ``stamp_ns``; cov : (n, n) after it
+
+    Each epoch has a gate of its own. Of k epochs the one that sees a direction best has at least
+    the k-th part of what they know of it together, and may be the oldest: a step of the velocity
+    goes unnoticed for at most sqrt(k) times as long as one epoch with all rows would let it, and
+    the age of the oldest. What it does to the position is added to ``cov``.
+    """
+    gate = float(options.gate_nis[2])
+    if math.isinf(gate):
+        return math.inf
+    mean, prior_cov = prediction
+    information = np.zeros((2, 2))
+    for k, (then_ns, rows) in enumerate(reversed(recent), start=1):
+        information += _information(mean, prior_cov, rows, options.height_m)
+        least, most = np.linalg.eigvalsh(information)
+        if least <= _BLIND * most:
+            continue
+        speed = options.manoeuvre_speed_sd
+        longest_s = math.sqrt(k * gate / least) / speed
+        within_s = longest_s + 1e-9 * (stamp_ns - then_ns)
+        moved2 = (speed * within_s) ** 2 / 3.0  # a step at any time in it
+        return float(
+            radius_of(cov[POSITION, POSITION] + moved2 * np.eye(2), options.integrity_risk)
+        )
+    return math.inf
+
+
+def _information(mean: Array, cov: Array, rows: Array, height_m: float) -> Array:
+    """Of rows (m, ROW_WIDTH) about the position of mean (n,) (2, 2)."""
+    predicted = predicted_rows(mean, cov, rows, height_m)
+    variance = rows[:, GATE_VARIANCE] + predicted.prior_var + predicted.second_order_var
+    slopes = predicted.H[:, POSITION] / np.sqrt(variance)[:, np.newaxis]
+    information: Array = slopes.T @ slopes
+    return information

@@ -1,4 +1,4 @@
-"""Rauch-Tung-Striebel smoothing of what a filter stored: fixed interval and fixed lag.
+"""Rauch-Tung-Striebel smoothing of what a filter stored.
 
 All states have the length of the last one; where biases were appended on the way, the caller pads
 the earlier means with 0 and covariances with the bias's prior variance. Process noise is the
@@ -59,18 +59,3 @@ def rts(dts: Array, means: Array, covs: Array, motions: Array, bias: Array) -> t
         motion = motions[min(k, motions.shape[0] - 1)]
         step_back(means[k], covs[k], dts[k], motion, bias, means[k + 1], covs[k + 1])
     return means, covs
-
-
-@kernel
-def fixed_lag(
-    dts: Array, means: Array, covs: Array, motions: Array, bias: Array
-) -> tuple[Array, Array]:
-    """Mean (n,) and covariance (n, n) of the first entry of a window given all of it; arguments as
-    ``rts``."""
-    mean, cov = means[-1].copy(), covs[-1].copy()
-    for k in range(dts.size - 1, -1, -1):
-        motion = motions[min(k, motions.shape[0] - 1)]
-        earlier, earlier_cov = means[k].copy(), covs[k].copy()
-        step_back(earlier, earlier_cov, dts[k], motion, bias, mean, cov)
-        mean, cov = earlier, earlier_cov
-    return mean, cov

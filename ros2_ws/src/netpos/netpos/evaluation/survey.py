@@ -22,7 +22,7 @@ from netpos.messages.values import (
     TrackState,
     TrackStatus,
 )
-from netpos.tracking.error_words import words
+from netpos.tracking.diagnosis import errors_in_words
 
 _GAP_S = 1.0
 _BIASED, _FEW, _SEVERAL = 0.5, 20, 4
@@ -109,11 +109,8 @@ class Survey:
 def survey_vue(record: VueRecord, rsus: Mapping[str, RsuInfo], learns: bool) -> SurveyedVue:
     """Figures of one device. ``learns``: whether its tracker learned the errors of the RSUs."""
     series = tuple(series_of(record.measurements, rsus, record.track, record.clock))
-    errors = newest(record.errors)
-    rows = tuple(
-        summary(s, words(errors[s.rsu_id, s.quantity]) if (s.rsu_id, s.quantity) in errors else "")
-        for s in series
-    )
+    said = {key: errors_in_words(errors) for key, errors in newest(record.errors).items()}
+    rows = tuple(summary(s, said.get((s.rsu_id, s.quantity), "")) for s in series)
     figures = _figures(record, rows)
     suggestions = tuple(_suggestions(figures, rsus, record.measurements, learns))
     return SurveyedVue(

@@ -196,8 +196,8 @@ class Follower:
                 unheard_s, bias = (stamp - heard_ns) / NS, epochs.bias[:, : known - first].copy()
                 step = estimate.step(stamp, unheard_s, rejected, rows, bias)
                 run.nis[k], run.dof[k], run.undetected_m[k] = step.nis, step.dof, step.undetected_m
-                run.groups[k] = step.accepted.sum()
-                rejected = 0 if 2 * run.groups[k] >= step.accepted.size else rejected + 1
+                run.groups[k] = sum(step.accepted)
+                rejected = 0 if 2 * run.groups[k] >= len(step.accepted) else rejected + 1
                 heard_ns = stamp if run.dof[k] else heard_ns
             run.means[k], run.covs[k] = augmented(estimate.mean, estimate.cov, sd)
             run.radius[k] = estimate.radius(0.0)

@@ -8,9 +8,9 @@ square of the change as its variance.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -21,26 +21,22 @@ from netpos.tracking.models import gate_thresholds
 _LASTS_S = 1.0  # a report holds for so long, and its error may build up within that time
 
 
-@dataclass(slots=True)
 class AdaptiveProcessNoise:
     """Turns reported velocities into the density of the white acceleration up to their stamp."""
 
-    config: TrackerConfig
-    _last: dict[str, Velocity] = field(default_factory=dict)
-    _explained: float = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.set_config(self.config)
+    def __init__(self, config: TrackerConfig) -> None:
+        self._last: dict[str, Velocity] = {}  # by source
+        self.set_config(config)
 
     def set_config(self, config: TrackerConfig) -> None:
         """Go on with other parameters and what was heard."""
-        self.config = config
+        self._config = config
         self._explained = float(gate_thresholds(config.gate_probability)[2])
 
     def copy(self) -> AdaptiveProcessNoise:
         """An independent copy."""
-        twin = AdaptiveProcessNoise.__new__(AdaptiveProcessNoise)
-        twin.config, twin._explained, twin._last = self.config, self._explained, self._last.copy()
+        twin = copy.copy(self)
+        twin._last = self._last.copy()
         return twin
 
     def density(
@@ -48,7 +44,7 @@ class AdaptiveProcessNoise:
     ) -> float:
         """Density [m/s^2/sqrt(Hz)] for the prediction to ``stamp_ns``, where ``velocities`` are
         reported; ``free_density``: of a device of which they say nothing."""
-        config = self.config
+        config = self._config
         opened = max((self._change(velocity) for velocity in velocities), default=0.0)
         if config.steady_accel_density_mps2_sqrthz == 0.0 or config.use_imu:
             return free_density

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages.values import RsuErrors, StepCalibration, TrackState, TrackStatus
-from netpos.tracking import error_words
 from netpos.tracking.clocks import Stranger
 from netpos.tracking.health import RsuReport, RsuState
 from netpos.tracking.refusals import Refused
 
 _NOTHING: Mapping[str, RsuErrors] = {}
 _NEVER: Mapping[str, int] = {}
+_BIAS_SDS = 3.0  # sd of a bias that is mentioned
+_SCATTER = 1.5  # times as stated, or less than one over it
+_LENGTHS = {"RANGE": "ranges", "TDOA": "time differences"}
 
 
 class Level(IntEnum):
@@ -133,7 +137,7 @@ def of_rsus(
 
 def _with_errors(finding: Finding, errors: RsuErrors | None) -> Finding:
     """With what is learned of an RSU; it is no fault."""
-    said = error_words.words(errors) if errors is not None else ""
+    said = errors_in_words(errors) if errors is not None else ""
     if errors is None:
         return finding
     values = dict(finding.values)
@@ -142,6 +146,35 @@ def _with_errors(finding: Finding, errors: RsuErrors | None) -> Finding:
         values[f"learned scatter: {quantity}"] = f"{errors.scatter[k]:.2f}"
     message = f"{finding.message}; {said}" if said else finding.message
     return replace(finding, message=message, values=values)
+
+
+def errors_in_words(errors: RsuErrors) -> str:
+    """What is learned of the errors of an RSU, a phrase for each quantity that is not as stated:
+    "ranges 0.12 m long, scatter 3.1 times as stated"; empty where all are."""
+    phrases = []
+    for quantity, scatter, bias, sd in zip(
+        errors.quantities, errors.scatter, errors.bias, errors.bias_sd, strict=True
+    ):
+        faults = []
+        if abs(bias) > _BIAS_SDS * sd:
+            faults.append(_off(quantity, bias))
+        if not 1.0 / _SCATTER < scatter < _SCATTER:
+            faults.append(f"scatter {scatter:.1f} times as stated")
+        if faults:
+            name = _LENGTHS.get(quantity, quantity.lower())
+            phrases.append(f"{name} {', '.join(faults)}")
+    return "; ".join(phrases)
+
+
+def _off(quantity: str, bias: float) -> str:
+    if quantity in _LENGTHS:
+        return f"{abs(bias):.2f} m {'long' if bias > 0.0 else 'short'}"
+    if quantity == "TOA":
+        late = "late" if bias > 0.0 else "early"
+        return f"{abs(bias) / SPEED_OF_LIGHT_MPS * 1e9:.1f} ns {late}"
+    if quantity.startswith("COSINE"):
+        return f"off by {bias:.3f}"
+    return f"off by {math.degrees(bias):.1f} deg"
 
 
 def _of_rsu(

@@ -1,7 +1,8 @@
-"""The measurements of one epoch as rows for the filters."""
+"""The measurements of one epoch as rows for the filters, and how they fitted."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -12,6 +13,7 @@ import numpy as np
 from netpos.estimation.measurement import (
     BIAS,
     COMMON,
+    GROUP,
     HEIGHT,
     KIND,
     ROW_WIDTH,
@@ -165,3 +167,31 @@ def mostly_accepted(epoch_rows: EpochRows, accepted: Sequence[float]) -> bool:
         if isinstance(item, RsuMeasurement)
     ] or [bool(taken) for taken in accepted]
     return 2 * sum(votes) >= len(votes)
+
+
+def widen(innovations: Array, rows: Array, rsu: Rsu) -> None:
+    """Let the sd in ``innovations`` (m, 2) of ``rows`` without bias states hold the RSU's biases,
+    in place."""
+    for pair, row in zip(innovations, rows, strict=True):
+        pair[1] = math.hypot(pair[1], rsu.bias_sd(Kind(int(row[KIND]))))
+
+
+def fits(innovations: Array, gate: Array) -> bool:
+    """Whether each of ``innovations`` (m, 2), with its sd, is within the ``gate`` of one row."""
+    return bool(((innovations[:, 0] / innovations[:, 1]) ** 2 <= gate[1]).all())
+
+
+def refused_groups(
+    epoch_rows: EpochRows, accepted: Sequence[float], gate: Array
+) -> list[tuple[int, float]]:
+    """Rows and gate of each group of an epoch that its gate refused; one that is open refuses
+    nothing."""
+    if 0.0 not in accepted:
+        return []
+    sizes = np.bincount(epoch_rows.rows[:, GROUP].astype(int), minlength=len(accepted))
+    limits = gate[np.minimum(sizes, gate.size - 1)]
+    return [
+        (size, limit)
+        for size, limit, taken in zip(sizes.tolist(), limits.tolist(), accepted, strict=True)
+        if not taken and math.isfinite(limit)
+    ]

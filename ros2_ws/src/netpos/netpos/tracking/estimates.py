@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -46,17 +47,24 @@ from netpos.tracking.models import (
 _FARTHEST_BEHIND_SD = 5.0  # one Gaussian error in three million
 
 
-class Step(NamedTuple):
-    """What came of an epoch: NIS of the accepted rows and their number; 1 or 0 of each group
-    (groups,), until the next step; innovations (m, 2) of the rows as the prediction saw them, and
-    their sd; how far [m] a manoeuvre that the epoch does not show may have taken the device, not a
-    number where the posterior is not sound."""
+class UpdateResult(NamedTuple):
+    """What an estimator made of the rows of one epoch.
+
+    nis, dof : of the accepted rows together, and their number
+    accepted : 1 or 0 for each group of rows
+    innovations : (m, 2) innovation of each row at the prediction, and its standard deviation
+    undetected_m : how far [m] a manoeuvre that nothing has shown may have taken the device
+    sound : whether the posterior can be that of a device
+    breaks : times a smoother cannot reach across this epoch
+    """
 
     nis: float
     dof: int
-    accepted: Array
+    accepted: Sequence[float]
     innovations: Array
-    undetected_m: float
+    undetected_m: float = 0.0
+    sound: bool = True
+    breaks: int = 0
 
 
 class Estimate:
@@ -66,14 +74,20 @@ class Estimate:
 
     mean: Array
     """State (n,)."""
+    motion: Array
+    """(Parameter,) of the last step; of no use to a smoother for interacting models."""
+    declared_density: float
+    """Density of the white acceleration [m/s^2/sqrt(Hz)] of a device of which nothing is
+    learned."""
 
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
+        """``mean``, ``cov``: as ``start_state`` takes them."""
         self.stamp_ns = self._turn_ns = stamp_ns
         self._options = options_of(config)
         self._factored = not form_of(config.filter).carries_cov
         self._dynamics = dynamics_of(config, NO_BIAS)
-        self._motion: Array = self._dynamics.motions[0]
-        self._declared = float(self._motion[Parameter.ACCEL])
+        self.motion = self._dynamics.motions[0]
+        self.declared_density = float(self.motion[Parameter.ACCEL])
         self._components: Mixture | None = None  # replaced, never changed; None: one component
         self._modes: tuple[TrackMode, ...] | None = ()  # None: not yet asked for
         mean, cov = start_state(config, mean, cov)
@@ -88,33 +102,22 @@ class Estimate:
     def _unknown(self) -> AccelDensity | None:
         return unknown_density(self.mean.size) if self._options.learns_density else None
 
-    @property
-    def motion(self) -> Array:
-        """(Parameter,) of the last step; of no use to a smoother for interacting models."""
-        return self._motion
-
     def set_imu_increment(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
         """Set what the IMU integrated since ``stamp_ns``, and how good its yaw rate was."""
-        self._motion[Parameter.YAW_INCREMENT] = yaw_rad
-        self._motion[Parameter.SPEED_INCREMENT] = speed_mps
-        self._motion[Parameter.GYRO] = gyro_density
+        self.motion[Parameter.YAW_INCREMENT] = yaw_rad
+        self.motion[Parameter.SPEED_INCREMENT] = speed_mps
+        self.motion[Parameter.GYRO] = gyro_density
 
     @property
     def accel_density(self) -> float:
         """Density of the white acceleration [m/s^2/sqrt(Hz)] from ``stamp_ns`` on where none is
         set: declared, or learned up to there."""
-        return self._declared if self._learned is None else float(density_of(self._learned))
-
-    @property
-    def declared_density(self) -> float:
-        """Density of the white acceleration [m/s^2/sqrt(Hz)] of a device of which nothing is
-        learned."""
-        return self._declared
+        return self.declared_density if self._learned is None else float(density_of(self._learned))
 
     def set_process_noise(self, accel_density: float) -> None:
         """Set the density of the white acceleration [m/s^2/sqrt(Hz)] from ``stamp_ns`` up to the
         next epoch, from which none is learned."""
-        self._motion[Parameter.ACCEL] = accel_density
+        self.motion[Parameter.ACCEL] = accel_density
         self._accel_is_set = True
 
     def set_config(self, config: TrackerConfig) -> None:
@@ -123,7 +126,7 @@ class Estimate:
         if learned != self._options.learns_density:
             self._learned = self._unknown()
         self._dynamics.motions[:, Parameter.ACCEL] = motions_of(config)[:, Parameter.ACCEL]
-        self._declared = float(self._motion[Parameter.ACCEL])
+        self.declared_density = float(self.motion[Parameter.ACCEL])
         self._modes = () if self._components is None else None
 
     def _move_learned(self, dt_s: float, bias: Array) -> None:
@@ -132,9 +135,9 @@ class Estimate:
         learned, self._learns = self._learned, not self._accel_is_set
         self._accel_is_set = False
         if self._learns:
-            self._motion[Parameter.ACCEL] = self.accel_density
+            self.motion[Parameter.ACCEL] = self.accel_density
         if learned is not None and self._learns:
-            move(learned, self.mean, dt_s, self._motion, bias)
+            move(learned, self.mean, dt_s, self.motion, bias)
         elif learned is not None:
             self._learned = AccelDensity(learned.theta, *unknown_density(self.mean.size)[1:])
 
@@ -195,10 +198,6 @@ class Estimate:
         held: float = mixture_radius(self._components, self.mean, risk)
         return max(level_m, held)
 
-    def split(self, mixture: Mixture) -> None:
-        """Go on with the components of a first fix, each with all states of the filter."""
-        self._set(mixture)
-
     def augment(self, sd: Array) -> None:
         """Append independent states of mean 0 until there are 6 + len(sd)."""
         if self.mean.size >= N_CORE + sd.size:
@@ -212,20 +211,12 @@ class Estimate:
             self._learned = resized(self._learned, self.mean.size)
         self._make_room(self._rows)
 
-    def change_prior(self, index: int, before: float, after: float) -> None:
-        """Take the bias state ``index``, whose prior had the sd ``before``, for one of sd
-        ``after``; nothing happens to several components."""
-        if self._components is None:
-            cov = self.cov.copy()
-            change_prior(self.mean, cov, index, before, after)
-            self._cov_or_sqrt = engine.to_cov_or_sqrt(cov, self._options)
-
-    def cut_off_behind(self, origin: Array, front: Array) -> None:
-        """Take away what is behind a line (``cut_off_behind``); nothing happens to several
+    def adjust(self, change: Callable[..., None], *arguments: Any) -> None:
+        """Have ``change(mean, cov, *arguments)`` change both in place; nothing happens to several
         components."""
         if self._components is None:
             cov = self.cov.copy()
-            cut_off_behind(self.mean, cov, origin, front)
+            change(self.mean, cov, *arguments)
             self._cov_or_sqrt = engine.to_cov_or_sqrt(cov, self._options)
 
     def predict(self, stamp_ns: int, bias: Array) -> None:
@@ -234,13 +225,13 @@ class Estimate:
         self.stamp_ns = stamp_ns
         self._move_learned(dt, bias)
         if self._components is None:
-            engine.predict(self.mean, self._cov_or_sqrt, dt, self._motion, bias, self._options)
+            engine.predict(self.mean, self._cov_or_sqrt, dt, self.motion, bias, self._options)
         elif dt > 0.0:
             self._set(mixtures.move(self._components, dt, self._with(bias), self._options))
 
     def step(
         self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
-    ) -> Step:
+    ) -> UpdateResult:
         """Move to ``stamp_ns`` and apply one epoch. ``prior`` holds the prediction afterwards."""
         m = len(rows)
         if m > self._rows:
@@ -249,7 +240,7 @@ class Estimate:
         dt_s = (stamp_ns - self.stamp_ns) * 1e-9
         epoch = EpochInput(dt_s, unheard_s, rejected_in_row, rows)
         self._move_learned(dt_s, bias)
-        found: Outcome = mixtures.advance(
+        outcome: Outcome = mixtures.advance(
             self.mean,
             self._cov_or_sqrt,
             self._components or self._one,
@@ -260,15 +251,20 @@ class Estimate:
             memory,
         )
         self.stamp_ns = stamp_ns
-        self._learn(found.turned)
-        if found.begun:
+        self._learn(outcome.turned)
+        if outcome.begun:
             self._turn_ns = stamp_ns
-        several = found.components.log_weights.size > 1
-        self._components = found.components if several else None
+        several = outcome.components.log_weights.size > 1
+        self._components = outcome.components if several else None
         self._modes = None if several else ()
-        accepted = memory.step.accepted[: int(rows.item(-1, GROUP)) + 1]
-        innovations = memory.innovations[:m].copy()
-        return Step(found.nis, found.used, accepted, innovations, found.undetected_m)
+        return UpdateResult(
+            outcome.nis,
+            outcome.used,
+            memory.step.accepted[: int(rows.item(-1, GROUP)) + 1].tolist(),
+            memory.innovations[:m].copy(),
+            outcome.undetected_m,
+            sound=not math.isnan(outcome.undetected_m),
+        )
 
     def copy(self) -> Estimate:
         """An independent copy."""
@@ -276,7 +272,7 @@ class Estimate:
         twin.__dict__.update(self.__dict__)
         twin.mean, twin._cov_or_sqrt = self.mean.copy(), self._cov_or_sqrt.copy()
         twin._dynamics = self._dynamics._replace(motions=self._dynamics.motions.copy())
-        twin._motion = twin._dynamics.motions[0]
+        twin.motion = twin._dynamics.motions[0]
         if self._learned is not None:
             twin._learned = resized(self._learned, self.mean.size)
         return twin
@@ -333,19 +329,13 @@ def modes_of(mixture: Mixture, risk: float) -> tuple[TrackMode, ...]:
     return modes if len(modes) > 1 else ()
 
 
-def start(config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> Estimate:
-    """Estimate of the chosen filter from mean and covariance at ``stamp_ns``, as ``start_state``
-    takes them."""
-    return Estimate(config, stamp_ns, mean, cov)
-
-
 def start_from(config: TrackerConfig, stamp_ns: int, mixture: Mixture) -> Estimate:
-    """As ``start``, from the components of a first fix; from their moments where the estimate is
-    one Gaussian."""
-    estimate = start(config, stamp_ns, *moments(mixture))
+    """An estimate from the components of a first fix; from their moments where it is one
+    Gaussian."""
+    estimate = Estimate(config, stamp_ns, *moments(mixture))
     if mixture.log_weights.size > 1 and carries_modes(config):
         pairs = zip(mixture.means, mixture.covs, strict=True)
         states = [start_state(config, mean, cov) for mean, cov in pairs]
         means, covs = np.array([mean for mean, _ in states]), np.array([cov for _, cov in states])
-        estimate.split(Mixture(means, covs, mixture.log_weights))
+        estimate._set(Mixture(means, covs, mixture.log_weights))
     return estimate

@@ -20,7 +20,6 @@ from netpos.estimation.state import POSITION
 from netpos.messages.values import (
     Array,
     ClockState,
-    ImuSample,
     InitialPose,
     NetworkTrack,
     Odometry,
@@ -30,8 +29,9 @@ from netpos.messages.values import (
     TrackMode,
 )
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.epoch_rows import EpochRows, RowForm, Source, epoch_rows_of
-from netpos.tracking.fit import widen
+from netpos.tracking.epoch_rows import EpochRows, RowForm, Source, epoch_rows_of, widen
+from netpos.tracking.estimates import UpdateResult
+from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser
 from netpos.tracking.models import pose_state
 from netpos.tracking.rsus import BiasStates, Rsu
@@ -62,26 +62,6 @@ class FirstFix(NamedTuple):
     refused: str = ""
 
 
-class UpdateResult(NamedTuple):
-    """What an estimator made of the rows of one epoch.
-
-    nis, dof : of the accepted rows together, and their number
-    accepted : 1 or 0 for each group of rows
-    innovations : (m, 2) innovation of each row at the prediction, and its standard deviation
-    undetected_m : how far [m] a manoeuvre that nothing has shown may have taken the device
-    sound : whether the posterior can be that of a device
-    breaks : times a smoother cannot reach across this epoch
-    """
-
-    nis: float
-    dof: int
-    accepted: Sequence[float]
-    innovations: Array
-    undetected_m: float = 0.0
-    sound: bool = True
-    breaks: int = 0
-
-
 class Description(NamedTuple):
     """An estimate as others read it: odometry, clock, the sd [m] of the position along its worst
     horizontal direction, the radius [m] that its Gaussian error leaves with ``integrity_risk``."""
@@ -90,16 +70,6 @@ class Description(NamedTuple):
     clock: ClockState
     position_sd_m: float
     radius_m: float
-
-
-class ImuInput(Protocol):
-    """The IMU samples of one device."""
-
-    def add(self, sample: ImuSample) -> str | None:
-        """Take a sample; returns the reason when it is refused."""
-
-    def clear(self) -> None:
-        """Forget all samples."""
 
 
 class AnyEstimate(Protocol):
@@ -122,7 +92,7 @@ class Estimator(ABC):
     - Fixed-lag smoothing is planar: a spatial track is smoothed afterwards, over its whole length.
     """
 
-    imu: ImuInput
+    imu: ImuBuffer
     """The samples of the device; they stay when the estimate is forgotten."""
     estimate: AnyEstimate | None
     """None before the first fix."""
@@ -137,6 +107,7 @@ class Estimator(ABC):
         self, vue_id: str, config: TrackerConfig, rsus: Mapping[str, Rsu], form: RowForm
     ) -> None:
         self._vue_id, self._config = vue_id, config
+        self.imu = ImuBuffer()
         self._rsus, self._form = rsus, form
         self.bias = np.zeros((2, 0))
 

@@ -20,14 +20,22 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
 
-from netpos.tracking.health_memory import RsuMemory, Run, Vote
-from netpos.tracking.health_words import mean_nis, medians, off, rate_hz, words
-from netpos.tracking.observations import FittedEpoch, Observation
-from netpos.tracking.probation import Probation, independent
+from netpos.messages.values import RsuMeasurement
+from netpos.tracking.epoch_rows import Source
+from netpos.tracking.observations import (
+    FittedEpoch,
+    Observation,
+    mean_nis,
+    medians,
+    off,
+    rate_hz,
+    words,
+)
+from netpos.tracking.probation import Probation, Vote, independent
 from netpos.tracking.rsus import Rsu
 
 _AGREES, _REFUSED = 0.7, 0.3  # accept ratios
@@ -94,6 +102,35 @@ class RsuReport:
     mean_normalised: Mapping[str, float] = field(default_factory=dict)
 
 
+@dataclass(slots=True)
+class Run:
+    """Verdicts of one sign in a row: first and last stamp and number of their measurements."""
+
+    first_ns: int
+    last_ns: int
+    count: int
+
+    def reaches(self, duration_s: float, count: int) -> bool:
+        """Whether it is long enough, in time and measurements."""
+        return self.last_ns - self.first_ns >= duration_s * 1e9 and self.count >= count
+
+
+@dataclass(slots=True)
+class RsuMemory:
+    """One RSU: what was found of it lately, and the verdicts so far."""
+
+    window: deque[Observation]
+    last_ns: int = -1
+    last_vue: str = ""
+    measurements: int = 0
+    late: int = 0
+    excluded: bool = False
+    cause: str = ""
+    against: Run | None = None
+    agrees: Run | None = None
+    changes: deque[tuple[int, bool]] = field(default_factory=lambda: deque(maxlen=16))
+
+
 class RsuHealth:
     """Collects observations of all tracks, reports and isolates RSUs."""
 
@@ -126,35 +163,9 @@ class RsuHealth:
         self._accused = False  # an RSU is, or was, excluded
         self._probation = Probation(self._slot_ns, self._settle_ns)
 
-    def observe(
-        self,
-        rsu_id: str,
-        vue_id: str,
-        stamp_ns: int,
-        accepted: bool,
-        innovations: Mapping[str, tuple[float, float]],
-    ) -> None:
-        """Take what a track found of one measurement; of an excluded RSU: what the gate would have
-        said. A second observation of the same RSU, device and stamp replaces the first.
-
-        innovations : (measured minus predicted in m or rad, its sd) by ``Kind`` name, any case
-        Raises ``ValueError`` for an innovation that is not finite or an sd that is not > 0.
-        """
-        for value, sd in innovations.values():
-            if not (-math.inf < value < math.inf and 0.0 < sd < math.inf):
-                raise ValueError(
-                    f"innovation and sd of {rsu_id} must be finite, the sd > 0, got "
-                    f"{dict(innovations)}"
-                )
-        values = [value for pair in innovations.values() for value in pair]
-        seen = Observation(stamp_ns, vue_id, accepted, tuple(innovations), values)
-        self._catch_up()
-        if stamp_ns >= self._due_ns:
-            self._advance(stamp_ns)
-        self._take(vue_id, stamp_ns, [(rsu_id, seen)])
-
     def hear(self, epoch: FittedEpoch) -> None:
-        """``observe`` for all measurements of an epoch, whose innovations are sound."""
+        """Take what a track found of an epoch; of an excluded RSU: what the gate would have said.
+        A second observation of the same RSU, device and stamp replaces the first."""
         if epoch.stamp_ns >= self._due_ns:
             self._advance(epoch.stamp_ns)
         self._heard_of.append(epoch)
@@ -200,18 +211,26 @@ class RsuHealth:
                     else:
                         del streams[key]
 
-    def trusts_all(self, stamp_ns: int) -> bool:
-        """Whether no measurement with this stamp is to be refused."""
+    def sort_out(
+        self, stamp_ns: int, items: list[Source], agrees: Callable[[RsuMeasurement], bool]
+    ) -> tuple[list[Source], list[RsuMeasurement]]:
+        """What of an epoch may be fused, and what is only looked at: that of an excluded RSU, and
+        of one on probation where it does not agree with the prediction (``agrees``)."""
         if stamp_ns >= self._due_ns:
             self._advance(stamp_ns)
-        return not (self._accused or self._probation.any)
-
-    def on_probation(self, rsu_id: str, vue_id: str, stamp_ns: int) -> bool:
-        """Whether a measurement of this RSU, device and stamp is to be fused only where it agrees
-        with the prediction."""
-        if stamp_ns >= self._due_ns:
-            self._advance(stamp_ns)
-        return self._probation.holds(rsu_id, vue_id, stamp_ns)
+        if not (self._accused or self._probation.any):
+            return items, []
+        used: list[Source] = []
+        watched: list[RsuMeasurement] = []
+        for item in items:
+            if isinstance(item, RsuMeasurement) and (
+                self.excluded(item.rsu_id, stamp_ns)
+                or (self._probation.holds(item.rsu_id, item.vue_id, stamp_ns) and not agrees(item))
+            ):
+                watched.append(item)
+            else:
+                used.append(item)
+        return used, watched
 
     def excluded(self, rsu_id: str, stamp_ns: int) -> bool:
         """Whether a measurement of this RSU with this stamp is to be refused."""

@@ -1,20 +1,25 @@
-"""Yaw rate and forward acceleration of a device, integrated between any two stamps."""
+"""The samples of a device's IMU, and their integrals between any two stamps."""
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from array import array
+from bisect import bisect_left, bisect_right
 
-from netpos.messages.values import ImuSample
+import numpy as np
+from numpy.typing import NDArray
+
+from netpos.messages.values import Array, ImuSample
 
 _KEEP_NS = 70_000_000_000
 _GAP_NS = 50_000_000  # a longer silence of the IMU is a hole, not a step
 
 
 class ImuBuffer:
-    """Integrals of the last minute of IMU samples, trapezoidal between their stamps.
+    """The samples of the last minute, and integrals of yaw rate and forward acceleration,
+    trapezoidal between their stamps.
 
-    The device's base_link has x forward and z up; the track is planar, so pitch and roll count as
-    part of the acceleration's bias.
+    The device's base_link has x forward and z up; a planar track counts pitch and roll as part of
+    the acceleration's bias.
     """
 
     def __init__(self) -> None:
@@ -23,31 +28,37 @@ class ImuBuffer:
     def clear(self) -> None:
         """Forget all samples."""
         self._stamps: list[int] = []
-        self._samples: list[tuple[float, float]] = []
+        self._rates = array("d")  # six a sample: angular velocity, specific force
         self._integrals: list[tuple[float, float, int]] = []  # yaw, speed, time in holes [ns]
 
     def add(self, sample: ImuSample) -> str | None:
         """Take a sample; returns the reason when it is not newer than the last."""
         stamp = sample.stamp_ns
-        value = (float(sample.angular_velocity[2]), float(sample.specific_force[0]))
         if self._stamps and stamp <= self._stamps[-1]:
             return "duplicate" if stamp == self._stamps[-1] else "late"
+        value = (*sample.angular_velocity.tolist(), *sample.specific_force.tolist())
         yaw, speed, holes = self._integrals[-1] if self._integrals else (0.0, 0.0, 0)
         if self._stamps:
             span = stamp - self._stamps[-1]
             if span > _GAP_NS:
                 holes += span
             else:
-                last = self._samples[-1]
-                yaw += (last[0] + value[0]) / 2.0 * span * 1e-9
-                speed += (last[1] + value[1]) / 2.0 * span * 1e-9
+                yaw += (self._rates[-4] + value[2]) / 2.0 * span * 1e-9
+                speed += (self._rates[-3] + value[3]) / 2.0 * span * 1e-9
         self._stamps.append(stamp)
-        self._samples.append(value)
+        self._rates.extend(value)
         self._integrals.append((yaw, speed, holes))
         if self._stamps[0] < stamp - 2 * _KEEP_NS:
             keep = bisect_left(self._stamps, stamp - _KEEP_NS)
-            del self._stamps[:keep], self._samples[:keep], self._integrals[:keep]
+            del self._stamps[:keep], self._rates[: 6 * keep], self._integrals[:keep]
         return None
+
+    def between(self, from_ns: int, to_ns: int) -> tuple[NDArray[np.int64], Array]:
+        """Stamps (n,) and rates (n, 6) that cover an interval, with one sample before it."""
+        first = max(bisect_right(self._stamps, from_ns) - 1, 0)
+        last = min(bisect_left(self._stamps, to_ns) + 1, len(self._stamps))
+        stamps = np.array(self._stamps[first:last], dtype=np.int64)
+        return stamps, np.array(self._rates[6 * first : 6 * last]).reshape(-1, 6)
 
     def increments(self, from_ns: int, to_ns: int) -> tuple[float, float, float]:
         """Yaw [rad] and speed [m/s] gained between two stamps, and the seconds not covered."""
@@ -71,7 +82,8 @@ class ImuBuffer:
         share = (stamp_ns - self._stamps[i - 1]) / span
         if after[2] > before[2]:
             return before[0], before[1], before[2] + int(share * span)
-        (w0, a0), (w1, a1) = self._samples[i - 1], self._samples[i]
+        w0, a0 = self._rates[6 * i - 4 : 6 * i - 2]
+        w1, a1 = self._rates[6 * i + 2 : 6 * i + 4]
         t = share * span * 1e-9
         yaw = before[0] + t * (w0 + share * (w1 - w0) / 2.0)
         speed = before[1] + t * (a0 + share * (a1 - a0) / 2.0)

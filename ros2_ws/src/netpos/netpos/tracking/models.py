@@ -165,14 +165,14 @@ def pose_state(config: TrackerConfig, position: Array, position_cov: Array) -> t
     return mean, cov
 
 
-def augmented(mean: Array, cov: Array, sd: Array) -> tuple[Array, Array]:
-    """Mean and covariance with the last entries of ``sd`` appended as independent states of mean
-    0, so that there are as many as 6 + len(sd)."""
-    new = sd[mean.size - N_CORE :]
+def augmented(mean: Array, cov: Array, sd: Array, first: int = N_CORE) -> tuple[Array, Array]:
+    """Mean and covariance (n, n) with the last entries of ``sd`` appended as independent states of
+    mean 0, so that there are as many as ``first`` + len(sd)."""
+    n = len(cov)
+    new = sd[n - first :]
     if not new.size:
         return mean, cov
-    n = mean.size + new.size
-    larger = np.zeros((n, n))
-    larger[: mean.size, : mean.size] = cov
-    larger[mean.size :, mean.size :] = np.diag(new**2)
+    larger = np.zeros((n + new.size, n + new.size))
+    larger[:n, :n] = cov
+    larger[n:, n:] = np.diag(new**2)
     return np.append(mean, np.zeros(new.size)), larger

@@ -86,7 +86,7 @@ class PhaseStart:
         speed, height = self.config.initial_speed_sd_mps, self.config.device_height_m
         if init_hypothesis(mean, cov, rows[at - 1], rows[at], turns, speed, height) == -math.inf:
             return None
-        return estimates.start(self.config, stamp_ns, mean, cov)
+        return Estimate(self.config, stamp_ns, mean, cov)
 
     def _by_sectors(
         self, stamp_ns: int, rows: Array, at: int, start: tuple[Array, Array]

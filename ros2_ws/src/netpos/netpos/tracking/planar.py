@@ -9,8 +9,10 @@ from typing import Self
 
 import numpy as np
 
+from netpos.estimation.fit import innovations_with_sd
 from netpos.estimation.measurement import VARIANCE
 from netpos.estimation.mixture.gaussians import Mixture, moments, one_component
+from netpos.estimation.protection import level_of_epochs
 from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import (
     Array,
@@ -27,17 +29,14 @@ from netpos.tracking import estimates, output
 from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import EpochRows, Source, planar_form
-from netpos.tracking.estimates import Estimate
+from netpos.tracking.estimates import Estimate, UpdateResult
 from netpos.tracking.estimator import (
     Description,
     Estimator,
     FirstFix,
     Past,
     Recent,
-    UpdateResult,
 )
-from netpos.tracking.fit import innovations_with_sd
-from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser, with_heading
 from netpos.tracking.learning import LearnedErrors
 from netpos.tracking.models import (
@@ -53,7 +52,6 @@ from netpos.tracking.phase_start import PhaseStart
 from netpos.tracking.rsus import Rsu
 from netpos.tracking.shared_errors import SharedErrors
 from netpos.tracking.smoothing import Posterior, PosteriorRecorder
-from netpos.tracking.unnoticed import level_of_epochs
 
 _IMU_HOLE_S = 0.05
 _BLIND_GYRO = 1.0  # rad/s/sqrt(Hz): what the heading does while the IMU is silent
@@ -66,8 +64,7 @@ class PlanarEstimator(Estimator):
     """Estimator of a device that moves at a known height."""
 
     estimate: Estimate | None
-    imu: ImuBuffer
-    recorder: PosteriorRecorder | None
+    recorder: PosteriorRecorder | None = None
 
     def __init__(
         self,
@@ -79,12 +76,12 @@ class PlanarEstimator(Estimator):
         self._heading = heading_index(config)
         self._height = height_state(config)
         super().__init__(vue_id, config, rsus, planar_form(self._heading, self._height))
-        self.imu = ImuBuffer()
         self._shared, self._lives = shared, count(1)
         self._options, self._extra_sd = options_of(config), initial_extra_sd(config)
         self._use_imu, self._calibrates_steps = config.use_imu, config.calibrates_steps
         self._secondary = Secondary(vue_id, config) if config.network else None
-        self.recorder = PosteriorRecorder.of(vue_id, config)
+        if config.fixed_lag_s > 0.0:
+            self.recorder = PosteriorRecorder(vue_id, config)
         self._forget()
 
     def _forget(self) -> None:
@@ -128,8 +125,8 @@ class PlanarEstimator(Estimator):
 
     def innovations(self, rows: Array) -> Array:
         estimate, height_m = self._there(), self._config.device_height_m
-        found: Array = innovations_with_sd(estimate.mean, estimate.cov, rows, height_m)
-        return found
+        innovations: Array = innovations_with_sd(estimate.mean, estimate.cov, rows, height_m)
+        return innovations
 
     def _there(self) -> Estimate:
         assert self.estimate is not None
@@ -148,7 +145,7 @@ class PlanarEstimator(Estimator):
         if self._heading >= 0:
             self._pose = stamp_ns, mean, cov  # the first antennas tell the heading
             return False
-        self.estimate = estimates.start(self._config, stamp_ns, mean, cov)
+        self.estimate = Estimate(self._config, stamp_ns, mean, cov)
         return True
 
     def first_fix(self, stamp_ns: int, epoch_rows: EpochRows) -> FirstFix:
@@ -217,41 +214,31 @@ class PlanarEstimator(Estimator):
         rows, unheard_s = epoch_rows.rows, past.unheard_s
         estimate = self._prepared(stamp_ns, epoch_rows.items)
         was_ambiguous = bool(estimate.modes)
-        step = estimate.step(stamp_ns, unheard_s, past.rejected_in_row, rows, self.bias)
+        result = estimate.step(stamp_ns, unheard_s, past.rejected_in_row, rows, self.bias)
         if self._secondary is not None:
             self._own = self._secondary.after(self._own, stamp_ns, estimate, rows, self.bias)
-        self._keep_in_front(epoch_rows, step.accepted)
+        self._keep_in_front(epoch_rows, result.accepted)
+        undetected_m = result.undetected_m
+        if math.isinf(undetected_m):  # one epoch does not bound it: the recent ones with it
+            epochs = [*((then_ns, e.rows) for then_ns, e in past.recent), (stamp_ns, rows)]
+            prior, cov = estimate.prior, estimate.cov
+            undetected_m = level_of_epochs(epochs, stamp_ns, prior, cov, self._options)
         # a smoother does not reach across: what it keeps is one Gaussian
         breaks = int(bool(estimate.modes) != was_ambiguous)
-        return UpdateResult(
-            step.nis,
-            step.dof,
-            step.accepted.tolist(),
-            step.innovations,
-            self._undetected_m(step.undetected_m, stamp_ns, rows, past.recent),
-            sound=not math.isnan(step.undetected_m),
-            breaks=breaks,
-        )
+        return result._replace(undetected_m=undetected_m, breaks=breaks)
 
-    def _undetected_m(self, level_m: float, stamp_ns: int, rows: Array, recent: Recent) -> float:
-        """``level_m``, or where one epoch does not bound it that of the recent ones with it."""
-        if not math.isinf(level_m):
-            return level_m
-        estimate = self._there()
-        epochs = [*((then_ns, before.rows) for then_ns, before in recent), (stamp_ns, rows)]
-        return level_of_epochs(epochs, stamp_ns, estimate.prior, estimate.cov, self._options)
-
-    def _keep_in_front(self, epoch_rows: EpochRows, accepted: Array) -> None:
+    def _keep_in_front(self, epoch_rows: EpochRows, accepted: Sequence[float]) -> None:
         """Take away what is behind an array that hears the device, where the mean is there."""
         estimate = self._there()
-        for item, taken in zip(epoch_rows.items, accepted.tolist(), strict=True):
+        for item, taken in zip(epoch_rows.items, accepted, strict=True):
             if not taken or not isinstance(item, RsuMeasurement):
                 continue
             rsu = self._rsus[item.rsu_id]
             dx, dy = (estimate.mean[POSITION] - rsu.info.position[:2]).tolist()
             if rsu.cone and not rsu.in_front(dx, dy):
                 across = math.hypot(rsu.axes[0], rsu.axes[1])
-                estimate.cut_off_behind(rsu.info.position[:2], rsu.axes[:2] / across)
+                origin, front = rsu.info.position[:2], rsu.axes[:2] / across
+                estimate.adjust(estimates.cut_off_behind, origin, front)
 
     def learn(
         self, stamp_ns: int, rows: Array, accepted: Sequence[float]
@@ -264,7 +251,7 @@ class PlanarEstimator(Estimator):
         height_m = self._config.device_height_m
         concluded, changes = biases.learn(stamp_ns, fitted, posterior, height_m)
         for change in changes:
-            estimate.change_prior(*change)
+            estimate.adjust(estimates.change_prior, *change)
         self.bias = biases.arrays()
         if not concluded:
             return ()
@@ -312,7 +299,7 @@ class PlanarEstimator(Estimator):
     # smoothing
 
     def keep_posteriors(self) -> None:
-        self.recorder = PosteriorRecorder.of(self._vue_id, self._config, keep=True)
+        self.recorder = PosteriorRecorder(self._vue_id, self._config, keep=True)
 
     def record(self, segment: int) -> tuple[Odometry, ...]:
         estimate = self.estimate

@@ -11,15 +11,26 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
-from netpos.tracking.health_memory import Vote
+from netpos.tracking.observations import Observation
 from netpos.tracking.rsus import Rsu
 
 _APART_M = 1.0
 _WITNESSES = 3  # two ranges leave a mirrored place
 _SLOTS = 3  # to agree in before it is admitted; a guard holds as long
+
+
+@dataclass(slots=True)
+class Vote:
+    """What one device says of one RSU in one slot."""
+
+    entries: list[Observation]
+    ratio: float
+    mean_nis: float
+    witnesses: frozenset[str] = frozenset()
 
 
 def independent(votes: Mapping[str, Vote], names: Iterable[str], rsus: Mapping[str, Rsu]) -> int:

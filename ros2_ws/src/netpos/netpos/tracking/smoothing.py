@@ -91,8 +91,8 @@ class Smoother:
 
     def first(self, window: Sequence[Posterior]) -> Odometry:
         """Odometry of the first posterior given all of ``window``, which is of one segment."""
-        mean, cov = smooth.fixed_lag(*_stacked(window, self._extra_sd))
-        return self._odometry(window[0].stamp_ns, mean, cov)
+        means, covs = smooth.rts(*_stacked(window, self._extra_sd))
+        return self._odometry(window[0].stamp_ns, means[0], covs[0])
 
     def _odometry(self, stamp_ns: int, mean: Array, cov: Array) -> Odometry:
         self._yaw, yaw_var = output.heading(mean, cov, self._yaw, self._heading)
@@ -106,58 +106,35 @@ class Smoother:
         return odometry
 
 
-class FixedLag:
-    """Smooths one device online: what was known of each epoch ``lag_s`` later."""
-
-    def __init__(self, vue_id: str, config: TrackerConfig) -> None:
-        """Raises ``ValueError`` as ``check_smoothable``."""
-        self._smoother = Smoother(vue_id, config)
-        self._lag_ns = int(config.fixed_lag_s * 1e9)
-        self._window: deque[Posterior] = deque()
-
-    def add(self, posterior: Posterior) -> list[Odometry]:
-        """Take a posterior, one that corrects an earlier one of its stamp included; gives the
-        odometry of the epochs that are now older than the lag or the last of their segment."""
-        after = []
-        while self._window and self._window[-1].stamp_ns >= posterior.stamp_ns:
-            after.append(self._window.pop())
-        if after and after[0].stamp_ns == posterior.stamp_ns:
-            after.pop(0)
-        done = []
-        if self._window and self._window[-1].segment != posterior.segment:
-            done = self._smoother.interval(list(self._window))
-            self._window.clear()
-        self._window.append(posterior)
-        while self._window[0].stamp_ns <= posterior.stamp_ns - self._lag_ns:
-            if len(self._window) == 1:
-                break
-            done.append(self._smoother.first(list(self._window)))
-            self._window.popleft()
-        return done
-
-
 class PosteriorRecorder:
     """Keeps the posteriors of one device, for smoothing online, afterwards, or both."""
 
-    def __init__(self, vue_id: str, config: TrackerConfig, *, keep: bool) -> None:
+    def __init__(self, vue_id: str, config: TrackerConfig, *, keep: bool = False) -> None:
         """``keep``: all, for ``smoothed``. Raises ``ValueError`` as ``check_smoothable``."""
         self.posteriors: list[Posterior] = []
         self._keep = keep
         self._smoother = Smoother(vue_id, config)
-        self._fixed_lag = FixedLag(vue_id, config) if config.fixed_lag_s > 0.0 else None
-
-    @classmethod
-    def of(
-        cls, vue_id: str, config: TrackerConfig, *, keep: bool = False
-    ) -> PosteriorRecorder | None:
-        """The recorder that is wanted; None: none."""
-        return cls(vue_id, config, keep=keep) if keep or config.fixed_lag_s > 0.0 else None
+        self._lag_ns = int(config.fixed_lag_s * 1e9)
+        self._window: deque[Posterior] = deque()
 
     def note(self, posterior: Posterior) -> tuple[Odometry, ...]:
-        """Take the posterior of an epoch; odometry of epochs that are now older than the lag."""
+        """Take a posterior, one that corrects an earlier one of its stamp included; with a fixed
+        lag, gives the odometry of the epochs that are now older or the last of their segment."""
         if self._keep:
             self.posteriors.append(posterior)
-        return () if self._fixed_lag is None else tuple(self._fixed_lag.add(posterior))
+        if self._lag_ns == 0:
+            return ()
+        window, done = self._window, []
+        while window and window[-1].stamp_ns >= posterior.stamp_ns:
+            window.pop()
+        if window and window[-1].segment != posterior.segment:
+            done = self._smoother.interval(list(window))
+            window.clear()
+        window.append(posterior)
+        while len(window) > 1 and window[0].stamp_ns <= posterior.stamp_ns - self._lag_ns:
+            done.append(self._smoother.first(list(window)))
+            window.popleft()
+        return tuple(done)
 
     def go_back(self, stamp_ns: int) -> None:
         """Forget the posteriors from ``stamp_ns`` on; the fixed lag replaces its own."""

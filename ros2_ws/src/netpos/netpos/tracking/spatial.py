@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from netpos.estimation.conditioning import Robust
 from netpos.estimation.engine import is_sound
@@ -26,13 +27,32 @@ from netpos.estimation.measurement import (
     VARIANCE,
     Kind,
 )
+from netpos.estimation.position_fix import fix_position, start_of
 from netpos.estimation.protection import protection_level
 from netpos.estimation.rows import put_measurement
 from netpos.estimation.sensors.table import readings
-from netpos.estimation.space import direction_rows, linearise_in_space, place_rows
-from netpos.estimation.space_conditioning import reweight_3d
-from netpos.estimation.state import ERR_BIASES, ERR_CLOCK_DRIFT, NAV_CLOCK_DRIFT, POSITION, Nav
-from netpos.inertial.strapdown import ERR, NAV
+from netpos.estimation.space import (
+    direction_rows,
+    linearise_in_space,
+    place_rows,
+    reweight_3d,
+)
+from netpos.estimation.state import (
+    ERR_ATTITUDE,
+    ERR_BIASES,
+    ERR_CLOCK_DRIFT,
+    ERR_GYRO_BIAS,
+    ERR_POSITION,
+    NAV_CLOCK_DRIFT,
+    NAV_GYRO_BIAS,
+    NAV_POSITION,
+    NAV_QUATERNION,
+    NAV_VELOCITY,
+    POSITION,
+    Err,
+    Nav,
+)
+from netpos.inertial.strapdown import ERR
 from netpos.messages.values import (
     Array,
     Field,
@@ -44,6 +64,7 @@ from netpos.messages.values import (
 from netpos.tracking import output
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import EpochRows, RowForm, Sites, Source
+from netpos.tracking.estimates import UpdateResult
 from netpos.tracking.estimator import (
     RECENT,
     Description,
@@ -51,19 +72,17 @@ from netpos.tracking.estimator import (
     FirstFix,
     Past,
     Recent,
-    UpdateResult,
 )
 from netpos.tracking.initialise import Initialiser
-from netpos.tracking.models import gate_thresholds, robust_options_of
+from netpos.tracking.models import augmented, gate_thresholds, robust_options_of
 from netpos.tracking.rsus import BiasStates, Rsu
-from netpos.tracking.strapdown_engine import compile_kernels
-from netpos.tracking.strapdown_models import augmented_3d, sensors_of, with_clock
-from netpos.tracking.strapdown_output import odometry_of
+from netpos.tracking.strapdown_models import nav_of, sensors_of, with_clock
 from netpos.tracking.strapdown_smoothing import Recorder
-from netpos.tracking.strapdown_start import SampleBuffer, StrapdownStart
+from netpos.tracking.strapdown_start import StrapdownStart
 
 _POSE_VAR_MIN = 1e-4  # an initial pose may leave the height's variance at 0
 _RATE_WINDOW_NS = 50_000_000
+_GYRO_MEAN_S = 0.01  # of one sample of a usual IMU
 _IN_PLANE = [Nav.PX, Nav.PY, Nav.VX, Nav.VY]  # of nav and of its error alike
 _HEIGHT_MAX_M = 1e4  # as ``TrackerConfig.device_height_m``
 _AHEAD = np.array([[1.0, 0.0, 0.0]])
@@ -76,12 +95,17 @@ for _sensor, _reading in readings():
 
 def warm_up(config: TrackerConfig) -> None:
     """Compile, or load, the kernels before the first measurement."""
-    compile_kernels(sensors_of(config))
-    nav, cov = with_clock(config, np.zeros(NAV), np.eye(ERR))
+    nav, cov = with_clock(config, nav_of(np.zeros(3), np.zeros(3), np.eye(4)[3]), np.eye(ERR))
+    memory, sensors = np.zeros(MEMORY), sensors_of(config)
+    imu = Imu(np.array([10_000_000], dtype=np.int64), np.zeros((1, 6)))
+    advance(nav, cov, memory, 0, 10_000_000, imu, sensors)
     rows = place_rows(np.zeros(3), np.eye(3), (0.0, 0.0, 0.0))
     innovations_with_sd_3d(rows, nav, cov)
     if config.robust != "none" or config.nlos_probability > 0.0:
         reweight_3d(nav, cov, rows, robust_options_of(config))
+    correct(nav, cov, rows, np.full(4, np.inf), np.zeros(1))
+    doubt_standstill(memory)
+    fix_position(rows, start_of(rows, 0.0))
 
 
 # rows
@@ -128,6 +152,38 @@ def planar_rows(rows: Array, height_m: float) -> Array:
 # the estimator
 
 
+def odometry_of(
+    stamp_ns: int, vue_id: str, nav: Array, cov: Array, measured: Array | None, gyro_density: float
+) -> Odometry:
+    """Odometry of a navigation state (n + 1,): pose in map, twist in base_link.
+
+    cov : (n, n); measured : (3,) angular velocity in base_link [rad/s], biased, None where
+    there is none; gyro_density : its noise
+    """
+    C = Rotation.from_quat(nav[NAV_QUATERNION]).as_matrix()
+    v = nav[NAV_VELOCITY]
+    rate = np.zeros(3) if measured is None else measured - nav[NAV_GYRO_BIAS]
+    cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    pose = np.r_[ERR_POSITION, ERR_ATTITUDE]
+    J = np.hstack([C.T, C.T @ cross])  # of C' v for errors of velocity and attitude
+    twist_cov = np.zeros((6, 6))
+    moving = slice(Err.VX, Err.ACCEL_BIAS)  # velocity and attitude
+    twist_cov[:3, :3] = J @ cov[moving, moving] @ J.T
+    twist_cov[3:, 3:] = cov[
+        ERR_GYRO_BIAS, ERR_GYRO_BIAS
+    ] + gyro_density**2 / _GYRO_MEAN_S * np.eye(3)
+    return Odometry(
+        stamp_ns=stamp_ns,
+        vue_id=vue_id,
+        position=nav[NAV_POSITION].copy(),
+        quaternion=nav[NAV_QUATERNION].copy(),
+        linear_velocity=C.T @ v,
+        angular_velocity=rate,
+        pose_cov=cov[np.ix_(pose, pose)],
+        twist_cov=(twist_cov + twist_cov.T) / 2.0,
+    )
+
+
 @dataclass(slots=True)
 class StrapdownEstimate:
     """nav (n + 1,), cov (n, n) of its error and the memory (MEMORY,) of ``error_state.advance``
@@ -149,12 +205,10 @@ class SpatialEstimator(Estimator):
     """Estimator of a device that moves in space and has an IMU."""
 
     estimate: StrapdownEstimate | None
-    imu: SampleBuffer
     recorder: Recorder | None = None
 
     def __init__(self, vue_id: str, config: TrackerConfig, rsus: Mapping[str, Rsu]) -> None:
         super().__init__(vue_id, config, rsus, ROWS_3D)
-        self.imu = SampleBuffer()
         self._sensors, self._gyro = sensors_of(config), config.gyro_noise_density
         self._gate = gate_thresholds(config.gate_probability)
         self._robust = robust_options_of(config)
@@ -225,10 +279,10 @@ class SpatialEstimator(Estimator):
         rows = epoch_rows.rows[epoch_rows.rows[:, KIND] != Kind.BODY_VELOCITY]
         rows[:, VARIANCE] += replace(epoch_rows, rows=rows).slow_variance(self.biases)
         self._start.add_rows(stamp_ns, rows, np.array(rsus[0].lever_arm))
-        found = self._start.solve(self.imu)
-        if found is None or found[0] != stamp_ns:
+        start = self._start.solve(self.imu)
+        if start is None or start[0] != stamp_ns:
             return FirstFix(False)
-        nav, cov = with_clock(self._config, *found[1:])
+        nav, cov = with_clock(self._config, *start[1:])
         self.estimate = StrapdownEstimate(stamp_ns, nav, cov, np.zeros(MEMORY))
         self._grow()
         has_clock = self._set_clock(rows)
@@ -264,7 +318,8 @@ class SpatialEstimator(Estimator):
     def _grow(self) -> None:
         """States for all biases heard of."""
         estimate = self._there()
-        estimate.nav, estimate.cov = augmented_3d(estimate.nav, estimate.cov, self.bias[0])
+        sd = self.bias[0]
+        estimate.nav, estimate.cov = augmented(estimate.nav, estimate.cov, sd, ERR_BIASES)
 
     def _sensors_now(self) -> Sensors:
         return self._sensors._replace(slow=self._sensors.slow._replace(biases=self.bias))

@@ -11,7 +11,6 @@ from netpos.estimation.error_state import Constraints, Sensors, SlowErrors
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.estimation.state import (
     ERR_ACCEL_BIAS,
-    ERR_BIASES,
     ERR_GYRO_BIAS,
     ERR_POSITION,
     ERR_VELOCITY,
@@ -70,15 +69,6 @@ def with_clock(config: TrackerConfig, nav: Array, cov: Array) -> tuple[Array, Ar
     c = SPEED_OF_LIGHT_MPS
     sd = np.array([c * config.clock_offset_sd_s, c * config.clock_drift_sd])
     return np.append(nav, [0.0, c * config.clock_drift_mean]), block_diag(cov, np.diag(sd**2))
-
-
-def augmented_3d(nav: Array, cov: Array, sd: Array) -> tuple[Array, Array]:
-    """State with a clock, nav (n + 1,), cov (n, n), and those of the biases of standard deviations
-    ``sd`` (k,), in the order of the states, that it lacks."""
-    new = sd[len(cov) - ERR_BIASES :]
-    if not new.size:
-        return nav, cov
-    return np.append(nav, np.zeros(new.size)), block_diag(cov, np.diag(new**2))
 
 
 def start_sd(

@@ -17,23 +17,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from netpos.estimation.engine import Epochs
 from netpos.estimation.error_state import (
-    MEMORY,
     Chunk,
     Imu,
     Sensors,
     apply_constraints,
-    correct,
-    doubt_standstill,
     predict_chunk,
 )
 from netpos.estimation.factor import factor, solve_factored
-from netpos.estimation.measurement import GROUP
 from netpos.estimation.state import ERR_BIASES
 from netpos.inertial.strapdown import ACCEL_BIAS, ATTITUDE_ERR, QUATERNION, inject
 from netpos.messages.values import Array
-from netpos.tracking.strapdown_models import augmented_3d
+from netpos.tracking.models import augmented
 
 
 @dataclass(slots=True)
@@ -104,10 +99,10 @@ class Recorder:
 
     def smoothed(self) -> list[Instant]:
         """The epochs given all measurements, as new values in the order of stamps."""
-        found: list[Instant] = []
+        epochs: list[Instant] = []
         for instants, bias_sd in zip(self._passages, self._bias_sd, strict=True):
-            found += [i for i in smooth(instants, bias_sd) if i.epoch][::-1]
-        return found
+            epochs += [i for i in smooth(instants, bias_sd) if i.epoch][::-1]
+        return epochs
 
 
 def difference(later: Array, nav: Array) -> Array:
@@ -125,8 +120,8 @@ def _step_back(instant: Instant, later: Instant, nav_s: Array, cov_s: Array, sd:
     """Smooth ``instant`` in place by the smoothed nav_s, cov_s of the ``later`` one."""
     assert later.predicted is not None
     nav_p, cov_p, Phi = later.predicted
-    instant.nav, instant.cov = augmented_3d(
-        instant.nav, instant.cov, sd[: len(cov_p) - ERR_BIASES]
+    instant.nav, instant.cov = augmented(
+        instant.nav, instant.cov, sd[: len(cov_p) - ERR_BIASES], ERR_BIASES
     )
     gain_t = Phi @ instant.cov
     solve_factored(factor(cov_p.copy()), gain_t)
@@ -148,29 +143,3 @@ def smooth(instants: Sequence[Instant], bias_sd: Array) -> Iterator[Instant]:
             _step_back(instant, later, later.nav, later.cov, bias_sd)
         yield instant
         later = instant
-
-
-def smoothed_drive(
-    start_ns: int,
-    nav: Array,
-    cov: Array,
-    imu: Imu,
-    epochs: Epochs,
-    sensors: Sensors,
-    gate_nis: Array,
-) -> tuple[Array, Array]:
-    """``strapdown_engine.drive`` given all measurements: nav (N, n + 1) and cov (N, n, n) of every
-    epoch after ``start_ns``."""
-    recorder, memory, now = Recorder(), np.zeros(MEMORY), start_ns
-    nav, cov = nav.copy(), cov.copy()
-    recorder.begin(start_ns, nav, cov)
-    for i, stamp in enumerate(epochs.stamps_ns.tolist()):
-        recorder.advance(nav, cov, memory, now, stamp, imu, sensors)
-        rows, now = epochs.rows[epochs.row_start[i] : epochs.row_start[i + 1]], stamp
-        if len(rows):
-            _, used = correct(nav, cov, rows, gate_nis, np.zeros(int(rows[-1, GROUP]) + 1))
-            if used == 0:
-                doubt_standstill(memory)
-        recorder.note(nav, cov, None, sensors.slow.biases[0])
-    found = recorder.smoothed()
-    return np.array([i.nav for i in found]), np.array([i.cov for i in found])

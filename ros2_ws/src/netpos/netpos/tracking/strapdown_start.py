@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
 from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from netpos.estimation.chi_square import chi_square_bound
@@ -18,11 +16,11 @@ from netpos.estimation.space import linearise_in_space
 from netpos.estimation.state import NAV_POSITION, Err, Nav
 from netpos.inertial.alignment import fit_course, way_of
 from netpos.inertial.strapdown import ERR, NAV
-from netpos.messages.values import Array, ImuSample
+from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.strapdown_models import nav_of, start_sd
 
-_KEEP_NS = 70_000_000_000
 _WINDOW_NS = 20_000_000_000
 _SPAN_MIN_NS = 3_000_000_000  # shorter, and one bad fix makes a heading the filter cannot mend
 _ATTEMPT_NS = 500_000_000
@@ -31,38 +29,6 @@ _MISFIT_MAX = 4.0
 _TILT_SD = 0.03
 _FALSE_ALARM = 1e-3
 _NS = 1e9
-
-
-class SampleBuffer:
-    """The samples of the last minute, as the strapdown kernels take them."""
-
-    def __init__(self) -> None:
-        self.clear()
-
-    def clear(self) -> None:
-        """Forget all samples."""
-        self._stamps: list[int] = []
-        self._rates: list[tuple[float, ...]] = []
-
-    def add(self, sample: ImuSample) -> str | None:
-        """Take a sample; returns the reason when it is not newer than the last."""
-        stamp = sample.stamp_ns
-        if self._stamps and stamp <= self._stamps[-1]:
-            return "duplicate" if stamp == self._stamps[-1] else "late"
-        self._stamps.append(stamp)
-        rate, force = sample.angular_velocity, sample.specific_force
-        self._rates.append((*rate.tolist(), *force.tolist()))
-        if self._stamps[0] < stamp - 2 * _KEEP_NS:
-            keep = bisect_left(self._stamps, stamp - _KEEP_NS)
-            del self._stamps[:keep], self._rates[:keep]
-        return None
-
-    def between(self, from_ns: int, to_ns: int) -> tuple[NDArray[np.int64], Array]:
-        """Stamps (n,) and rates (n, 6) that cover an interval, with one sample before it."""
-        first = max(bisect_right(self._stamps, from_ns) - 1, 0)
-        last = min(bisect_left(self._stamps, to_ns) + 1, len(self._stamps))
-        stamps = np.array(self._stamps[first:last], dtype=np.int64)
-        return stamps, np.array(self._rates[first:last], dtype=np.float64).reshape(-1, 6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +66,7 @@ class StrapdownStart:
         while self._fixes[0].stamp_ns < stamp_ns - _WINDOW_NS:
             self._fixes.popleft()
 
-    def solve(self, imu: SampleBuffer) -> tuple[int, Array, Array] | None:
+    def solve(self, imu: ImuBuffer) -> tuple[int, Array, Array] | None:
         """Stamp, navigation state (NAV,) and covariance (ERR, ERR) at the newest fix; None while
         they are not known well enough."""
         if len(self._fixes) < 3:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from netpos.estimation.chi_square import chi_square_bound
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.report import level_of
 from netpos.messages.values import (
+    Array,
     InitialPose,
     Odometry,
     RsuErrors,
@@ -22,11 +23,19 @@ from netpos.messages.values import (
     TrackStatus,
 )
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.epoch_rows import EpochRows, Source, mostly_accepted, velocity_inflation
-from netpos.tracking.estimator import RECENT, Estimator, ImuInput, Past, UpdateResult
-from netpos.tracking.fit import fits, observe_excluded, refused_groups, without_excluded
+from netpos.tracking.epoch_rows import (
+    EpochRows,
+    Source,
+    fits,
+    mostly_accepted,
+    refused_groups,
+    velocity_inflation,
+)
+from netpos.tracking.estimates import UpdateResult
+from netpos.tracking.estimator import RECENT, Estimator, Past
 from netpos.tracking.health import RsuHealth
-from netpos.tracking.history import History, merge
+from netpos.tracking.history import History, TrackSnapshot, merge
+from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.models import gate_thresholds
 from netpos.tracking.nlos_rate import NlosRate
 from netpos.tracking.observations import FittedEpoch
@@ -42,7 +51,6 @@ from netpos.tracking.report import (
 from netpos.tracking.rsus import Rsu
 from netpos.tracking.sequencer import Epoch, Item
 from netpos.tracking.shared_errors import SharedErrors
-from netpos.tracking.snapshot import TrackSnapshot
 
 
 class Track:
@@ -62,7 +70,7 @@ class Track:
         self._health = health or RsuHealth()
         self._shared = shared
         self._gate = gate_thresholds(config.gate_probability)
-        self._history: History[TrackSnapshot] = History(int(config.history_s * 1e9))
+        self._history: History = History(int(config.history_s * 1e9))
         self.refused: Counter[str] = Counter()
         """Measurements refused at the door, by reason."""
         self._errors: tuple[RsuErrors, ...] = ()
@@ -79,7 +87,7 @@ class Track:
             state.estimator.set_config(config)
 
     @property
-    def imu(self) -> ImuInput:
+    def imu(self) -> ImuBuffer:
         """Where the samples of the device's IMU go."""
         return self._state.estimator.imu
 
@@ -210,8 +218,8 @@ class Track:
         """What may be fused, and what comes from an excluded RSU and is only looked at."""
         if not self._config.isolate_rsus:
             return items, []
-        used, watched = without_excluded(
-            self._health, stamp_ns, items, lambda item: self._agrees(stamp_ns, item)
+        used, watched = self._health.sort_out(
+            stamp_ns, items, lambda item: self._agrees(stamp_ns, item)
         )
         if watched:
             self._state.rejected["isolated_rsu"] += len(watched)
@@ -229,7 +237,15 @@ class Track:
         if self.has_estimate:
             self._state.estimator.predict(stamp_ns)
             rows, innovations = self._state.estimator.rows_alone(item)
-            observe_excluded(self._health, self._vue_id, stamp_ns, rows, innovations, self._gate)
+            self._hear(stamp_ns, rows, innovations, [fits(innovations, self._gate)])
+
+    def _hear(
+        self, stamp_ns: int, rows: EpochRows, innovations: Array, accepted: Sequence[float]
+    ) -> None:
+        """Tell the health of the RSUs how an epoch fitted."""
+        self._health.hear(
+            FittedEpoch(stamp_ns, self._vue_id, rows.items, rows.rows, innovations, accepted)
+        )
 
     # first fix
 
@@ -254,7 +270,7 @@ class Track:
 
     def _try_first_fix(self, stamp_ns: int, epoch_rows: EpochRows) -> tuple[str, ...]:
         state = self._state
-        if state.pose_wait.at(self._config, stamp_ns, tracked=state.accepted > 0):
+        if state.pose_wait.awaits(self._config, stamp_ns, tracked=state.accepted > 0):
             state.rejected["no_initial_pose"] += len(epoch_rows.items)
             return ()
         fix = state.estimator.first_fix(stamp_ns, epoch_rows)
@@ -317,10 +333,7 @@ class Track:
             scale = state.rsus_scale if of_rsus else state.device_scale
             scale.add(result.nis, result.dof, refused_groups(epoch_rows, accepted, self._gate))
         if self._config.isolate_rsus:
-            items, rows = epoch_rows.items, epoch_rows.rows
-            self._health.hear(
-                FittedEpoch(stamp_ns, self._vue_id, items, rows, result.innovations, accepted)
-            )
+            self._hear(stamp_ns, epoch_rows, result.innovations, accepted)
 
     def _note_accepted(
         self, stamp_ns: int, epoch_rows: EpochRows, result: UpdateResult | None = None

@@ -10,7 +10,8 @@ import pytest
 from engine_cases import opened, start
 from netpos.estimation import engine
 from netpos.estimation.engine import EpochInput
-from netpos.estimation.forms import ekf, srukf
+from netpos.estimation.factor import factor
+from netpos.estimation.forms import ekf
 from netpos.estimation.fusion import predicted_in
 from netpos.estimation.manoeuvre import add_manoeuvre
 from netpos.estimation.measurement import GATE_VARIANCE, VARIANCE
@@ -30,7 +31,7 @@ def test_opening_a_factor_is_opening_its_covariance() -> None:
     options = options_of(config)
     _, cov = start()
     for sd, unheard_s in ((3.0, 0.0), (5.0, 0.1), (5.0, 30.0), (1e-3, 2.0)):
-        L = srukf.factor(cov)
+        L = factor(cov)
         engine.open_velocity(L, sd, unheard_s, options)
         plain = cov.copy()
         engine.open_velocity(plain, sd, unheard_s, options_of(TrackerConfig()))

@@ -37,7 +37,7 @@ def by_srukf(mean: Array, cov: Array, rows: Array, limits: Array, ok: Array) -> 
 
 
 def by_kf(mean: Array, cov: Array, rows: Array, limits: Array, ok: Array) -> tuple[float, int]:
-    return kf.update(mean, cov, rows, 0.0, limits, ok, kf.NO_FLOOR)
+    return kf.update(mean, cov, rows, 0.0, limits, ok, kf.NO_FLOOR, kf.NOTHING)
 
 
 def by_filterpy(

@@ -53,7 +53,9 @@ def test_update_equals_the_information_form(seed: int, row: Maker, random_cov: M
     expected, expected_cov = information_form(mean, cov, slice(None))
     nis_expected = distance(mean, cov, slice(None), gates)
     accepted = np.full(2, 9.0)
-    nis, dof = kf.update(mean, cov, linear(row, gates), 0.0, OPEN, accepted, kf.NO_FLOOR)
+    nis, dof = kf.update(
+        mean, cov, linear(row, gates), 0.0, OPEN, accepted, kf.NO_FLOOR, kf.NOTHING
+    )
     np.testing.assert_allclose(mean, expected, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(cov, expected_cov, rtol=1e-9, atol=1e-12)
     assert (nis, dof) == (pytest.approx(nis_expected, rel=1e-12), 4)
@@ -69,7 +71,9 @@ def test_groups_pass_or_fall_whole(row: Maker, random_cov: Maker) -> None:
     limit = min(first, second) * (1.0 + 1e-9)
     mean, cov, accepted = prior.copy(), prior_cov.copy(), np.full(2, 9.0)
     gate_nis = np.array([0.0, 0.0, limit])
-    nis, dof = kf.update(mean, cov, linear(row, gates), 0.0, gate_nis, accepted, kf.NO_FLOOR)
+    nis, dof = kf.update(
+        mean, cov, linear(row, gates), 0.0, gate_nis, accepted, kf.NO_FLOOR, kf.NOTHING
+    )
     assert (nis, dof) == (pytest.approx(min(first, second), rel=1e-12), 2)
     assert accepted.tolist() == [float(first < second), float(second < first)]
     expected, expected_cov = information_form(prior, prior_cov, small)
@@ -77,7 +81,9 @@ def test_groups_pass_or_fall_whole(row: Maker, random_cov: Maker) -> None:
     np.testing.assert_allclose(cov, expected_cov, rtol=1e-9, atol=1e-12)
     gate_nis[2] = limit * (1.0 - 2e-9)
     mean, cov = prior.copy(), prior_cov.copy()
-    result = kf.update(mean, cov, linear(row, gates), 0.0, gate_nis, accepted, kf.NO_FLOOR)
+    result = kf.update(
+        mean, cov, linear(row, gates), 0.0, gate_nis, accepted, kf.NO_FLOOR, kf.NOTHING
+    )
     assert result == (0.0, 0)
     assert accepted.tolist() == [0.0, 0.0]
     assert (mean == prior).all()
@@ -90,7 +96,7 @@ def test_other_rows_are_rejected_with_their_group(row: Maker) -> None:
     rows[1] = row(Kind.AZIMUTH, 0.1, 1.0, 0, origin=(9.0, 0.0, 0.0))
     mean, cov, accepted = np.zeros(6), np.eye(6), np.full(2, 9.0)
     expected, expected_cov = information_form(mean, cov, slice(2, 4))
-    assert kf.update(mean, cov, rows, 0.0, OPEN, accepted, kf.NO_FLOOR)[1] == 2
+    assert kf.update(mean, cov, rows, 0.0, OPEN, accepted, kf.NO_FLOOR, kf.NOTHING)[1] == 2
     assert accepted.tolist() == [0.0, 1.0]
     np.testing.assert_allclose(mean, expected, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(cov, expected_cov, rtol=1e-9, atol=1e-12)
@@ -107,7 +113,7 @@ def test_floor_under_the_gain(axis: int, scale: float, row: Maker, random_cov: M
     h[axis] = scale
     mean, start = np.zeros(8), cov.copy()
     rows = np.array([row(Kind.LINEAR, 2.0 * scale, scale**2, h=h)])
-    kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), floor)
+    kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), floor, kf.NOTHING)
     K = start[:, axis] / (start[axis, axis] + 1.0)
     K[axis], K[6 + axis] = 0.3, 0.1
     A = np.eye(8)
@@ -116,7 +122,7 @@ def test_floor_under_the_gain(axis: int, scale: float, row: Maker, random_cov: M
     np.testing.assert_allclose(cov, A @ start @ A.T + np.outer(K, K), rtol=1e-9, atol=1e-14)
     floor = np.array([0.0, 0.25, 0.0])
     mean, cov = np.zeros(8), start.copy()
-    kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), floor)
+    kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), floor, kf.NOTHING)
     assert mean[axis + 2] == pytest.approx(0.5, rel=1e-12)
     assert mean[axis] == pytest.approx(2.0 * start[axis, axis] / (start[axis, axis] + 1.0))
 
@@ -130,7 +136,7 @@ def test_floor_is_compared_with_the_gain_per_metre(
     mean, cov, gain = np.zeros(6), 4.0 * np.eye(6), 4.0 / (4.0 + 9.0)
     rows = np.array([row(Kind.LINEAR, 2.0 * scale, 9.0 * scale**2, h=scale * np.eye(6)[0])])
     floor = np.array([share * gain, 0.0, 0.0])
-    kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), floor)
+    kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), floor, kf.NOTHING)
     assert mean[X.PX] == pytest.approx(2.0 * gain * (share if raised else 1.0), rel=1e-12)
 
 
@@ -140,11 +146,11 @@ def test_floor_needs_one_position_alone(row: Maker) -> None:
     for h in ([0, 0, 1, 0, 0, 0], [1, 1, 0, 0, 0, 0], [1, 0, 0, 0, 1, 0], [0.0] * 6):
         mean, cov = np.zeros(8), 1e-6 * np.eye(8)
         rows = np.array([row(Kind.LINEAR, 1.0, 1.0, h=h)])
-        kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), floor)
+        kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), floor, kf.NOTHING)
         assert np.abs(mean).max() < 2e-6
     mean, cov = np.zeros(6), 1e-6 * np.eye(6)
     rows = np.array([row(Kind.LINEAR, 1.0, 1.0, h=[1, 0, 0, 0, 0, 0])])
-    kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), floor)
+    kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), floor, kf.NOTHING)
     np.testing.assert_allclose(mean, [0.5, 0, 0.5, 0, 0, 0], rtol=1e-9, atol=1e-12)
 
 
@@ -164,7 +170,7 @@ def test_dvornikovs_filter(row: Maker) -> None:
             ekf.predict(mean, cov, 0.5, motion, NO_BIAS)
         prior = mean.copy()
         rows = np.array([row(Kind.LINEAR, value, 100.0, h=h)])
-        kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), kf.DVORNIKOV_FLOOR)
+        kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), kf.DVORNIKOV_FLOOR, kf.NOTHING)
         gains.append((mean - prior)[[0, 2, 6]] / (value - prior[0]))
         errors.append(mean[X.PX] - truth)
     assert gains[0][0] == pytest.approx(1000.0 / 1100.0)
@@ -175,7 +181,7 @@ def test_dvornikovs_filter(row: Maker) -> None:
 def test_an_epoch_without_rows(row: Maker) -> None:
     mean, P = np.arange(6.0), 2.0 * np.eye(6)
     rows = np.array([row(Kind.RANGE, 1.0, 1.0)])[:0]
-    assert kf.update(mean, P, rows, 0.0, OPEN, np.zeros(0), kf.NO_FLOOR) == (0.0, 0)
+    assert kf.update(mean, P, rows, 0.0, OPEN, np.zeros(0), kf.NO_FLOOR, kf.NOTHING) == (0.0, 0)
     assert mean.tolist() == [0, 1, 2, 3, 4, 5]
     assert (2.0 * np.eye(6) == P).all()
 
@@ -191,7 +197,7 @@ def test_no_variance_turns_negative(gain_floor: Array, row: Maker) -> None:
             h = rng.normal(size=6)
             h[1 if rng.random() < 0.3 else 6 :] = 0.0
             rows = np.array([row(Kind.LINEAR, 1.0, 1e-10, h=h)])
-            kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), gain_floor)
+            kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), gain_floor, kf.NOTHING)
             assert (np.diag(cov) > 0.0).all()
             assert (cov == cov.T).all()
         assert np.isfinite(mean).all()
@@ -211,7 +217,7 @@ def test_own_share_is_what_the_noise_alone_makes(
         for value, variance in zip(noise, variances, strict=True):
             h = np.eye(6)[0]
             rows = np.array([row(Kind.LINEAR, value, variance, 0, h=h, gate_variance=variance)])
-            kf.update_shared(mean, cov, rows, 0.0, OPEN, np.zeros(1), gain_floor, own)
+            kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), gain_floor, own)
         shares.append(own)
         covs.append(cov)
         return mean
@@ -226,5 +232,5 @@ def test_own_share_is_what_the_noise_alone_makes(
     for variance in variances:
         h = np.eye(6)[0]
         rows = np.array([row(Kind.LINEAR, 0.0, variance, 0, h=h, gate_variance=variance)])
-        kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), gain_floor)
+        kf.update(mean, cov, rows, 0.0, OPEN, np.zeros(1), gain_floor, kf.NOTHING)
     np.testing.assert_array_equal(cov, covs[0])

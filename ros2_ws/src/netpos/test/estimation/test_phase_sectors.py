@@ -239,7 +239,7 @@ def test_a_wrong_sector_that_is_sure_of_itself_gives_way() -> None:
     wrong = np.hypot(*walk.start) * np.array([sine, math.sqrt(1 - sine**2)])
     mean = np.array([*wrong, *walk.velocity, 0.0, 0.0])
     cov = np.diag([0.1, 0.1, 0.2, 0.2, 1.0, 1.0]) ** 2
-    estimate = estimates.start(TrackerConfig(**CONFIG), T0, mean, cov)
+    estimate = estimates.Estimate(TrackerConfig(**CONFIG), T0, mean, cov)
     for k in range(40):
         rows = rows_at(walk, k, 0.05)
         estimate.step(T0 + k * DT_NS, 0.1, 0, rows, NO_BIAS)

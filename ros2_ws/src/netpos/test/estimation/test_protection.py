@@ -11,6 +11,7 @@ from engine_cases import opened
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from netpos.estimation.engine import FilterOptions
+from netpos.estimation.fit import innovations_with_sd
 from netpos.estimation.manoeuvre import detection_delay_s
 from netpos.estimation.measurement import (
     GROUP,
@@ -38,7 +39,6 @@ from netpos.estimation.rows import linear_rows, rsu_axes, rsu_rows
 from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking import TrackerConfig, estimates
-from netpos.tracking.fit import innovations_with_sd
 from netpos.tracking.models import options_of
 from scipy import integrate, optimize, stats
 
@@ -133,29 +133,21 @@ def test_monotone_in_covariance_and_risk(
     assert protection_level(wider, risk) >= level * (1 - 1e-7)
 
 
-def test_inflation_is_a_factor() -> None:
-    cov = rotated(2.0, 1.0, 0.3)
-    assert protection_level(cov, 1e-4, 1.7) == pytest.approx(1.7 * protection_level(cov, 1e-4))
-    assert protection_level(cov, 1e-4, 1.7) == pytest.approx(protection_level(1.7**2 * cov, 1e-4))
-
-
 @pytest.mark.parametrize(
-    ("cov", "risk", "inflation", "text"),
+    ("cov", "risk", "text"),
     [
-        (np.diag([1.0, -1.0]), 1e-4, 1.0, "cov2"),
-        (np.array([[1.0, 2.0], [2.0, 1.0]]), 1e-4, 1.0, "cov2"),
-        (np.diag([1.0, np.nan]), 1e-4, 1.0, "cov2"),
-        (np.diag([1.0, np.inf]), 1e-4, 1.0, "cov2"),
-        (np.eye(2), 0.0, 1.0, "risk"),
-        (np.eye(2), 0.6, 1.0, "risk"),
-        (np.eye(2), math.nan, 1.0, "risk"),
-        (np.eye(2), 1e-4, 0.99, "inflation"),
-        (np.eye(2), 1e-4, math.nan, "inflation"),
+        (np.diag([1.0, -1.0]), 1e-4, "cov2"),
+        (np.array([[1.0, 2.0], [2.0, 1.0]]), 1e-4, "cov2"),
+        (np.diag([1.0, np.nan]), 1e-4, "cov2"),
+        (np.diag([1.0, np.inf]), 1e-4, "cov2"),
+        (np.eye(2), 0.0, "risk"),
+        (np.eye(2), 0.6, "risk"),
+        (np.eye(2), math.nan, "risk"),
     ],
 )
-def test_unsound_input_is_refused(cov: Array, risk: float, inflation: float, text: str) -> None:
+def test_unsound_input_is_refused(cov: Array, risk: float, text: str) -> None:
     with pytest.raises(ValueError, match=text):
-        protection_level(cov, risk, inflation)
+        protection_level(cov, risk)
 
 
 # manoeuvres
@@ -314,7 +306,7 @@ def test_an_epoch_tells_its_innovations_and_the_level_of_a_manoeuvre(speed: floa
     rows = np.vstack([azimuth_row(-50.0, 0.0, 0.05, prior), azimuth_row(9.0, -80.0, 0.02, prior)])
     rows[:, GROUP] = 0, 1
     config = TrackerConfig(filter="ekf", manoeuvre_speed_sd_mps=speed, integrity_risk=1e-4)
-    estimate, said = estimates.start(config, 0, prior, cov), options_of(config)
+    estimate, said = estimates.Estimate(config, 0, prior, cov), options_of(config)
     step = estimate.step(0, 0.0, 0, rows.copy(), NO_BIAS)
     fits = innovations_with_sd(prior, cov, rows, said.height_m)
     np.testing.assert_allclose(step.innovations, fits, rtol=1e-12)
@@ -330,7 +322,7 @@ def test_nothing_is_told_of_what_is_not_sound(where: str) -> None:
     else:
         cov[X.PY, X.PX] = cov[X.PX, X.PY] = 2.0
     row = azimuth_row(-50.0, 0.0, 0.05, np.zeros(6))
-    estimate = estimates.start(TrackerConfig(filter="ekf"), 0, mean, cov)
+    estimate = estimates.Estimate(TrackerConfig(filter="ekf"), 0, mean, cov)
     assert math.isnan(estimate.step(0, 0.0, 0, row, NO_BIAS).undetected_m)
 
 

@@ -92,9 +92,9 @@ def test_smoother_equals_batch_least_squares(row: Maker, random_cov: Maker) -> N
     assert (means == kept).all()
     assert (covs == kept_covs).all()
     window = slice(4, 13)
-    mean, cov = smooth.fixed_lag(dts[4:], means[window], covs[window], MOTION[None], BIAS)
-    np.testing.assert_allclose(mean, expected[4], rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(cov, expected_covs[4], rtol=1e-9, atol=1e-9)
+    lagged, lagged_covs = smooth.rts(dts[4:], means[window], covs[window], MOTION[None], BIAS)
+    np.testing.assert_allclose(lagged[0], expected[4], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(lagged_covs[0], expected_covs[4], rtol=1e-9, atol=1e-9)
 
 
 def test_smoother_equals_filterpys(row: Maker, random_cov: Maker) -> None:

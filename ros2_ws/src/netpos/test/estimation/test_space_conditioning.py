@@ -16,7 +16,7 @@ from netpos.estimation.measurement import (
     Kind,
 )
 from netpos.estimation.predicted import predicted_rows
-from netpos.estimation.space_conditioning import reweight_3d
+from netpos.estimation.space import reweight_3d
 from netpos.estimation.state import ERR_BIASES, Err, Nav, X
 from netpos.inertial.strapdown import NAV
 from netpos.messages.values import Array

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from netpos.estimation.engine import scratch
+from netpos.estimation.factor import factor
 from netpos.estimation.forms import ekf, srukf
 from netpos.estimation.measurement import BIAS, COMMON, KIND, Kind, curvature_variance
 from netpos.estimation.measurement import predict_row as predict
@@ -88,13 +89,13 @@ def test_both_filters_find_the_factor_and_the_offset(row: Any) -> None:
     cov = np.diag([1.0, 1.0, 1e-10, 1e-10, 1.0, 1.0, 0.01, 0.01])
     sd = 0.05
     rows, accepted = step_rows(u, sd), np.zeros(1)
-    factor, around = srukf.factor(cov), mean.copy()
+    L, around = factor(cov), mean.copy()
     work = scratch(8, 2)[0]
     for _ in range(100):
         ekf.update(mean, cov, rows, 0.0, NO_GATE, 8, accepted, work)
-        srukf.update(around, factor, rows, 0.0, NO_GATE, accepted)
+        srukf.update(around, L, rows, 0.0, NO_GATE, accepted)
     limit = sd / 10 / math.hypot(*u)
-    for x, P in ((mean, cov), (around, srukf.covariance(factor))):
+    for x, P in ((mean, cov), (around, L @ L.T)):
         np.testing.assert_allclose(x[6:], [k, a], atol=1e-3)
         expected = 1 / math.sqrt(1 / limit**2 + 100)
         np.testing.assert_allclose(np.sqrt(np.diag(P)[6:]), expected, rtol=0.02)

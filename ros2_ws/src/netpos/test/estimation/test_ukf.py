@@ -1,17 +1,27 @@
-"""The compiled unscented filter against the textbook's sums, written out in NumPy."""
+"""The compiled unscented filter, by factors and by covariances, against the textbook's sums in
+NumPy, exact arithmetic and petukhov's down-dates."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from fractions import Fraction
 
 import numpy as np
 import pytest
 from netpos.estimation import sigma
-from netpos.estimation.forms import ukf
+from netpos.estimation.forms import srukf, ukf
 from netpos.estimation.measurement import BIAS, KIND, ORIGIN, VALUE, Kind
-from netpos.estimation.motion import NO_BIAS, Model, motion_parameters, noise, propagate
-from netpos.estimation.state import X
+from netpos.estimation.motion import (
+    NO_BIAS,
+    Model,
+    Parameter,
+    ProcessNoise,
+    motion_parameters,
+    noise,
+    propagate,
+)
+from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array
 
 Maker = Callable[..., Array]
@@ -29,6 +39,10 @@ def textbook_points(mean: Array, cov: Array) -> tuple[Array, Array, Array]:
     cov_weights = mean_weights.copy()
     cov_weights[0] += 1.0 - 1.0 + 2.0
     return points, mean_weights, cov_weights
+
+
+def is_lower_factor(L: Array) -> bool:
+    return bool((np.triu(L, 1) == 0.0).all() and (np.diag(L) >= 0.0).all())
 
 
 def value_of(row: Array, x: Array) -> float:
@@ -86,9 +100,13 @@ def test_update_equals_the_textbook(n: int, seed: int, row: Maker, random_cov: M
     mean, cov, rows = rng.normal(size=n), random_cov(rng, n, 1e-5), epoch(row)
     expected_mean, expected_cov = textbook_update(mean, cov, rows)
     innovation, S, _ = textbook_moments(mean, cov, rows)
+    by_factor, L = mean.copy(), np.linalg.cholesky(cov)
     nis, dof = ukf.update(mean, cov, rows, HEIGHT, OPEN, np.zeros(2))
-    np.testing.assert_allclose(mean, expected_mean, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(cov, expected_cov, rtol=0, atol=1e-15)
+    assert srukf.update(by_factor, L, rows, HEIGHT, OPEN, np.zeros(2)) == (nis, dof)
+    assert is_lower_factor(L)
+    for state, P in ((mean, cov), (by_factor, L @ L.T)):
+        np.testing.assert_allclose(state, expected_mean, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(P, expected_cov, rtol=0, atol=1e-15)
     gate_S = S + np.diag([0.001, 3.0, 0.003, 5.0])
     assert dof == 4
     assert nis == pytest.approx(innovation @ np.linalg.solve(gate_S, innovation), rel=1e-9)
@@ -108,24 +126,36 @@ def test_update_with_wide_prior_equals_the_textbook(
     assert (cov == cov.T).all()
 
 
-@pytest.mark.parametrize("model", [Model.CONSTANT_VELOCITY, Model.CONSTANT_TURN])
-def test_predict_equals_the_textbook(model: Model, random_cov: Maker) -> None:
-    rng = np.random.default_rng(3)
-    motion = motion_parameters(model=model, accel=1.0, turn_rate=0.1, drift_density=0.2)
-    bias = np.array([[2.0], [30.0]])
-    n = 7 + int(motion[2])
-    mean, cov, dt = rng.normal(size=n) * 3.0, random_cov(rng, n), 0.7
+def textbook_predict(
+    mean: Array, cov: Array, dt: float, motion: Array, bias: Array
+) -> tuple[Array, Array]:
     points, wm, wc = textbook_points(mean, cov)
     for point in points:
         propagate(point, dt, motion, bias)
-    expected = wm @ points
-    Q = np.empty((n, n))
-    noise(expected, dt, motion, bias, Q)
-    expected_cov = (points - expected).T @ np.diag(wc) @ (points - expected) + Q
+    moved, Q = wm @ points, np.empty_like(cov)
+    noise(moved, dt, motion, bias, Q)
+    return moved, (points - moved).T @ np.diag(wc) @ (points - moved) + Q
+
+
+@pytest.mark.parametrize("kind", list(ProcessNoise))
+@pytest.mark.parametrize("model", [Model.CONSTANT_VELOCITY, Model.CONSTANT_TURN])
+def test_predict_equals_the_textbook(model: Model, kind: ProcessNoise, random_cov: Maker) -> None:
+    rng = np.random.default_rng(3)
+    motion = motion_parameters(
+        model, kind, accel=1.0, velocity_step=0.3, drift_step=0.1, turn_rate=0.1, drift_density=0.2
+    )
+    bias = np.array([[2.0], [30.0]])
+    n = 7 + int(motion[Parameter.EXTRAS])
+    mean, cov, dt = rng.normal(size=n) * 3.0, random_cov(rng, n), 0.7
+    by_factor, L = mean.copy(), np.linalg.cholesky(cov)
+    expected, expected_cov = textbook_predict(mean, cov, dt, motion, bias)
     ukf.predict(mean, cov, dt, motion, bias)
-    np.testing.assert_allclose(mean, expected, rtol=1e-11, atol=1e-11)
-    np.testing.assert_allclose(cov, expected_cov, rtol=1e-10, atol=1e-10)
+    srukf.predict(by_factor, L, dt, motion, bias)
     assert (cov == cov.T).all()
+    assert is_lower_factor(L)
+    for state, P in ((mean, cov), (by_factor, L @ L.T)):
+        np.testing.assert_allclose(state, expected, rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(P, expected_cov, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("dt", [0.0, -1.0])
@@ -222,7 +252,7 @@ def test_what_is_known_exactly_stays(row: Maker) -> None:
 
 
 def test_ill_conditioned_covariance_stays_definite(row: Maker) -> None:
-    """P - K S K' turns negative here; the Joseph form does not."""
+    """P - K S K' turns negative here; a product of factors does not."""
     mean, cov = np.zeros(6), np.diag([1e10, 1e10, 1.0, 1.0, 1e10, 1.0])
     cov[X.PX, X.PY] = cov[X.PY, X.PX] = 1e10 * (1 - 1e-9)
     rows = np.array(
@@ -245,3 +275,82 @@ def test_an_epoch_without_rows(row: Maker) -> None:
     assert ukf.update(mean, P, rows, 0.0, OPEN, np.zeros(0)) == (0.0, 0)
     assert mean.tolist() == [0, 1, 2, 3, 4, 5]
     assert (2.0 * np.eye(6) == P).all()
+
+
+def test_update_equals_petukhovs_down_dates(row: Maker, random_cov: Maker) -> None:
+    """petukhov:eq.26 with the factor of S it omits: P less the squares of the columns of K S_y."""
+    rng = np.random.default_rng(3)
+    mean, rows = rng.normal(size=7), epoch(row)
+    L = np.linalg.cholesky(random_cov(rng, 7))
+    _, G, E = sigma.regress(mean, L, rows, 1.5)
+    S_factor = np.linalg.cholesky(G @ G.T + E @ E.T + np.diag(rows[:, 2]))
+    K_S = L @ G.T @ np.linalg.inv(S_factor).T
+    down = np.linalg.cholesky(L @ L.T - K_S @ K_S.T)
+    srukf.update(mean, L, rows, 1.5, OPEN, np.zeros(2))
+    np.testing.assert_allclose(L, down, rtol=1e-9, atol=1e-12)
+
+
+def exact_posterior(cov: Array, rows: list[tuple[Array, float]]) -> list[list[Fraction]]:
+    """Covariance of a linear update in rational arithmetic, row by row."""
+    P = [[Fraction(value) for value in line] for line in cov.tolist()]
+    n = len(P)
+    for h_float, r in rows:
+        h = [Fraction(value) for value in h_float.tolist()]
+        Ph = [sum(P[i][j] * h[j] for j in range(n)) for i in range(n)]
+        s = sum(h[i] * Ph[i] for i in range(n)) + Fraction(r)
+        P = [[P[i][j] - Ph[i] * Ph[j] / s for j in range(n)] for i in range(n)]
+    return P
+
+
+def test_digits_where_the_plain_filter_has_none(row: Maker) -> None:
+    """Variances 1e10 are measured to 1e-10, then a second row sees their difference. The factor is
+    right to 1e-6; P - K S K', and the Joseph form, have lost everything."""
+    prior = np.diag([1e5, 1e5, 1.0, 1.0, 1e5, 1e-5])
+    prior[1, 0] = 3e4
+    h = [
+        np.array([1.0, 0, 0, 0, 0, 0]),
+        np.array([1.0, 1, 0, 0, 0, 0]),
+        np.array([0, 1.0, 0, 0, 1, 0]),
+    ]
+    rows = np.array([row(Kind.LINEAR, 0.0, 1e-10, 0, h=h_row) for h_row in h])
+    exact = exact_posterior(prior @ prior.T, [(h_row, 1e-10) for h_row in h])
+    sd = np.array([math.sqrt(exact[i][i]) for i in range(6)])
+    expected = np.array([[float(value) for value in line] for line in exact]) / np.outer(sd, sd)
+    L = prior.copy()
+    srukf.update(np.zeros(6), L, rows, 0.0, OPEN, np.zeros(1))
+    scaled = L / sd[:, None]
+    np.testing.assert_allclose(scaled @ scaled.T, expected, rtol=1e-9, atol=1e-6)
+    assert np.linalg.eigvalsh(scaled @ scaled.T).min() > 0.0
+    P, H = prior @ prior.T, np.array(h)
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + 1e-10 * np.eye(3))
+    plain = P - K @ (H @ P @ H.T + 1e-10 * np.eye(3)) @ K.T
+    assert np.linalg.eigvalsh(plain).min() < -1e-9
+    assert np.abs(plain / np.outer(sd, sd) - expected).max() > 1.0
+
+
+def test_ten_thousand_steps(row: Maker) -> None:
+    """The factor and the textbook drift apart by rounding only, and the factor keeps its shape."""
+    rng = np.random.default_rng(9)
+    motion = motion_parameters(noise=ProcessNoise.WHITE_ACCELERATION, accel=0.5, drift_step=1e-3)
+    truth = np.array([0.0, 0.0, 1.0, 0.5, 20.0, 0.0])
+    mean, cov = truth + rng.normal(size=6), np.diag([25.0, 25, 4, 4, 100, 1])
+    other, L, accepted = mean.copy(), np.sqrt(cov), np.zeros(2)
+    rows = epoch(row)
+    rows[3, 4] = -1.0
+    sd = np.sqrt(rows[:, 2])
+    for step in range(10_000):
+        angle = step * 2e-3
+        p = 40.0 * np.array([math.cos(angle), math.sin(angle)])
+        for i in (0, 2):
+            d = np.array([*p, 1.5]) - rows[i, 7:10]
+            rows[i, 1] = math.atan2(d[1], d[0]) + sd[i] * rng.normal()
+            rows[i + 1, 1] = math.sqrt(d @ d) + 20.0 * (i == 0) + sd[i + 1] * rng.normal()
+        mean, cov = textbook_predict(mean, cov, 0.1, motion, NO_BIAS)
+        srukf.predict(other, L, 0.1, motion, NO_BIAS)
+        mean, cov = textbook_update(mean, cov, rows)
+        srukf.update(other, L, rows, 1.5, OPEN, accepted)
+    np.testing.assert_allclose(other, mean, rtol=1e-9, atol=1e-8)
+    np.testing.assert_allclose(L @ L.T, cov, rtol=1e-9, atol=1e-8)
+    assert is_lower_factor(L)
+    assert (np.diag(L) > 1e-4).all()
+    assert np.hypot(*(mean[POSITION] - p)) < 2.0

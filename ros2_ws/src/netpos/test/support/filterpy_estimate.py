@@ -8,12 +8,12 @@ import copy
 import filterpy_reference as reference
 import numpy as np
 from netpos.estimation import engine
+from netpos.estimation.fit import innovations_with_sd
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.motion import Parameter, add_velocity_step
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.estimates import Step
-from netpos.tracking.fit import innovations_with_sd
+from netpos.tracking.estimates import UpdateResult
 from netpos.tracking.models import augmented, initial_extra_sd, motions_of, options_of
 
 
@@ -23,20 +23,16 @@ class FilterpyEstimate:
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
         self.stamp_ns = stamp_ns
         self._options = options_of(config)
-        self._motion: Array = motions_of(config)[0].copy()
+        self.motion: Array = motions_of(config)[0].copy()
         self._predict = getattr(reference, f"{config.filter}_predict")
         self._update = getattr(reference, f"{config.filter}_update")
         self.mean, self.cov = augmented(mean, cov, initial_extra_sd(config))
         self.prior = (self.mean, self.cov)
 
-    @property
-    def motion(self) -> Array:
-        return self._motion
-
     def set_imu_increment(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
-        self._motion[Parameter.YAW_INCREMENT] = yaw_rad
-        self._motion[Parameter.SPEED_INCREMENT] = speed_mps
-        self._motion[Parameter.GYRO] = gyro_density
+        self.motion[Parameter.YAW_INCREMENT] = yaw_rad
+        self.motion[Parameter.SPEED_INCREMENT] = speed_mps
+        self.motion[Parameter.GYRO] = gyro_density
 
     @property
     def modes(self) -> tuple[TrackMode, ...]:
@@ -48,20 +44,17 @@ class FilterpyEstimate:
     def augment(self, sd: Array) -> None:
         self.mean, self.cov = augmented(self.mean, self.cov, sd)
 
-    def change_prior(self, index: int, before: float, after: float) -> None:
-        raise NotImplementedError
-
     def predict(self, stamp_ns: int, bias: Array) -> None:
         dt = (stamp_ns - self.stamp_ns) * 1e-9
         if dt > 0.0:
-            self._motion[Parameter.VELOCITY_STEP_SD] = 0.0
+            self.motion[Parameter.VELOCITY_STEP_SD] = 0.0
             self.mean, self.cov = self.mean.copy(), self.cov.copy()
-            self._predict(self.mean, self.cov, dt, self._motion, bias)
+            self._predict(self.mean, self.cov, dt, self.motion, bias)
             self.stamp_ns = stamp_ns
 
     def step(
         self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
-    ) -> Step:
+    ) -> UpdateResult:
         self.predict(stamp_ns, bias)
         self.prior = self.mean, self.cov
         mean, cov = self.mean.copy(), self.cov.copy()
@@ -74,10 +67,10 @@ class FilterpyEstimate:
         nis, used = self._update(mean, cov, rows, height_m, gate, accepted)
         if used:
             self.mean, self.cov = mean, cov
-            engine.set_velocity_step_noise(self._motion, sd, unheard_s, 0.0, 0.0)
-        return Step(nis, used, accepted, innovations, 0.0)
+            engine.set_velocity_step_noise(self.motion, sd, unheard_s, 0.0, 0.0)
+        return UpdateResult(nis, used, accepted.tolist(), innovations)
 
     def copy(self) -> FilterpyEstimate:
         twin = copy.copy(self)
-        twin._motion = self._motion.copy()
+        twin.motion = self.motion.copy()
         return twin

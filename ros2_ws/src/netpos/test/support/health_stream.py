@@ -7,7 +7,10 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
+from netpos.estimation.measurement import KIND, ROW_WIDTH, Kind
+from netpos.messages.values import RsuMeasurement
 from netpos.tracking.health import HealthConfig, RsuHealth
+from netpos.tracking.observations import FittedEpoch
 
 GATE = 18.42  # chi2.ppf(0.9999, 2)
 SD = {"azimuth": math.radians(1.5), "toa": 0.6, "range": 0.5}
@@ -26,6 +29,24 @@ def liar(start: float, stop: float = math.inf, **errors: float) -> Behaviour:
 
 def ns(t: float) -> int:
     return round(t * 1e9)
+
+
+def observe(
+    health: RsuHealth,
+    rsu_id: str,
+    vue_id: str,
+    stamp_ns: int,
+    accepted: bool,
+    innovations: Mapping[str, tuple[float, float]],
+) -> None:
+    """Have ``health`` hear of one measurement; innovation and sd by name of a ``Kind``. Without
+    any it is a position."""
+    kinds = [Kind[name.upper()] for name in innovations] or [Kind.LINEAR]
+    rows = np.zeros((len(kinds), ROW_WIDTH))
+    rows[:, KIND] = kinds
+    fits = np.array(list(innovations.values()) or [(0.0, 1.0)])
+    item = RsuMeasurement(stamp_ns=stamp_ns, rsu_id=rsu_id, vue_id=vue_id)
+    health.hear(FittedEpoch(stamp_ns, vue_id, (item,), rows, fits, [float(accepted)]))
 
 
 class Stream:
@@ -58,7 +79,7 @@ class Stream:
             for kind in self.kinds
         }
         accepted = sum((v / sd) ** 2 for v, sd in values.values()) <= GATE
-        self.health.observe(name, vue, ns(t), accepted, values)
+        observe(self.health, name, vue, ns(t), accepted, values)
 
 
 def isolated(health: RsuHealth, t: float, names: Iterable[str] = "abcdef") -> set[str]:

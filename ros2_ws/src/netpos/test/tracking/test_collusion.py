@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from health_stream import observe
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement, TrackState
 from netpos.tracking import Tracker, TrackerConfig
 from netpos.tracking.health import RsuHealth, RsuReport, RsuState
@@ -156,7 +157,7 @@ def test_names_at_one_place_are_one_witness(apart_m: float, excluded: bool) -> N
         for name in sites:
             fits = name.startswith("m")
             pair = (0.1 if fits else 30.0, 0.3)
-            health.observe(name, "vue_1", T0 + k * S // 10, fits, {"range": pair})
+            observe(health, name, "vue_1", T0 + k * S // 10, fits, {"range": pair})
     end_ns = T0 + 20 * S
     assert [health.excluded(name, end_ns) for name in "ab"] == [excluded] * 2
     assert not any(health.excluded(f"m{k}", end_ns) for k in range(5))

@@ -91,8 +91,8 @@ def test_filterpy_says_the_same(
     slow = {"range_bias_sd_m": 0.3, "bias_correlation_time_s": 30.0}
     world.rsus = {n: replace(info, **slow) for n, info in world.rsus.items()}
     found = {}
-    for algebra, start in (("ours", estimates.start), ("filterpy", FilterpyEstimate)):
-        monkeypatch.setattr(estimates, "start", start)
+    for algebra, start in (("ours", estimates.Estimate), ("filterpy", FilterpyEstimate)):
+        monkeypatch.setattr(estimates, "Estimate", start)
         world.rng = np.random.default_rng(8)
         tracker = world.tracker(
             filter=name,
@@ -147,7 +147,7 @@ KINDS: dict[str, dict[str, Any]] = {
 def started(name: str) -> estimates.Estimate:
     cov = np.diag([1.0, 1.0, 4.0, 4.0, 9.0, 1.0])
     mean = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
-    return estimates.start(TrackerConfig(**KINDS[name]), T0, mean, cov)
+    return estimates.Estimate(TrackerConfig(**KINDS[name]), T0, mean, cov)
 
 
 def fix(x: float, y: float) -> Array:
@@ -213,7 +213,7 @@ def test_step_keeps_the_prediction_and_what_it_accepted(name: str) -> None:
     far = np.vstack([fix(4.0, 6.0), fix(900.0, 6.0)])
     far[2:, 6] = 1
     step = estimate.step(T0 + 10**9, 1.0, 0, far, NO_BIAS)
-    assert step.accepted.tolist() == [1.0, 0.0]
+    assert step.accepted == [1.0, 0.0]
     assert step.dof == 2
     assert 0.0 <= step.nis < 1.0
     np.testing.assert_allclose(estimate.prior[0], ahead.mean, rtol=1e-12, atol=1e-15)
@@ -225,7 +225,7 @@ def test_step_keeps_the_prediction_and_what_it_accepted(name: str) -> None:
     # nothing accepted: the prediction it is
     refused = started(name)
     step = refused.step(T0 + 10**9, 1.0, 0, fix(900.0, 6.0), NO_BIAS)
-    assert (step.dof, step.accepted.tolist()) == (0, [0.0])
+    assert (step.dof, step.accepted) == (0, [0.0])
     np.testing.assert_allclose(refused.mean, ahead.mean, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(refused.cov, ahead.cov, rtol=1e-12, atol=1e-15)
 
@@ -236,10 +236,10 @@ def test_many_rows_need_no_warning() -> None:
     rows = np.vstack([fix(1.0, 2.0) for _ in range(30)])
     rows[:, 6] = np.repeat(np.arange(30), 2)
     step = estimate.step(T0, 0.0, 0, rows, NO_BIAS)
-    assert (step.dof, step.accepted.sum()) == (60, 30)
+    assert (step.dof, sum(step.accepted)) == (60, 30)
     assert estimate.cov[X.PX, X.PX] == pytest.approx(1.0 / (1.0 + 30 / 0.25))
     step = estimate.step(T0, 0.0, 0, fix(1.0, 2.0), NO_BIAS)
-    assert (step.dof, step.accepted.tolist()) == (2, [1.0])
+    assert (step.dof, step.accepted) == (2, [1.0])
 
 
 @pytest.mark.parametrize(
@@ -261,7 +261,7 @@ def test_interacting_models_in_one_kernel_are_the_same(name: str) -> None:
     config = TrackerConfig(filter=name, motion_model="interacting", robust="huber")
     cov = np.diag([1.0, 1.0, 4.0, 4.0, 9.0, 1.0])
     mean = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
-    estimate = estimates.start(config, T0, mean, cov)
+    estimate = estimates.Estimate(config, T0, mean, cov)
     times = np.array([0.0, 0.1, 0.2, 0.3, 1.9, 2.0])
     stamps = T0 + np.round(times * 1e9).astype(np.int64)
     rows = [fix(1.0 + 3.0 * t + 500.0 * (t == 0.2), 2.0 + 4.0 * t) for t in times]
@@ -279,7 +279,7 @@ def test_interacting_models_in_one_kernel_are_the_same(name: str) -> None:
     for k, stamp in enumerate(stamps.tolist()):
         part = rows[k].copy()
         step = estimate.step(stamp, (stamp - heard) * 1e-9, rejected, part, NO_BIAS)
-        heard, rejected = (stamp, 0) if step.accepted.any() else (heard, rejected + 1)
+        heard, rejected = (stamp, 0) if any(step.accepted) else (heard, rejected + 1)
         assert (run.nis[k], run.dof[k], run.undetected_m[k]) == (
             step.nis,
             step.dof,

@@ -17,6 +17,7 @@ from health_stream import (
     isolated,
     liar,
     ns,
+    observe,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -169,7 +170,7 @@ def test_a_track_led_astray_is_no_witness(size: float, found: bool) -> None:
     for k in range(200):
         for name in "abc":
             values = {"azimuth": (size * (-1) ** k, 1.0), "toa": (size, 1.0)}
-            health.observe(name, "v", ns(k / 10), name != "b", values)
+            observe(health, name, "v", ns(k / 10), name != "b", values)
     assert isolated(health, 20) == ({"b"} if found else set())
 
 
@@ -253,7 +254,7 @@ def test_somebody_is_always_trusted(data: Any, rsu_count: int, vue_count: int) -
                 if what != "n":
                     active[slot].add(name)
                     for k in range(3):
-                        health.observe(name, f"v{v}", ns(slot + 0.3 * k), what == "a", {})
+                        observe(health, name, f"v{v}", ns(slot + 0.3 * k), what == "a", {})
         now = isolated(health, slot + 1, names)
         if now:
             assert len(set(names) - now) >= 2

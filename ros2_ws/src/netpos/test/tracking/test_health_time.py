@@ -13,6 +13,7 @@ from health_stream import (
     isolated,
     liar,
     ns,
+    observe,
 )
 from netpos.tracking.health import RsuHealth
 
@@ -70,9 +71,9 @@ def test_order_of_arrival_does_not_matter() -> None:
         for i in order:
             t, name, accepted, values = records[i]
             if wrong_first:
-                health.observe(name, "v", ns(t), not accepted, {"range": (99.0, 1.0)})
+                observe(health, name, "v", ns(t), not accepted, {"range": (99.0, 1.0)})
                 health.rewind("w", 0)
-            health.observe(name, "v", ns(t), accepted, values)
+            observe(health, name, "v", ns(t), accepted, values)
             seen.add((t, health.excluded("b", ns(t))))
         health.excluded("a", ns(60))
         return [sorted(seen), *health.reports(ns(45))]
@@ -89,7 +90,7 @@ def test_rewind_drops_one_device_from_a_stamp_on() -> None:
     health = RsuHealth()
     for vue in "vw":
         for k in range(20):
-            health.observe("a", vue, ns(k / 10), True, {})
+            observe(health, "a", vue, ns(k / 10), True, {})
     health.rewind("v", ns(0.75))
     health.excluded("a", ns(10))
     assert health.report("a", ns(10)).measurements == 8 + 20
@@ -97,9 +98,9 @@ def test_rewind_drops_one_device_from_a_stamp_on() -> None:
 
 def test_too_late_is_counted() -> None:
     health = RsuHealth()
-    health.observe("a", "v", ns(10.0), True, {})
-    health.observe("a", "v", ns(7.999), False, {})
-    health.observe("a", "v", ns(8.0), False, {})
+    observe(health, "a", "v", ns(10.0), True, {})
+    observe(health, "a", "v", ns(7.999), False, {})
+    observe(health, "a", "v", ns(8.0), False, {})
     health.excluded("a", ns(20))
     report = health.report("a", ns(20))
     assert (report.late, report.measurements, report.accept_ratio) == (1, 2, 0.5)

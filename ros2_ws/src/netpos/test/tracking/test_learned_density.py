@@ -115,7 +115,7 @@ def test_one_kernel_and_the_track_learn_the_same() -> None:
     config, way = TrackerConfig(), vehicle(70.0)
     epochs = epochs_of(way)
     run = compiled(config, epochs, way)
-    estimate = estimates.start(config, T0, *pose_state(config, way[0], np.eye(2)))
+    estimate = estimates.Estimate(config, T0, *pose_state(config, way[0], np.eye(2)))
     for k, stamp in enumerate(epochs.stamps_ns.tolist()):
         rows = epochs.rows[2 * k : 2 * k + 2].copy()
         estimate.step(stamp, DT if k else 0.0, 0, rows, NO_BIAS)
@@ -128,7 +128,7 @@ def test_one_kernel_and_the_track_learn_the_same() -> None:
 def test_a_copy_learns_for_itself() -> None:
     epochs = epochs_of(forklift(20.0))
     config = TrackerConfig()
-    estimate = estimates.start(config, T0, *pose_state(config, np.zeros(2), 100 * np.eye(2)))
+    estimate = estimates.Estimate(config, T0, *pose_state(config, np.zeros(2), 100 * np.eye(2)))
 
     def onward(one: estimates.Estimate, first: int, end: int) -> float:
         for k in range(first, end):
@@ -154,7 +154,7 @@ def test_a_copy_learns_for_itself() -> None:
 def test_others_hold_theirs(settings: dict[str, object], density: float) -> None:
     config = TrackerConfig(**settings)  # type: ignore[arg-type]
     assert not config.learns_density
-    estimate = estimates.start(config, T0, *pose_state(config, np.zeros(2), np.eye(2)))
+    estimate = estimates.Estimate(config, T0, *pose_state(config, np.zeros(2), np.eye(2)))
     epochs = epochs_of(forklift(5.0))
     for k in range(50):
         rows = epochs.rows[2 * k : 2 * k + 2].copy()
@@ -165,7 +165,7 @@ def test_others_hold_theirs(settings: dict[str, object], density: float) -> None
 
 def test_a_declared_density_holds_from_the_next_epoch_on() -> None:
     config = TrackerConfig()
-    estimate = estimates.start(config, T0, *pose_state(config, np.zeros(2), np.eye(2)))
+    estimate = estimates.Estimate(config, T0, *pose_state(config, np.zeros(2), np.eye(2)))
     estimate.predict(T0 + 10**8, NO_BIAS)
     assert estimate.motion[Parameter.ACCEL] == pytest.approx(START)
     estimate.set_config(replace(config, accel_density_mps2_sqrthz=0.7))
@@ -178,7 +178,7 @@ def test_a_declared_density_holds_from_the_next_epoch_on() -> None:
 
 def test_steps_say_more_up_to_the_next_epoch() -> None:
     config = TrackerConfig()
-    estimate = estimates.start(config, T0, *pose_state(config, np.zeros(2), np.eye(2)))
+    estimate = estimates.Estimate(config, T0, *pose_state(config, np.zeros(2), np.eye(2)))
     estimate.set_process_noise(0.05)
     estimate.predict(T0 + 10**8, NO_BIAS)
     assert estimate.motion[Parameter.ACCEL] == 0.05

@@ -10,7 +10,7 @@ import pytest
 from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array, Odometry, RsuMeasurement
 from netpos.tracking import Tracker, TrackerConfig
-from netpos.tracking.smoothing import FixedLag, Posterior, Smoother
+from netpos.tracking.smoothing import Posterior, PosteriorRecorder, Smoother
 from scipy.stats import chi2
 
 STEP_S = 0.1
@@ -145,8 +145,8 @@ def test_fixed_lag_gives_each_epoch_once_and_a_long_lag_is_the_interval(world: A
 
     smoother = Smoother("vue_1", TrackerConfig(**config()))
     whole = smoother.interval(posteriors)
-    lag = FixedLag("vue_1", TrackerConfig(**config(fixed_lag_s=14.0)))
-    late = [o for p in posteriors for o in lag.add(p)]
+    lag = PosteriorRecorder("vue_1", TrackerConfig(**config(fixed_lag_s=14.0)))
+    late = [o for p in posteriors for o in lag.note(p)]
     window = [p for p in posteriors if p.stamp_ns - posteriors[0].stamp_ns <= 14_000_000_000]
     np.testing.assert_allclose(late[0].position, smoother.interval(window)[0].position, atol=1e-9)
     assert abs(late[0].position[0] - whole[0].position[0]) < 0.05

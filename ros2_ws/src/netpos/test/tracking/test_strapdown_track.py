@@ -27,7 +27,7 @@ from netpos.messages.values import (
 )
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking import Tracker, TrackerConfig, TrackOutput
-from netpos.tracking.strapdown_output import odometry_of
+from netpos.tracking.spatial import odometry_of
 from scipy.spatial.transform import Rotation
 
 NS = 1_000_000_000

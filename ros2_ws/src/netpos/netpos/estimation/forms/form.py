@@ -50,7 +50,7 @@ class FilterForm:
     write_cov: Kernel | None = None
     write_cov_or_sqrt: Kernel | None = None
     update_shared: Kernel | None = None
-    """``kf.update_shared`` of a linear form, which can say what of a covariance its own rows made;
+    """``kf.update`` of a linear form, which can say what of a covariance its own rows made;
     None: the form is not linear."""
     summary: str = ""
     """What the parameter's description says beside the name."""

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from netpos.estimation.engine import FilterOptions
 
 NO_FLOOR = np.zeros(3)
+NOTHING = np.empty((0, 0))
 # Position, velocity [1/s], acceleration [1/s^2]: dvornikov2017, section on the simulation.
 DVORNIKOV_FLOOR = np.array([0.0926, 0.008, 0.0003])
 
@@ -36,6 +37,7 @@ def update(
     gate_nis: Array,
     accepted: Array,
     gain_floor: Array,
+    own: Array,
 ) -> tuple[float, int]:
     """One epoch, in place: gate each group as a whole and all together, fuse what passed row by
     row.
@@ -48,28 +50,12 @@ def update(
     accepted : (groups,), filled with 0 or 1
     gain_floor : (3,) smallest gain from a position to the position, velocity and acceleration of
         its axis, per metre; 0: none. The third is for CONSTANT_ACCELERATION only.
+    own : (n, n), or ``NOTHING``: the part of ``cov`` that the noise of these rows and those before
+        made. What else is in ``cov`` comes from the motion and the start, which others who watch
+        the same object share.
 
     Returns the NIS of the accepted rows together, with their gate variances, and their number.
     """
-    own = np.empty((0, 0))
-    nis, used = update_shared(mean, cov, rows, height_m, gate_nis, accepted, gain_floor, own)
-    return nis, used
-
-
-@kernel
-def update_shared(
-    mean: Array,
-    cov: Array,
-    rows: Array,
-    height_m: float,
-    gate_nis: Array,
-    accepted: Array,
-    gain_floor: Array,
-    own: Array,
-) -> tuple[float, int]:
-    """``update`` that also carries ``own`` (n, n), or (0, 0): the part of ``cov`` that the noise
-    of these rows and those before made. What else is in ``cov`` comes from the motion and the
-    start, which others who watch the same object share."""
     predicted = predicted_rows(mean, cov, rows, height_m)
     nis, used = _update_predicted(mean, cov, rows, predicted, gate_nis, accepted, gain_floor, own)
     return nis, used
@@ -86,7 +72,7 @@ def _update_predicted(
     gain_floor: Array,
     own: Array,
 ) -> tuple[float, int]:
-    """``update_shared`` with the rows ``predicted``."""
+    """``update`` with the rows ``predicted``."""
     m, n = rows.shape[0], mean.size
     innovation, H = predicted.innovation[:m].copy(), predicted.H[:, :n].copy()
     S = H @ predicted.HP[:, :n].copy().T
@@ -104,22 +90,6 @@ def _update_predicted(
         residual = innovation[i] - np.dot(H[i], mean - start)
         fuse_row(mean, cov, residual, H[i], rows[i, VARIANCE], gain_floor, own)
     return nis, index.size
-
-
-@kernel
-def _update_in(
-    mean: Array,
-    cov: Array,
-    rows: Array,
-    gate_nis: Array,
-    accepted: Array,
-    gain_floor: Array,
-    work: Array,
-) -> tuple[float, int]:
-    """``update`` with rows that are predicted in the workspace."""
-    predicted, own = predicted_in(work, mean.size, rows.shape[0]), np.empty((0, 0))
-    nis, used = _update_predicted(mean, cov, rows, predicted, gate_nis, accepted, gain_floor, own)
-    return nis, used
 
 
 @kernel
@@ -182,7 +152,9 @@ def _update_form(
     accepted: Array,
     work: Array,
 ) -> tuple[float, int]:
-    nis, used = _update_in(mean, cov, rows, gate_nis, accepted, options.of_form, work)
+    predicted = predicted_in(work, mean.size, rows.shape[0])
+    floor, own = options.of_form, work[:0]
+    nis, used = _update_predicted(mean, cov, rows, predicted, gate_nis, accepted, floor, own)
     return nis, used
 
 
@@ -190,7 +162,7 @@ FORM = FilterForm(
     name="kf",
     predict=ekf.predict,
     update=_update_form,
-    update_shared=update_shared,
+    update_shared=update,
     summary="linear: position fixes and velocities only",
     parameters={
         "position_gain_min": real(

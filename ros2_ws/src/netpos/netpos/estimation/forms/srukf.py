@@ -1,8 +1,8 @@
 """Square-root unscented Kalman filter: carries the lower factor L of P = L L'. In place.
 
-The same filter as ``ukf``, with twice its digits: nothing is ever squared, so variances 1e20 apart
-live side by side. Prediction is a QR decomposition of the weighted deviations and the noise's
-factor by rotations (one Cholesky up-date per deviation: petukhov:eq.22). The update rotates
+Nothing is ever squared, so variances 1e20 apart live side by side. Prediction is a QR
+decomposition of the weighted deviations and the noise's factor by rotations (one Cholesky up-date
+per deviation: petukhov:eq.22). The update rotates
 
     [ chol(E E' + R)   G ]      [ chol(S)             0  ]
     [ 0                L ]  to  [ L G' chol(S)^-T     L+ ]
@@ -32,26 +32,11 @@ from netpos.messages.values import Array
 if TYPE_CHECKING:
     from netpos.estimation.engine import FilterOptions
 
-__all__ = ["cholesky_update", "covariance", "factor", "predict", "update"]
-
 
 @kernel
-def covariance(L: Array) -> Array:
-    """P = L L' of its factor (n, n)."""
-    return L @ L.T
-
-
-@kernel
-def cholesky_update(L: Array, x: Array, sign: float) -> bool:
-    """Factor of L L' + sign x x' in place of ``L`` (n, n), for sign 1 or -1; ``x`` (n,) is used
-    up.
-
-    False, and L as it was, where the down-dated matrix would not be positive definite.
-    """
-    if sign < 0.0:
-        return bool(_down_date(L, x))
-    _up_date(L, x)
-    return True
+def write_cov(L: Array, cov: Array) -> None:
+    """Write P = L L' of a factor (n, n) to ``cov`` (n, n)."""
+    cov[:] = L @ L.T
 
 
 @leaf
@@ -70,30 +55,6 @@ def _up_date(L: Array, x: Array) -> None:
             x[i] = c * x[i] - s * below
 
 
-@kernel
-def _down_date(L: Array, x: Array) -> bool:
-    """The rotations that lift x = L p out of L: LINPACK's dchdd."""
-    n = x.size
-    rest = 1.0
-    for k in range(n):
-        for j in range(k):
-            x[k] -= L[k, j] * x[j]
-        if L[k, k] > 0.0:
-            x[k] /= L[k, k]
-            rest -= x[k] * x[k]
-        elif x[k] != 0.0:
-            return False
-    if rest <= 0.0:
-        return False
-    top = math.sqrt(rest)
-    lifted = np.zeros(n)
-    for k in range(n - 1, -1, -1):
-        length = math.hypot(top, x[k])
-        _rotate(lifted, L[:, k], k, top / length, x[k] / length)
-        top = length
-    return True
-
-
 @inlined
 def _rotate(first: Array, second: Array, start: int, c: float, s: float) -> None:
     """Rotate two columns from entry ``start`` on."""
@@ -105,7 +66,12 @@ def _rotate(first: Array, second: Array, start: int, c: float, s: float) -> None
 
 @kernel
 def predict(mean: Array, L: Array, dt: float, motion: Array, bias: Array) -> None:
-    """Move mean (n,) and factor ``L`` (n, n) by ``dt`` seconds; as ``ukf.predict``."""
+    """Move mean (n,) and factor ``L`` (n, n) by ``dt`` seconds through the sigma points: petukhov:
+    eq.19-22. Nothing happens for dt <= 0.
+
+    motion : of ``motion_parameters``
+    bias : (2, k) stationary sd and time constant of each bias state
+    """
     if dt <= 0.0:
         return
     D = move(mean, L, dt, motion, bias)
@@ -120,7 +86,16 @@ def predict(mean: Array, L: Array, dt: float, motion: Array, bias: Array) -> Non
 def update(
     mean: Array, L: Array, rows: Array, height_m: float, gate_nis: Array, accepted: Array
 ) -> tuple[float, int]:
-    """One epoch, in place; as ``ukf.update`` with the factor ``L`` (n, n) for cov."""
+    """One epoch of mean (n,) and factor ``L`` (n, n), in place: sigma points redrawn from the
+    prediction, each group of rows gated as a whole and all together, one joint update with what
+    passed. Nothing changes where nothing passes.
+
+    rows : (m, ROW_WIDTH), rows of a group adjacent
+    gate_nis : (d + 1,) largest accepted squared Mahalanobis distance for d degrees of freedom
+    accepted : (groups,), filled with 0 or 1
+
+    Returns the NIS of the accepted rows together, with their gate variances, and their number.
+    """
     innovation, G, E = regress(mean, L, rows, height_m)
     S = innovation_cov(G, E, rows[:, GATE_VARIANCE].copy())
     gate_groups(rows, innovation, S, gate_nis, accepted)
@@ -184,11 +159,6 @@ def add_velocity_step(sd: float, time_s: float, position_sd: float, L: Array) ->
 
 
 @kernel
-def _write_cov(L: Array, cov: Array) -> None:
-    cov[:] = covariance(L)
-
-
-@kernel
 def _write_factor(cov: Array, L: Array) -> None:
     L[:] = factor(cov)
 
@@ -212,7 +182,7 @@ FORM = FilterForm(
     predict=predict,
     update=_update_form,
     add_velocity_step=add_velocity_step,
-    write_cov=_write_cov,
+    write_cov=write_cov,
     write_cov_or_sqrt=_write_factor,
     summary="square root",
 )

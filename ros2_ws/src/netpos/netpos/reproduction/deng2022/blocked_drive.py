@@ -20,11 +20,11 @@ from netpos.evaluation.metrics import NS
 from netpos.evaluation.pairing import Mask
 from netpos.messages.values import Array, RsuInfo
 from netpos.radio.noise import generator
+from netpos.reproduction.deng2022.drives import Drive, Fixes, drive, fix_each
 from netpos.reproduction.rows import RowTemplates, observation_rows
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.models import gate_thresholds
-from netpos.tracking.strapdown_engine import Drive, Fixes, drive, fix_each
 from netpos.tracking.strapdown_models import nav_of, sensors_of, start_sd, with_clock
 
 VUE = "vue_1"

@@ -33,11 +33,10 @@ from netpos.reproduction.deng2022.blocked_drive import (
     started,
     with_silence_ends,
 )
+from netpos.reproduction.deng2022.drives import Drive, drive, smoothed_drive
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking.models import gate_thresholds
-from netpos.tracking.strapdown_engine import Drive, drive
 from netpos.tracking.strapdown_models import nav_of, sensors_of, start_sd
-from netpos.tracking.strapdown_smoothing import smoothed_drive
 
 BOUND_RUNS = 20
 """The bound depends on who hears the vehicle alone: it hardly varies."""

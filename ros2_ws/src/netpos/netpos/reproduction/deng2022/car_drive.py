@@ -30,15 +30,16 @@ from netpos.reproduction.deng2022.blocked_drive import (
     loose_epochs,
     ned,
 )
+from netpos.reproduction.deng2022.drives import Drive, drive, fix_each
 from netpos.reproduction.deng2022.tally import Tally, added, is_lost, tally_errors
 from netpos.reproduction.rows import RowTemplates, observation_rows
 from netpos.scenario.along_path import FIELDS
 from netpos.scenario.recorded_drive import VUE, station_drive
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.models import gate_thresholds
-from netpos.tracking.strapdown_engine import Drive, drive, fix_each
 from netpos.tracking.strapdown_models import sensors_of
-from netpos.tracking.strapdown_start import SampleBuffer, StrapdownStart
+from netpos.tracking.strapdown_start import StrapdownStart
 
 RECORDING = "car_imu_rtk"
 SEEDS = 20
@@ -88,7 +89,7 @@ def recording() -> Recording | None:
 
 def _aligned(drive: CarDrive, config: TrackerConfig) -> Start:
     """Coarse alignment from rest, by RTK."""
-    start, samples = StrapdownStart(config), SampleBuffer()
+    start, samples = StrapdownStart(config), ImuBuffer()
     pending = iter(imu_samples(drive, VUE))
     cov, lever = np.diag(np.square(RTK_SD_M)), np.array(MOUNT.lever_arm_m)
     for stamp, position in zip(drive.rtk_ns.tolist(), drive.antenna, strict=True):

@@ -16,8 +16,8 @@ from netpos.evaluation.consistency import MeanTest, nees, nees_over_runs
 from netpos.evaluation.work import Work
 from netpos.messages.values import Array
 from netpos.reproduction.deng2022.blocked_drive import Case, Run, ned, run
+from netpos.reproduction.deng2022.drives import Drive, Fixes
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.strapdown_engine import Drive, Fixes
 
 LARGE_ERROR_M = 5.0
 NEES_STATES = (3, 9, 1)

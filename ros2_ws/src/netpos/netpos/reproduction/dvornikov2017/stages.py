@@ -25,9 +25,9 @@ from netpos.radio.noise import generator
 from netpos.reproduction.dvornikov2017.truth import START_NS
 from netpos.scenario.networks import fix_errors
 from netpos.scenario.schema import NS
-from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.epoch_rows import epoch_rows_of
+from netpos.tracking.estimates import Estimate
 from netpos.tracking.models import dynamics_of, options_of
 from netpos.tracking.networks.common_instant import TRACK_STATES, at_common_instant, step_matrices
 from netpos.tracking.networks.secondary import OwnNoise, Secondary
@@ -144,7 +144,7 @@ class Pass:
         """(n, 6, 6) what the fixes' own noise makes of the covariances."""
         config = replace(self._setting.tracker, network="any")
         secondary = Secondary(VUE, config)
-        estimate = estimates.start(config, START_NS, np.zeros(6), np.eye(6))
+        estimate = Estimate(config, START_NS, np.zeros(6), np.eye(6))
         estimate.cov[:] = self._start_cov
         rows = position_rows(np.zeros((self.stamps_ns.size, 2)), self._sd)
         noise: OwnNoise | None = None

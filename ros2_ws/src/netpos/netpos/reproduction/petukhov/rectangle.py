@@ -33,7 +33,6 @@ from netpos.reproduction.petukhov.waist_chain import Settings, config_of
 from netpos.reproduction.rows import RowTemplates, observation_rows
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.schema import RectangleRoute
-from netpos.tracking import estimates
 from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimates import Estimate
@@ -173,7 +172,7 @@ def _moved(config: TrackerConfig, estimate: Estimate, rows: Array) -> Estimate:
     velocity, velocity_cov = mean[moving].copy(), cov[moving, moving].copy()
     init_hypothesis(mean, cov, rows[0], phase, turns + (1 if turns <= 0 else -1), speed, height_m)
     mean[moving], cov[moving, moving] = velocity, velocity_cov
-    return estimates.start(config, estimate.stamp_ns, mean, cov)
+    return Estimate(config, estimate.stamp_ns, mean, cov)
 
 
 def _alone(rows: Array) -> Array:

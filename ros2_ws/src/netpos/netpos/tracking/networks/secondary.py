@@ -3,7 +3,7 @@
 Trackers of several networks that follow one object share its motion and may share their start, but
 not the noise of their measurements. A linear filter's covariance is therefore a sum, own + shared,
 and both parts go through the same gains: (I - K h) P (I - K h)' + K r K' for the own one, without
-the last term for the other, true for any gain (``kf.update_shared``).
+the last term for the other, true for any gain (``kf.update``).
 """
 
 from __future__ import annotations

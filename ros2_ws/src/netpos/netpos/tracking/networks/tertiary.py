@@ -58,16 +58,6 @@ class Device:
     places: tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fused:
-    """One device at one instant: mean (6,), cov (6, 6) and the tracks in it."""
-
-    vue_id: str
-    mean: Array
-    cov: Array
-    members: tuple[NetworkTrack, ...]
-
-
 @dataclass(slots=True)
 class _Entry:
     """The newest track of one source."""
@@ -192,26 +182,17 @@ class TrackFusion:
         )
 
     def _apply(self, epochs: list[Epoch]) -> list[TrackOutput]:
-        return [
-            self._output(epoch.stamp_ns, fused)
-            for epoch in epochs
-            for fused in self.fuse_epoch(
-                epoch.stamp_ns, [cast(NetworkTrack, item) for item in epoch.sorted()]
-            )
-        ]
-
-    def fuse_epoch(self, stamp_ns: int, reports: Sequence[NetworkTrack]) -> list[Fused]:
-        """All devices of which one of the ``reports``, all of ``stamp_ns``, speaks."""
-        moved, devices = self.put_together(stamp_ns, reports)
-        spoken = {report.source for report in reports}
-        fused = []
-        for device in devices:
-            if any(track.source in spoken for track in device.members):
-                mean, cov = self._fuse(moved, device.places)
-                fused.append(
-                    Fused(vue_id=device.vue_id, mean=mean, cov=cov, members=device.members)
-                )
-        return fused
+        """All devices of which a track of an epoch speaks, fused."""
+        outputs = []
+        for epoch in epochs:
+            reports = [cast(NetworkTrack, item) for item in epoch.sorted()]
+            moved, devices = self.put_together(epoch.stamp_ns, reports)
+            spoken = {report.source for report in reports}
+            for device in devices:
+                if any(track.source in spoken for track in device.members):
+                    mean, cov = self._fuse(moved, device.places)
+                    outputs.append(self._output(epoch.stamp_ns, device, mean, cov))
+        return outputs
 
     def put_together(
         self, stamp_ns: int, reports: Sequence[NetworkTrack]
@@ -294,26 +275,24 @@ class TrackFusion:
             cov, own = pair.cov, pair.own
         return mean, cov
 
-    def _output(self, stamp_ns: int, fused: Fused) -> TrackOutput:
-        last_yaw = self._yaw.get(fused.vue_id, 0.0)
-        yaw, yaw_var = output.heading(fused.mean, fused.cov, last_yaw)
-        self._yaw[fused.vue_id] = yaw
-        height_m = fused.members[0].height_m
-        odometry = output.odometry(
-            stamp_ns, fused.vue_id, fused.mean, fused.cov, height_m, yaw, yaw_var
-        )
-        sources = [member.source for member in fused.members]
+    def _output(self, stamp_ns: int, device: Device, mean: Array, cov: Array) -> TrackOutput:
+        last_yaw = self._yaw.get(device.vue_id, 0.0)
+        yaw, yaw_var = output.heading(mean, cov, last_yaw)
+        self._yaw[device.vue_id] = yaw
+        height_m = device.members[0].height_m
+        odometry = output.odometry(stamp_ns, device.vue_id, mean, cov, height_m, yaw, yaw_var)
+        sources = [member.source for member in device.members]
         status = TrackStatus(
             stamp_ns=stamp_ns,
-            vue_id=fused.vue_id,
+            vue_id=device.vue_id,
             state=TrackState.TRACKING,
             used=len(sources),
             accepted=sum(self._entries[source].accepted for source in sources),
             rejected=self.rejected(),
             sources=tuple(sources),
-            position_sd_m=output.largest_sd(fused.cov),
+            position_sd_m=output.largest_sd(cov),
             protection_level_m=protection_level(
-                fused.cov[POSITION, POSITION], self._config.integrity_risk, 1.0
+                cov[POSITION, POSITION], self._config.integrity_risk
             ),
         )
         return TrackOutput(odometry, None, status)

@@ -31,9 +31,9 @@ from netpos.reproduction.deng2022.blocked_drive import (
     Run,
     run,
 )
+from netpos.reproduction.deng2022.drives import Drive, drive
 from netpos.reproduction.deng2022.tally import Tally, tally_seeds
 from netpos.tracking.models import gate_thresholds
-from netpos.tracking.strapdown_engine import Drive, drive
 from netpos.tracking.strapdown_models import sensors_of
 from scipy.spatial.transform import Rotation
 

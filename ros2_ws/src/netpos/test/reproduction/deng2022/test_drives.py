@@ -10,7 +10,7 @@ from netpos.estimation.engine import Epochs
 from netpos.estimation.position_fix import FixStatus
 from netpos.estimation.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
-from netpos.tracking.strapdown_engine import fix_each
+from netpos.reproduction.deng2022.drives import fix_each
 from scipy.optimize import least_squares
 
 RANGE_SD_M = 0.5

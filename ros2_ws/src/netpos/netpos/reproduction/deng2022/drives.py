@@ -1,4 +1,4 @@
-"""Whole drives at once, compiled: what the strapdown track does epoch by epoch."""
+"""Whole drives at once: what the strapdown track does epoch by epoch, and fixes of every epoch."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ from netpos.estimation.error_state import (
 )
 from netpos.estimation.measurement import GROUP, KIND, ORIGIN, ROW_WIDTH, VALUE, VARIANCE, Kind
 from netpos.estimation.position_fix import fix_position, start_of
-from netpos.estimation.state import Nav
-from netpos.inertial.strapdown import ERR, NAV
 from netpos.messages.values import Array
+from netpos.tracking.strapdown_smoothing import Recorder
 
 Ints = NDArray[np.int64]
 _PLACE = int(Kind.PLACE)
@@ -95,15 +94,27 @@ def fix_each(epochs: Epochs, height_m: float, height_sd_m: float) -> Fixes:
     return Fixes(position, cov, status)
 
 
-def compile_kernels(sensors: Sensors) -> None:
-    """Compile, or load, what a track calls epoch by epoch, before its first measurement."""
-    nav, cov, memory = np.zeros(NAV), np.eye(ERR), np.zeros(MEMORY)
-    nav[Nav.QW] = 1.0
-    imu = Imu(np.array([10_000_000], dtype=np.int64), np.zeros((1, 6)))
-    advance(nav, cov, memory, 0, 10_000_000, imu, sensors)
-    rows = np.zeros((3, ROW_WIDTH))
-    rows[:, KIND], rows[:, VARIANCE] = _PLACE, 1.0
-    rows[:, ORIGIN : ORIGIN + 3] = np.eye(3)
-    correct(nav, cov, rows, np.full(4, np.inf), np.zeros(1))
-    doubt_standstill(memory)
-    fix_position(rows, start_of(rows, 0.0))
+def smoothed_drive(
+    start_ns: int,
+    nav: Array,
+    cov: Array,
+    imu: Imu,
+    epochs: Epochs,
+    sensors: Sensors,
+    gate_nis: Array,
+) -> tuple[Array, Array]:
+    """``drive`` given all measurements: nav (N, n + 1) and cov (N, n, n) of every
+    epoch after ``start_ns``."""
+    recorder, memory, now = Recorder(), np.zeros(MEMORY), start_ns
+    nav, cov = nav.copy(), cov.copy()
+    recorder.begin(start_ns, nav, cov)
+    for i, stamp in enumerate(epochs.stamps_ns.tolist()):
+        recorder.advance(nav, cov, memory, now, stamp, imu, sensors)
+        rows, now = epochs.rows[epochs.row_start[i] : epochs.row_start[i + 1]], stamp
+        if len(rows):
+            _, used = correct(nav, cov, rows, gate_nis, np.zeros(int(rows[-1, GROUP]) + 1))
+            if used == 0:
+                doubt_standstill(memory)
+        recorder.note(nav, cov, None, sensors.slow.biases[0])
+    found = recorder.smoothed()
+    return np.array([i.nav for i in found]), np.array([i.cov for i in found])

@@ -8,12 +8,11 @@ import filter_rows
 import numpy as np
 import pytest
 from netpos.estimation.measurement import Kind
-from netpos.estimation.protection import protection_level
+from netpos.estimation.protection import level_of_epochs, protection_level
 from netpos.estimation.state import POSITION
 from netpos.messages.values import Array
 from netpos.tracking import TrackerConfig
 from netpos.tracking.models import options_of
-from netpos.tracking.unnoticed import level_of_epochs
 from scipy import stats
 
 NS = 1_000_000_000

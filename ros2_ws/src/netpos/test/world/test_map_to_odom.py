@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from netpos.messages.values import Array
-from netpos.tracking.map_to_odom import MapToOdom
+from netpos.world.map_to_odom import MapToOdom
 
 S = 1_000_000_000
 
