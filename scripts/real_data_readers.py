@@ -117,27 +117,36 @@ def import_four_anchors(folder: Path, bag: Path) -> object:
 
 
 def import_iasl(folder: Path, bag: Path) -> object:
-    """Ranges of eight anchors; the truth has axes and a clock of its own."""
+    """Ranges of eight anchors; the truth has axes and a clock of its own. Of its rows one has
+    zeros for a rotation: there the cameras have not seen the body."""
     places = [(x, y, z) for z in (0.0, 2.2) for x, y in IASL_CORNERS_M]
     names = range(1, len(places) + 1)
     ranges = ",".join(f"range:{name}=Distance {name}" for name in names)
-    return import_csv(
-        folder / "uwb.csv",
-        bag,
-        Columns.parse(f"time=Local Time,{ranges}", "time=ms", f"range={SHEET_SD_M}"),
-        [
-            RsuInfo(rsu_id=str(name), position=np.array(xyz))
-            for name, xyz in zip(names, places, strict=True)
-        ],
-        truth=Truth(
-            source=folder / "gt.csv",
-            columns=TruthColumns.parse("time=Time,x=Position X,y=Position Y,z=Position Z"),
-            offset_s=None,
-            align="rigid",
-            height_m=IASL_HEIGHT_M,
-        ),
-        tracker={"device_height_m": IASL_HEIGHT_M},
-    )
+    seen = [
+        line
+        for line in (folder / "gt.csv").read_text(encoding="utf-8").splitlines(keepends=True)
+        if set(line.split()[1:]) != {"0"}
+    ]
+    with tempfile.NamedTemporaryFile("w", suffix=".csv") as truth:
+        truth.writelines(seen)
+        truth.flush()
+        return import_csv(
+            folder / "uwb.csv",
+            bag,
+            Columns.parse(f"time=Local Time,{ranges}", "time=ms", f"range={SHEET_SD_M}"),
+            [
+                RsuInfo(rsu_id=str(name), position=np.array(xyz))
+                for name, xyz in zip(names, places, strict=True)
+            ],
+            truth=Truth(
+                source=Path(truth.name),
+                columns=TruthColumns.parse("time=Time,x=Position X,y=Position Y,z=Position Z"),
+                offset_s=None,
+                align="rigid",
+                height_m=IASL_HEIGHT_M,
+            ),
+            tracker={"device_height_m": IASL_HEIGHT_M},
+        )
 
 
 def import_plaza(folder: Path, bag: Path) -> object:
