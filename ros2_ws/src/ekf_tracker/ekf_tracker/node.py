@@ -47,6 +47,7 @@ class EkfTrackerNode(EstimatingNode):
         with patience("compiling the kernels, some minutes, once after a change of the sources"):
             warm_up("")  # before the node is seen: whoever sees it may count on it
         super().__init__("ekf_tracker", **node_options)
+        self._heard_of: set[str] = set()  # devices that are listened to
         self._chosen = Parameters(self)
         self._tracker: Tracker | None = None
         self._chosen.watch(lambda: self._tracker, self._say_change)
@@ -146,8 +147,9 @@ class EkfTrackerNode(EstimatingNode):
         refused = self._add(measurement)
         for vue_id in self.tracker.take_left():
             self._remove_device(vue_id)
-        if refused is None and measurement.vue_id not in self._outputs and self._has_time():
-            self._add_device(measurement.vue_id)
+        vue_id = measurement.vue_id
+        if refused is None and vue_id not in self._heard_of and vue_id not in self._outputs:
+            self._hear_candidate(vue_id)
 
     def _add(self, item: Any) -> str | None:
         """Hand it to the tracker; the reason where it is refused."""
@@ -170,13 +172,29 @@ class EkfTrackerNode(EstimatingNode):
         return self._topics_made[second] <= _TOPICS_A_SECOND
 
     def _add_device(self, vue_id: str) -> None:
+        """Offer the estimates of a device, and listen to it."""
         self._add_outputs(vue_id, self._network, smoothed=self.tracker.config.fixed_lag_s > 0.0)
         self._told_s.setdefault(vue_id, time.monotonic())
         self._seen_ns.setdefault(vue_id, (0, self.get_clock().now().nanoseconds))
-        if self.is_active:
+        if self.is_active and vue_id not in self._heard_of:
             self._listen_to(vue_id)
 
+    def _hear_candidate(self, vue_id: str) -> None:
+        """Listen to a device that has no fix and needs one from outside."""
+        if self.tracker.lacks_something(vue_id) and self._has_time():
+            self._listen_to(vue_id)
+
+    def _give_back(self, vue_id: str) -> None:
+        super()._give_back(vue_id)
+        self._heard_of.discard(vue_id)
+
+    def _stop_listening(self) -> None:
+        super()._stop_listening()
+        self._heard_of.clear()
+
     def _listen_to(self, vue_id: str) -> None:
+        self._heard_of.add(vue_id)
+
         def topic(name: str) -> str:
             return topics.of_vue(vue_id, name)
 
@@ -217,9 +235,12 @@ class EkfTrackerNode(EstimatingNode):
         self._add(sample)
 
     def _publish_one(self, output: TrackOutput) -> None:
-        if output.status.vue_id not in self._outputs:  # nothing sound of it has come yet
-            self._note(output.status)
-            return
+        vue_id = output.status.vue_id
+        if vue_id not in self._outputs:
+            if output.odometry is None or not self._has_time():  # no fix yet
+                self._note(output.status)
+                return
+            self._add_device(vue_id)
         super()._publish_one(output)
         if self._errors_pub is not None:
             for errors in output.errors:
@@ -248,7 +269,7 @@ class EkfTrackerNode(EstimatingNode):
         silent = self._silent_s().keys() & self._seen_ns.keys() - self._kept
         over = [v for v in silent if now_ns - self._seen_ns[v][1] > limit_ns]
         taken = {v for v in over if v in self._statuses and self._statuses[v].accepted}
-        due = [v for v in over if v not in taken or v in self._outputs]
+        due = [v for v in over if v not in taken or v in self._outputs or v in self._heard_of]
         for vue_id in due[:_TOPICS_A_SECOND]:
             if vue_id in taken:
                 self._give_back(vue_id)

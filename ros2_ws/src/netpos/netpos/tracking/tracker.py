@@ -182,6 +182,11 @@ class Tracker:
         left, self._left = self._left, []
         return left
 
+    def lacks_something(self, vue_id: str) -> bool:
+        """Whether a device has no first fix from all that came in the time for one: it needs what
+        the device itself, or an operator, has to say."""
+        return self._admission.waits_ns(vue_id) >= 1e9 * self._config.initial_window_s
+
     def _refuse(self, item: Item | ImuSample, reason: str) -> None:
         """Count what is refused, and tell of it where nothing else is told of the device."""
         track = self.track(item.vue_id)
@@ -333,6 +338,8 @@ class Tracker:
             told = self._step(sequencer, self._tracks[vue], take) if sequencer is not None else []
             outputs += told
             for output in told:
+                if output.odometry is not None:
+                    self._admission.note_fix(vue)
                 for errors in output.errors:
                     self._errors[errors.rsu_id] = errors
             refused_ns = self._untold.pop(vue, None) if self._untold else None
