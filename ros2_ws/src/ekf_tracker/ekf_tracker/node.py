@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -37,7 +36,9 @@ from ekf_tracker.parameters import Parameters
 
 _COPY_S = 2.0
 _TELL_S = 2.0  # a word in the log about what is refused
-_TOPICS_A_SECOND = 10  # devices whose topics are made, or given back: each costs the others 10 ms
+_TOPICS_EVERY_S = (
+    0.25  # between the topics of two devices: to make them stops the others for 60 ms
+)
 
 
 class EkfTrackerNode(EstimatingNode):
@@ -63,7 +64,7 @@ class EkfTrackerNode(EstimatingNode):
         tracker = Tracker(config, parameters.rsu_list)
         self._network = config.network
         self._told_refusal_s = -_TELL_S
-        self._topics_made: Counter[int] = Counter()
+        self._topics_made_s = -_TOPICS_EVERY_S
         self._poses: dict[str, tuple[Any, float]] = {}
         datum = Datum(*config.datum_values) if config.datum_values is not None else None
         self._begin(tracker, publish_tf=parameters.publish_tf, frames=config.frames, datum=datum)
@@ -166,10 +167,12 @@ class EkfTrackerNode(EstimatingNode):
         return reason
 
     def _has_time(self) -> bool:
-        """Whether the topics of another new device may be made in this second."""
-        second = int(time.monotonic())
-        self._topics_made = Counter({second: self._topics_made[second] + 1})
-        return self._topics_made[second] <= _TOPICS_A_SECOND
+        """Whether the topics of another new device may be made now."""
+        now_s = time.monotonic()
+        if now_s - self._topics_made_s < _TOPICS_EVERY_S:
+            return False
+        self._topics_made_s = now_s
+        return True
 
     def _add_device(self, vue_id: str) -> None:
         """Offer the estimates of a device, and listen to it."""
@@ -237,7 +240,7 @@ class EkfTrackerNode(EstimatingNode):
     def _publish_one(self, output: TrackOutput) -> None:
         vue_id = output.status.vue_id
         if vue_id not in self._outputs:
-            if output.odometry is None or not self._has_time():  # no fix yet
+            if not self.tracker.has_fix(vue_id) or not self._has_time():
                 self._note(output.status)
                 return
             self._add_device(vue_id)
@@ -270,7 +273,7 @@ class EkfTrackerNode(EstimatingNode):
         over = [v for v in silent if now_ns - self._seen_ns[v][1] > limit_ns]
         taken = {v for v in over if v in self._statuses and self._statuses[v].accepted}
         due = [v for v in over if v not in taken or v in self._outputs or v in self._heard_of]
-        for vue_id in due[:_TOPICS_A_SECOND]:
+        for vue_id in due[: round(1.0 / _TOPICS_EVERY_S)]:
             if vue_id in taken:
                 self._give_back(vue_id)
             else:

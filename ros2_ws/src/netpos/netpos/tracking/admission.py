@@ -7,16 +7,20 @@ from collections import Counter
 from dataclasses import dataclass
 
 NOT_ALLOWED, TOO_MANY = "not_allowed", "too_many_devices"
+_NS = 1_000_000_000
+_SECONDS = 100  # of which changes are counted
+_WAITING = 1000  # names
 
 
 @dataclass(slots=True)
 class _Device:
-    """Sound items of a device: stamps of the first and the newest, and how many; whether it had a
-    fix."""
+    """Sound items of a device: stamps of the first and the newest, and how many; stamp of its
+    first fix, and whether a later epoch agreed with it."""
 
     first_ns: int = 0
     newest_ns: int = 0
     sound: int = 0
+    fix_ns: int | None = None
     fixed: bool = False
 
     def hear(self, stamp_ns: int) -> None:
@@ -29,16 +33,25 @@ class _Device:
 class Admission:
     """At most ``limit`` devices, of names that ``pattern`` matches as a whole (empty: any).
 
-    A device without a fix is a candidate. Where all places are taken, the candidate of which the
-    fewest sound items have come makes room for a new device of which something sound comes. So
-    candidates never displace a device that had a fix, and names that are made up, each heard once,
-    displace each other. A device that had a fix makes room where it is silent for longer than
-    ``silence_ns``. By stamps and the order of the items alone, so that a replay admits the same.
+    A device is a candidate until it has a plausible fix: one that a later epoch agrees with. Where
+    all places are taken, one makes room for a new device with something sound, the first that
+    there is of these:
+
+    - a device of which nothing sound has come;
+    - a candidate, that of which the fewest sound items have come. The new device must have been
+      heard at an earlier stamp as well: names that are made up and heard once cost no track, and
+      candidates never displace a device that had a fix. No more than a tenth of ``limit`` make
+      room so in a second of the stamps, because a first fix takes time of the others;
+    - a device that had a fix and is silent for longer than ``silence_ns``.
+
+    By stamps and the order of the items alone, so that a replay admits the same.
     """
 
     def __init__(self, limit: int, pattern: str, silence_ns: int) -> None:
         self.set_limits(limit, pattern, silence_ns)
         self._devices: dict[str, _Device] = {}
+        self._waiting: dict[str, int] = {}  # stamp at which a name was first heard in vain
+        self._changes: dict[int, int] = {}  # by second of the stamps
         self._refused: Counter[str] = Counter()
         self._last_refused = ""
 
@@ -60,34 +73,62 @@ class Admission:
             return self._turn_away(vue_id, NOT_ALLOWED), None
         leaves = None
         if len(self._devices) >= self._limit:
-            leaves = self._who_leaves(stamp_ns) if sound else None
+            leaves = self._who_leaves(vue_id, stamp_ns) if sound else None
             if leaves is None:
                 return self._turn_away(vue_id, TOO_MANY), None
             del self._devices[leaves]
+            self._waiting.pop(vue_id, None)
         device = self._devices[vue_id] = _Device()
         if sound:
             device.hear(stamp_ns)
         return None, leaves
 
-    def note_fix(self, vue_id: str) -> None:
-        """A device has a fix: it is a candidate no more."""
+    def note_fix(self, vue_id: str, stamp_ns: int) -> None:
+        """Something was accepted of a device, with or after its first fix."""
         device = self._devices.get(vue_id)
-        if device is not None:
-            device.fixed = True
+        if device is not None and not device.fixed:
+            if device.fix_ns is None:
+                device.fix_ns = stamp_ns
+            device.fixed = stamp_ns > device.fix_ns
+
+    def is_fixed(self, vue_id: str) -> bool:
+        """Whether a device had a plausible fix."""
+        device = self._devices.get(vue_id)
+        return device is not None and device.fixed
 
     def waits_ns(self, vue_id: str) -> int:
         """For how long, by its stamps, something sound came of a candidate; 0 of others."""
         device = self._devices.get(vue_id)
         return 0 if device is None or device.fixed else device.newest_ns - device.first_ns
 
-    def _who_leaves(self, stamp_ns: int) -> str | None:
+    def _who_leaves(self, vue_id: str, stamp_ns: int) -> str | None:
+        """The device that makes room for a new one; None: nobody does."""
+
         def order(entry: tuple[str, _Device]) -> tuple[bool, int, int, str]:
             name, device = entry
             return device.fixed, 0 if device.fixed else device.sound, device.newest_ns, name
 
         name, device = min(self._devices.items(), key=order)
-        silent = stamp_ns - device.newest_ns > self._silence_ns
-        return name if silent or not device.fixed else None
+        if device.fixed:
+            return name if stamp_ns - device.newest_ns > self._silence_ns else None
+        if device.sound and not (self._was_heard(vue_id, stamp_ns) and self._may_change(stamp_ns)):
+            return None
+        return name
+
+    def _was_heard(self, vue_id: str, stamp_ns: int) -> bool:
+        """Whether a name was heard at an earlier stamp; noted."""
+        first_ns = self._waiting.setdefault(vue_id, stamp_ns)
+        if len(self._waiting) > _WAITING:
+            del self._waiting[next(iter(self._waiting))]
+        return first_ns < stamp_ns
+
+    def _may_change(self, stamp_ns: int) -> bool:
+        """Whether one more candidate may make room in a second of the stamps; counted."""
+        second = stamp_ns // _NS
+        self._changes[second] = self._changes.get(second, 0) + 1
+        if len(self._changes) > _SECONDS:
+            del self._changes[next(iter(self._changes))]
+        return self._changes[second] <= max(self._limit // 10, 1)
 
     def _turn_away(self, vue_id: str, reason: str) -> str:
         self._refused[reason] += 1

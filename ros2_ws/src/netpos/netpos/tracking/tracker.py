@@ -182,6 +182,10 @@ class Tracker:
         left, self._left = self._left, []
         return left
 
+    def has_fix(self, vue_id: str) -> bool:
+        """Whether a device had a plausible fix: one that a later epoch agreed with."""
+        return self._admission.is_fixed(vue_id)
+
     def lacks_something(self, vue_id: str) -> bool:
         """Whether a device has no first fix from all that came in the time for one: it needs what
         the device itself, or an operator, has to say."""
@@ -338,8 +342,8 @@ class Tracker:
             told = self._step(sequencer, self._tracks[vue], take) if sequencer is not None else []
             outputs += told
             for output in told:
-                if output.odometry is not None:
-                    self._admission.note_fix(vue)
+                if output.odometry is not None and output.status.used:
+                    self._admission.note_fix(vue, output.status.stamp_ns)
                 for errors in output.errors:
                     self._errors[errors.rsu_id] = errors
             refused_ns = self._untold.pop(vue, None) if self._untold else None
