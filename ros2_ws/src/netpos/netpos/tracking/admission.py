@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 NOT_ALLOWED, TOO_MANY = "not_allowed", "too_many_devices"
 _NS = 1_000_000_000
-_SECONDS = 100  # of which changes are counted
+_SECONDS = 100  # of which newcomers are counted
 _WAITING = 1000  # names
 
 
@@ -33,15 +33,15 @@ class _Device:
 class Admission:
     """At most ``limit`` devices, of names that ``pattern`` matches as a whole (empty: any).
 
-    A device is a candidate until it has a plausible fix: one that a later epoch agrees with. Where
-    all places are taken, one makes room for a new device with something sound, the first that
-    there is of these:
+    A device is a candidate until it has a plausible fix: one that a later epoch agrees with. A
+    first fix takes time of the others. So where a tenth of ``limit`` are candidates of which
+    something sound has come, a new one must have been heard at an earlier stamp as well, and no
+    more than this tenth enter in a second of the stamps: names that are made up and heard once
+    cost no track. Where all places are taken, one makes room for a new device with something
+    sound, the first that there is of these:
 
     - a device of which nothing sound has come;
-    - a candidate, that of which the fewest sound items have come. The new device must have been
-      heard at an earlier stamp as well: names that are made up and heard once cost no track, and
-      candidates never displace a device that had a fix. No more than a tenth of ``limit`` make
-      room so in a second of the stamps, because a first fix takes time of the others;
+    - the candidate of which the fewest sound items have come, under the same condition;
     - a device that had a fix and is silent for longer than ``silence_ns``.
 
     By stamps and the order of the items alone, so that a replay admits the same.
@@ -51,7 +51,7 @@ class Admission:
         self.set_limits(limit, pattern, silence_ns)
         self._devices: dict[str, _Device] = {}
         self._waiting: dict[str, int] = {}  # stamp at which a name was first heard in vain
-        self._changes: dict[int, int] = {}  # by second of the stamps
+        self._entered: dict[int, int] = {}  # of those that had to wait, by second of the stamps
         self._refused: Counter[str] = Counter()
         self._last_refused = ""
 
@@ -72,7 +72,10 @@ class Admission:
         if self._pattern is not None and not self._pattern.fullmatch(vue_id):
             return self._turn_away(vue_id, NOT_ALLOWED), None
         leaves = None
-        if len(self._devices) >= self._limit:
+        if len(self._devices) < self._limit:
+            if sound and self._is_crowded() and not self._may_enter(vue_id, stamp_ns):
+                return self._turn_away(vue_id, TOO_MANY), None
+        else:
             leaves = self._who_leaves(vue_id, stamp_ns) if sound else None
             if leaves is None:
                 return self._turn_away(vue_id, TOO_MANY), None
@@ -111,24 +114,31 @@ class Admission:
         name, device = min(self._devices.items(), key=order)
         if device.fixed:
             return name if stamp_ns - device.newest_ns > self._silence_ns else None
-        if device.sound and not (self._was_heard(vue_id, stamp_ns) and self._may_change(stamp_ns)):
+        if device.sound and not self._may_enter(vue_id, stamp_ns):
             return None
         return name
 
-    def _was_heard(self, vue_id: str, stamp_ns: int) -> bool:
-        """Whether a name was heard at an earlier stamp; noted."""
+    def _is_crowded(self) -> bool:
+        """Whether there are so many candidates that a new one must wait."""
+        return sum(d.sound > 0 and not d.fixed for d in self._devices.values()) >= self._tenth
+
+    def _may_enter(self, vue_id: str, stamp_ns: int) -> bool:
+        """Whether a name was heard at an earlier stamp, and few others entered in this second of
+        the stamps; noted."""
         first_ns = self._waiting.setdefault(vue_id, stamp_ns)
         if len(self._waiting) > _WAITING:
             del self._waiting[next(iter(self._waiting))]
-        return first_ns < stamp_ns
-
-    def _may_change(self, stamp_ns: int) -> bool:
-        """Whether one more candidate may make room in a second of the stamps; counted."""
+        if first_ns >= stamp_ns:
+            return False
         second = stamp_ns // _NS
-        self._changes[second] = self._changes.get(second, 0) + 1
-        if len(self._changes) > _SECONDS:
-            del self._changes[next(iter(self._changes))]
-        return self._changes[second] <= max(self._limit // 10, 1)
+        self._entered[second] = self._entered.get(second, 0) + 1
+        if len(self._entered) > _SECONDS:
+            del self._entered[next(iter(self._entered))]
+        return self._entered[second] <= self._tenth
+
+    @property
+    def _tenth(self) -> int:
+        return max(self._limit // 10, 1)
 
     def _turn_away(self, vue_id: str, reason: str) -> str:
         self._refused[reason] += 1
