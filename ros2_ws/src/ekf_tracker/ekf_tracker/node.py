@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -37,7 +36,9 @@ from ekf_tracker.parameters import Parameters
 
 _COPY_S = 2.0
 _TELL_S = 2.0  # a word in the log about what is refused
-_TOPICS_A_SECOND = 10  # devices whose topics are made, or given back: each costs the others 10 ms
+_TOPICS_EVERY_S = (
+    0.25  # between the topics of two devices: to make them stops the others for 60 ms
+)
 
 
 class EkfTrackerNode(EstimatingNode):
@@ -47,6 +48,7 @@ class EkfTrackerNode(EstimatingNode):
         with patience("compiling the kernels, some minutes, once after a change of the sources"):
             warm_up("")  # before the node is seen: whoever sees it may count on it
         super().__init__("ekf_tracker", **node_options)
+        self._heard_of: set[str] = set()  # devices that are listened to
         self._chosen = Parameters(self)
         self._tracker: Tracker | None = None
         self._chosen.watch(lambda: self._tracker, self._say_change)
@@ -62,7 +64,7 @@ class EkfTrackerNode(EstimatingNode):
         tracker = Tracker(config, parameters.rsu_list)
         self._network = config.network
         self._told_refusal_s = -_TELL_S
-        self._topics_made: Counter[int] = Counter()
+        self._topics_made_s = -_TOPICS_EVERY_S
         self._poses: dict[str, tuple[Any, float]] = {}
         datum = Datum(*config.datum_values) if config.datum_values is not None else None
         self._begin(tracker, publish_tf=parameters.publish_tf, frames=config.frames, datum=datum)
@@ -146,8 +148,9 @@ class EkfTrackerNode(EstimatingNode):
         refused = self._add(measurement)
         for vue_id in self.tracker.take_left():
             self._remove_device(vue_id)
-        if refused is None and measurement.vue_id not in self._outputs and self._has_time():
-            self._add_device(measurement.vue_id)
+        vue_id = measurement.vue_id
+        if refused is None and vue_id not in self._heard_of and vue_id not in self._outputs:
+            self._hear_candidate(vue_id)
 
     def _add(self, item: Any) -> str | None:
         """Hand it to the tracker; the reason where it is refused."""
@@ -164,19 +167,37 @@ class EkfTrackerNode(EstimatingNode):
         return reason
 
     def _has_time(self) -> bool:
-        """Whether the topics of another new device may be made in this second."""
-        second = int(time.monotonic())
-        self._topics_made = Counter({second: self._topics_made[second] + 1})
-        return self._topics_made[second] <= _TOPICS_A_SECOND
+        """Whether the topics of another new device may be made now."""
+        now_s = time.monotonic()
+        if now_s - self._topics_made_s < _TOPICS_EVERY_S:
+            return False
+        self._topics_made_s = now_s
+        return True
 
     def _add_device(self, vue_id: str) -> None:
+        """Offer the estimates of a device, and listen to it."""
         self._add_outputs(vue_id, self._network, smoothed=self.tracker.config.fixed_lag_s > 0.0)
         self._told_s.setdefault(vue_id, time.monotonic())
         self._seen_ns.setdefault(vue_id, (0, self.get_clock().now().nanoseconds))
-        if self.is_active:
+        if self.is_active and vue_id not in self._heard_of:
             self._listen_to(vue_id)
 
+    def _hear_candidate(self, vue_id: str) -> None:
+        """Listen to a device that has no fix and needs one from outside."""
+        if self.tracker.lacks_something(vue_id) and self._has_time():
+            self._listen_to(vue_id)
+
+    def _give_back(self, vue_id: str) -> None:
+        super()._give_back(vue_id)
+        self._heard_of.discard(vue_id)
+
+    def _stop_listening(self) -> None:
+        super()._stop_listening()
+        self._heard_of.clear()
+
     def _listen_to(self, vue_id: str) -> None:
+        self._heard_of.add(vue_id)
+
         def topic(name: str) -> str:
             return topics.of_vue(vue_id, name)
 
@@ -217,9 +238,12 @@ class EkfTrackerNode(EstimatingNode):
         self._add(sample)
 
     def _publish_one(self, output: TrackOutput) -> None:
-        if output.status.vue_id not in self._outputs:  # nothing sound of it has come yet
-            self._note(output.status)
-            return
+        vue_id = output.status.vue_id
+        if vue_id not in self._outputs:
+            if not self.tracker.has_fix(vue_id) or not self._has_time():
+                self._note(output.status)
+                return
+            self._add_device(vue_id)
         super()._publish_one(output)
         if self._errors_pub is not None:
             for errors in output.errors:
@@ -248,8 +272,8 @@ class EkfTrackerNode(EstimatingNode):
         silent = self._silent_s().keys() & self._seen_ns.keys() - self._kept
         over = [v for v in silent if now_ns - self._seen_ns[v][1] > limit_ns]
         taken = {v for v in over if v in self._statuses and self._statuses[v].accepted}
-        due = [v for v in over if v not in taken or v in self._outputs]
-        for vue_id in due[:_TOPICS_A_SECOND]:
+        due = [v for v in over if v not in taken or v in self._outputs or v in self._heard_of]
+        for vue_id in due[: round(1.0 / _TOPICS_EVERY_S)]:
             if vue_id in taken:
                 self._give_back(vue_id)
             else:

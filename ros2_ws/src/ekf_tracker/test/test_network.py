@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -84,7 +85,9 @@ def test_names_of_a_scenario_are_the_networks_own(make: Any) -> None:
     assert set(node._outputs) == {"wifi_1"}
 
 
-def test_without_a_network_all_count(make: Any) -> None:
+def test_without_a_network_all_count(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds = itertools.count(1000)  # the topics of two devices are not made at once
+    monkeypatch.setattr("ekf_tracker.node.time.monotonic", lambda: float(next(seconds)))
     node = make(**(SETTINGS | {"network": ""}))
     assert node._track_pub is None
     feed(node)

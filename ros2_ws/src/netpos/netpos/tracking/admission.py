@@ -4,22 +4,54 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from dataclasses import dataclass
 
 NOT_ALLOWED, TOO_MANY = "not_allowed", "too_many_devices"
-_NEVER = -1
+_NS = 1_000_000_000
+_SECONDS = 100  # of which newcomers are counted
+_WAITING = 1000  # names
+
+
+@dataclass(slots=True)
+class _Device:
+    """Sound items of a device: stamps of the first and the newest, and how many; stamp of its
+    first fix, and whether a later epoch agreed with it."""
+
+    first_ns: int = 0
+    newest_ns: int = 0
+    sound: int = 0
+    fix_ns: int | None = None
+    fixed: bool = False
+
+    def hear(self, stamp_ns: int) -> None:
+        """Note a sound item."""
+        self.first_ns = min(self.first_ns, stamp_ns) if self.sound else stamp_ns
+        self.newest_ns = max(self.newest_ns, stamp_ns)
+        self.sound += 1
 
 
 class Admission:
     """At most ``limit`` devices, of names that ``pattern`` matches as a whole (empty: any).
 
-    Where all places are taken, a device of which nothing sound has come, or else the one that is
-    silent longest and for longer than ``silence_ns``, makes room for one of which something sound
-    comes. By stamps alone, so that a replay admits the same.
+    A device is a candidate until it has a plausible fix: one that a later epoch agrees with. A
+    first fix takes time of the others. So where a tenth of ``limit`` are candidates of which
+    something sound has come, a new one must have been heard at an earlier stamp as well, and no
+    more than this tenth enter in a second of the stamps: names that are made up and heard once
+    cost no track. Where all places are taken, one makes room for a new device with something
+    sound, the first that there is of these:
+
+    - a device of which nothing sound has come;
+    - the candidate of which the fewest sound items have come, under the same condition;
+    - a device that had a fix and is silent for longer than ``silence_ns``.
+
+    By stamps and the order of the items alone, so that a replay admits the same.
     """
 
     def __init__(self, limit: int, pattern: str, silence_ns: int) -> None:
         self.set_limits(limit, pattern, silence_ns)
-        self._sound_ns: dict[str, int] = {}  # stamp of the newest sound item, by device
+        self._devices: dict[str, _Device] = {}
+        self._waiting: dict[str, int] = {}  # stamp at which a name was first heard in vain
+        self._entered: dict[int, int] = {}  # of those that had to wait, by second of the stamps
         self._refused: Counter[str] = Counter()
         self._last_refused = ""
 
@@ -32,24 +64,81 @@ class Admission:
     def admit(self, vue_id: str, stamp_ns: int, *, sound: bool) -> tuple[str | None, str | None]:
         """Take note of an item of a device; the reason why the device is not admitted, and the
         device that makes room for it, None each."""
-        if vue_id in self._sound_ns:
+        known = self._devices.get(vue_id)
+        if known is not None:
             if sound:
-                self._sound_ns[vue_id] = max(stamp_ns, self._sound_ns[vue_id])
+                known.hear(stamp_ns)
             return None, None
         if self._pattern is not None and not self._pattern.fullmatch(vue_id):
             return self._turn_away(vue_id, NOT_ALLOWED), None
         leaves = None
-        if len(self._sound_ns) >= self._limit:
-            leaves = self._who_leaves(stamp_ns) if sound else None
+        if len(self._devices) < self._limit:
+            if sound and self._is_crowded() and not self._may_enter(vue_id, stamp_ns):
+                return self._turn_away(vue_id, TOO_MANY), None
+        else:
+            leaves = self._who_leaves(vue_id, stamp_ns) if sound else None
             if leaves is None:
                 return self._turn_away(vue_id, TOO_MANY), None
-            del self._sound_ns[leaves]
-        self._sound_ns[vue_id] = stamp_ns if sound else _NEVER
+            del self._devices[leaves]
+            self._waiting.pop(vue_id, None)
+        device = self._devices[vue_id] = _Device()
+        if sound:
+            device.hear(stamp_ns)
         return None, leaves
 
-    def _who_leaves(self, stamp_ns: int) -> str | None:
-        silent, last_ns = min(self._sound_ns.items(), key=lambda entry: (entry[1], entry[0]))
-        return silent if last_ns == _NEVER or stamp_ns - last_ns > self._silence_ns else None
+    def note_fix(self, vue_id: str, stamp_ns: int) -> None:
+        """Something was accepted of a device, with or after its first fix."""
+        device = self._devices.get(vue_id)
+        if device is not None and not device.fixed:
+            if device.fix_ns is None:
+                device.fix_ns = stamp_ns
+            device.fixed = stamp_ns > device.fix_ns
+
+    def is_fixed(self, vue_id: str) -> bool:
+        """Whether a device had a plausible fix."""
+        device = self._devices.get(vue_id)
+        return device is not None and device.fixed
+
+    def waits_ns(self, vue_id: str) -> int:
+        """For how long, by its stamps, something sound came of a candidate; 0 of others."""
+        device = self._devices.get(vue_id)
+        return 0 if device is None or device.fixed else device.newest_ns - device.first_ns
+
+    def _who_leaves(self, vue_id: str, stamp_ns: int) -> str | None:
+        """The device that makes room for a new one; None: nobody does."""
+
+        def order(entry: tuple[str, _Device]) -> tuple[bool, int, int, str]:
+            name, device = entry
+            return device.fixed, 0 if device.fixed else device.sound, device.newest_ns, name
+
+        name, device = min(self._devices.items(), key=order)
+        if device.fixed:
+            return name if stamp_ns - device.newest_ns > self._silence_ns else None
+        if device.sound and not self._may_enter(vue_id, stamp_ns):
+            return None
+        return name
+
+    def _is_crowded(self) -> bool:
+        """Whether there are so many candidates that a new one must wait."""
+        return sum(d.sound > 0 and not d.fixed for d in self._devices.values()) >= self._tenth
+
+    def _may_enter(self, vue_id: str, stamp_ns: int) -> bool:
+        """Whether a name was heard at an earlier stamp, and few others entered in this second of
+        the stamps; noted."""
+        first_ns = self._waiting.setdefault(vue_id, stamp_ns)
+        if len(self._waiting) > _WAITING:
+            del self._waiting[next(iter(self._waiting))]
+        if first_ns >= stamp_ns:
+            return False
+        second = stamp_ns // _NS
+        self._entered[second] = self._entered.get(second, 0) + 1
+        if len(self._entered) > _SECONDS:
+            del self._entered[next(iter(self._entered))]
+        return self._entered[second] <= self._tenth
+
+    @property
+    def _tenth(self) -> int:
+        return max(self._limit // 10, 1)
 
     def _turn_away(self, vue_id: str, reason: str) -> str:
         self._refused[reason] += 1

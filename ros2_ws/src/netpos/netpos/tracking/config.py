@@ -254,7 +254,7 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
     )
     network: str = described("", "the network whose RSUs count, one of several; empty: all")
     max_devices: int = count(
-        200, "devices tracked at once; one that is silent or never sound makes room"
+        200, "devices tracked at once; one that is silent or has no fix makes room"
     )
     allowed_devices: str = described(
         "", "regular expression that names of devices match as a whole; empty: any name"

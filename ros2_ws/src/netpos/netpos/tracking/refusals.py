@@ -15,6 +15,7 @@ from netpos.messages.values import Field, GroundSpeed, ImuSample, RsuMeasurement
 from netpos.tracking.rate_limit import RATE
 from netpos.tracking.sequencer import Item
 from netpos.tracking.validation import explanation
+from netpos.tracking.voices import CONFLICT
 
 WINDOW = 50
 """Items of a source by which it is judged."""
@@ -42,20 +43,17 @@ _SENTENCES = {
     "future_stamp": "its stamp is {ahead:.3g} s ahead of all others",
     "clock_ahead": "its stamp is {ahead:.3g} s ahead of those of the other RSUs; set its clock",
     "duplicate": "another one with the same stamp came before it",
-    "conflict": "two of the same stamp differ, neither is used; does somebody else send in its"
-    " name?",
+    CONFLICT: "two of the same stamp, or closer together than it ever sends, differ, neither is"
+    " used; does somebody else send in its name?",
     "repeated": "its values stay the same to the last bit for longer than its noise and its past"
     " allow; is it stuck? With the next other value it is taken again",
+    RATE: "more in a second of its stamps, or closer together, than max_rate_hz or"
+    " max_rsu_rate_hz allow; stop its sender, or raise them",
     "initialpose_off": "initial poses are refused; set accept_initialpose to true",
     "disabled": "the tracker is disabled; call its service enable with data: true",
     "not_finite": "a value is not finite, or beyond 1e9",
     "variance": "a covariance is not symmetric and positive definite with sds from 1e-6 to 1e6",
 }
-
-_RATE_SENTENCE = (
-    f"{RATE}: more in a second of its stamps, or closer together, than max_rate_hz or "
-    "max_rsu_rate_hz allow; stop its sender, or raise them"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,11 +114,12 @@ class Refusals:
         _count(self._devices, item.vue_id, reason, sentence)
         return sentence
 
-    def refuse_rate(self, rsu_id: str, vue_id: str) -> None:
-        """Count a measurement beyond the limits of its RSU, at the least cost."""
+    def refuse_unread(self, rsu_id: str, vue_id: str, reason: str) -> None:
+        """Count a measurement that is refused whatever it says, at the least cost."""
         self.any = True
-        _count(self._rsus, rsu_id, RATE, _RATE_SENTENCE)
-        _count(self._devices, vue_id, RATE, f"{_RATE_SENTENCE} (from {rsu_id})")
+        sentence = f"{reason}: {_SENTENCES[reason]}"
+        _count(self._rsus, rsu_id, reason, sentence)
+        _count(self._devices, vue_id, reason, f"{sentence} (from {rsu_id})")
 
     def take(self, item: Item | ImuSample) -> None:
         """Note that an item is taken."""

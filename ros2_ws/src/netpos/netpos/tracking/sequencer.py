@@ -19,6 +19,7 @@ import numpy as np
 
 from netpos.messages.values import GroundSpeed, InitialPose, RsuMeasurement, Velocity
 from netpos.tracking.clocks import Clocks, Verdict
+from netpos.tracking.voices import CONFLICT
 
 Item = RsuMeasurement | Velocity | GroundSpeed | InitialPose
 
@@ -100,12 +101,12 @@ class Epoch:
         """RSU measurements that are here."""
         return self._measured
 
-    def rsu_complete(self, least: int = 0) -> bool:
-        """Every RSU measurement announced by ``expected`` is here, and at least as many as
-        ``least``; False where the number is not announced."""
+    def rsu_complete(self, least: int = 0, silenced: int = 0) -> bool:
+        """Every RSU measurement announced by ``expected`` is here, but for those of ``silenced``
+        RSUs, and at least as many as ``least``; False where the number is not announced."""
         if not self._measured:
             return True
-        return 0 < self._expected <= self._measured and least <= self._measured
+        return 0 < self._expected <= self._measured + silenced and least <= self._measured
 
     def is_late_pose(self) -> bool:
         """Nothing but an initial pose of an older stamp: it came after what else is of this
@@ -191,6 +192,8 @@ class Sequencer:
         self._late_in_row = 0
         self.set_back = False
         """The device's time was set back: start anew."""
+        self.silenced = 0
+        """RSUs that are not heard now, though others announce them."""
         self.idle = False
         """Nothing can be released before the next item: the one epoch there is waits for
         measurements of its stamp."""
@@ -236,7 +239,7 @@ class Sequencer:
             return fault
         self.mark(key[0], stamp)
         alone = len(self._pending) == 1 and stamp == self.newest_ns and self._max_delay_ns > 0
-        complete = epoch.rsu_complete(self._delays.count)
+        complete = epoch.rsu_complete(self._delays.count, self.silenced)
         self.idle = alone and not complete and not self._waiting
         return None
 
@@ -316,7 +319,7 @@ class Sequencer:
         """What is wrong with an item of a stamp and source of which another is there or waits for
         its epoch, and whether it withdraws that one."""
         if epoch is not None and key in epoch.withdrawn:
-            return "conflict", False
+            return CONFLICT, False
         known = [epoch.items[key]] if epoch is not None and key in epoch.items else []
         known += waiting
         if not known:
@@ -324,9 +327,9 @@ class Sequencer:
         if any(says_the_same(item, other) for other in known):
             return "duplicate", False
         if len(known) > 1:
-            return "conflict", False
-        self._refused.append((known[0], "conflict"))
-        return "conflict", True
+            return CONFLICT, False
+        self._refused.append((known[0], CONFLICT))
+        return CONFLICT, True
 
     def release(self) -> list[Epoch]:
         """Epochs that may be applied now, in stamp order."""
@@ -382,7 +385,7 @@ class Sequencer:
             return False
         late_ns = self._delays.late_ns(newest - self._live_ns)
         reached = self._watermark.get(RSU, 0) > stamp + late_ns
-        if not reached and not epoch.rsu_complete(self._delays.count):
+        if not reached and not epoch.rsu_complete(self._delays.count, self.silenced):
             return False
         for channel, heard in self._watermark.items():
             if heard < stamp and heard >= newest - self._live_ns and channel != POSE:

@@ -36,6 +36,7 @@ from netpos.tracking.sequencer import IMU, Epoch, Item, Sequencer
 from netpos.tracking.shared_errors import SharedErrors
 from netpos.tracking.smoothing import check_smoothable
 from netpos.tracking.track import Track, warm_up_strapdown
+from netpos.tracking.voices import CONFLICT, Voices
 
 _PHASE = int(Field.PHASE)  # a plain integer: arithmetic of flags costs ten times as much
 _OLD_POSE_NS = 1_000_000_000
@@ -85,6 +86,7 @@ class Tracker:
         self._left: list[str] = []
         self._rate = RateLimit(self._config.max_rate_hz, self._config.max_rsu_rate_hz)
         self._repeats = Repeats()
+        self._voices = Voices()
 
     @property
     def config(self) -> TrackerConfig:
@@ -133,8 +135,9 @@ class Tracker:
             if self._config.network and not self.concerns(item):
                 return None
             source = item.rsu_id, item.vue_id, item.stamp_ns
-            if self.floods(*source):
-                return RATE
+            shut = self._shut(*source)
+            if shut is not None:
+                return shut
             self._rate.count(*source)
         elif isinstance(item, ImuSample):
             return self._add_imu(item)
@@ -142,9 +145,10 @@ class Tracker:
         shut = self._admits(item, reason is None)
         if shut is not None:
             return shut
-        reason = reason or self._repeated(item)
+        reason = reason or self._contradicted(item) or self._repeated(item)
         if reason is None:
             sequencer = self._sequencers.get(item.vue_id) or self._sequencer(item.vue_id)
+            sequencer.silenced = self._voices.silenced(item.vue_id, item.stamp_ns)
             reason = sequencer.add(item)
             for refused, why in sequencer.take_refused():
                 self._refuse(refused, why)
@@ -152,6 +156,7 @@ class Tracker:
                 self.refusals.take(item)
             if reason is None and isinstance(item, RsuMeasurement):
                 self._rate.took(*source)
+                self._voices.take(item)
             if sequencer.set_back:
                 self.reset(item.vue_id)
             elif sequencer.idle:
@@ -177,6 +182,15 @@ class Tracker:
         left, self._left = self._left, []
         return left
 
+    def has_fix(self, vue_id: str) -> bool:
+        """Whether a device had a plausible fix: one that a later epoch agreed with."""
+        return self._admission.is_fixed(vue_id)
+
+    def lacks_something(self, vue_id: str) -> bool:
+        """Whether a device has no first fix from all that came in the time for one: it needs what
+        the device itself, or an operator, has to say."""
+        return self._admission.waits_ns(vue_id) >= 1e9 * self._config.initial_window_s
+
     def _refuse(self, item: Item | ImuSample, reason: str) -> None:
         """Count what is refused, and tell of it where nothing else is told of the device."""
         track = self.track(item.vue_id)
@@ -190,15 +204,23 @@ class Tracker:
             self._untold[item.vue_id] = newest_ns or max(item.stamp_ns, 0)
 
     def floods(self, rsu_id: str, vue_id: str, stamp_ns: int) -> bool:
-        """Whether a measurement is one too many of its RSU, which is then counted as refused: it
-        need not be added. A device that is not known stays so."""
-        if not self._rate.exceeded(rsu_id, vue_id, stamp_ns):
-            return False
+        """Whether a measurement is one too many of its RSU, or two senders speak in its name. It
+        is then counted as refused and need not be added. A device that is not known stays so."""
+        return self._shut(rsu_id, vue_id, stamp_ns) is not None
+
+    def _shut(self, rsu_id: str, vue_id: str, stamp_ns: int) -> str | None:
+        """Why a measurement is refused whatever it says, and counted; None where it is not."""
+        if self._voices.refuses(rsu_id, vue_id, stamp_ns):
+            reason = CONFLICT
+        elif self._rate.exceeded(rsu_id, vue_id, stamp_ns):
+            reason = RATE
+        else:
+            return None
         track = self._tracks.get(vue_id)
         if track is not None:
-            track.refused[RATE] += 1
-        self.refusals.refuse_rate(rsu_id, vue_id)
-        return True
+            track.refused[reason] += 1
+        self.refusals.refuse_unread(rsu_id, vue_id, reason)
+        return reason
 
     def concerns(self, measurement: RsuMeasurement) -> bool:
         """Whether a measurement is for this tracker: one of a network leaves those of RSUs it
@@ -245,6 +267,7 @@ class Tracker:
                 self._shared.clear()
         for name in [vue_id] if vue_id is not None else list(self._tracks):
             self._rate.forget(name)
+            self._voices.forget(name)
             dropped = self._sequencers.pop(name, None)
             if dropped is not None and dropped.set_back:
                 self._clocks[name] = dropped.clocks
@@ -319,6 +342,8 @@ class Tracker:
             told = self._step(sequencer, self._tracks[vue], take) if sequencer is not None else []
             outputs += told
             for output in told:
+                if output.odometry is not None and output.status.used:
+                    self._admission.note_fix(vue, output.status.stamp_ns)
                 for errors in output.errors:
                     self._errors[errors.rsu_id] = errors
             refused_ns = self._untold.pop(vue, None) if self._untold else None
@@ -377,6 +402,11 @@ class Tracker:
                 if not self._config.accept_initialpose:
                     return "initialpose_off"
                 return validation.pose_fault(item, self._config.map_frame)
+
+    def _contradicted(self, item: Item) -> str | None:
+        if isinstance(item, RsuMeasurement) and self._voices.contradicts(item):
+            return CONFLICT
+        return None
 
     def _repeated(self, item: Item | ImuSample) -> str | None:
         if not self._config.isolate_rsus or isinstance(item, InitialPose):

@@ -60,6 +60,50 @@ def test_invented_names_do_not_keep_an_honest_device_out(world: Any) -> None:
     assert tracker.take_left() == []
 
 
+def test_names_of_which_something_sound_came_displace_each_other_and_no_track(world: Any) -> None:
+    """One epoch each: a fix that nothing confirms. The honest device gets its place between."""
+    tracker = tracker_of(world, max_devices=10)
+    assert run(world, tracker, "tracked", 0.0, 3) == [None] * 9
+    reasons: list[str | None] = []
+    honest: list[str | None] = []
+    for k in range(3000):
+        name = f"made_up_{k}"
+        reasons += run(world, tracker, name, 0.3 + k * 1e-3, 1)  # a fix, and no second epoch
+        if k % 100 == 50:
+            honest += run(world, tracker, "honest", 0.3 + k * 1e-3, 1)
+    assert reasons.count(None) == 3  # the one that found no other candidate
+    assert honest == ["too_many_devices"] * 3 + [None] * 87
+    assert not {"tracked", "honest"} & set(tracker.take_left())
+    assert {"tracked", "honest"} <= set(tracker.rejected())
+    assert len(tracker.rejected()) == 3
+
+
+def test_a_candidate_that_was_heard_more_often_stays(world: Any) -> None:
+    """It has no fix, because it needs a pose; names that are heard once leave before it."""
+    tracker = tracker_of(world, max_devices=3, require_initial_pose=True)
+    for k in range(40):
+        assert run(world, tracker, "waits", 0.1 * k, 1) == [None] * 3
+        run(world, tracker, f"made_up_{k // 2}", 0.1 * k, 1)
+        assert tracker.lacks_something("waits") is (k >= 30)
+    assert "waits" not in tracker.take_left()
+    run(world, tracker, "waits", 4.0, 1)
+    assert tracker.lacks_something("waits")
+    assert not tracker.lacks_something("made_up_19")
+    assert not tracker.lacks_something("nobody")
+
+
+def test_a_replay_admits_the_same(world: Any) -> None:
+    def who_stays() -> set[str]:
+        tracker = tracker_of(world, max_devices=5)
+        for k in range(60):
+            run(world, tracker, f"name_{(k * k) % 17}", 0.05 * k, 1)
+            tracker.add(heard(world, f"once_{k}", 0.05 * k)[0])
+        return set(tracker.rejected())
+
+    assert who_stays() == who_stays()
+    assert len(who_stays()) == 5
+
+
 def test_a_silent_device_makes_room_after_the_time_that_ends_its_track(world: Any) -> None:
     tracker = tracker_of(world, max_devices=2, max_gap_s=5.0)
     run(world, tracker, "gone", 0.0, 3)

@@ -14,6 +14,8 @@ from netpos.messages.values import Array, RsuMeasurement
 
 _MORE_DEVICES = 50
 _BEFORE_NS = 1000
+_BESIDE = 50  # messages for each of theirs
+_PAUSE_NS = 10 * NS  # after which they begin anew
 
 
 def spoofed_info(stream: Stream, hit: Hit) -> Stream:
@@ -65,6 +67,25 @@ def injected(stream: Stream, hit: Hit) -> Stream:
         if ghost is not None:
             lies.append(Arrival(arrival.at_ns - _BEFORE_NS, ghost))
     return in_order([*lies, *stream])
+
+
+def beside(stream: Stream, hit: Hit) -> Stream:
+    """Somebody sends fifty messages for each of the RSUs in their names, with stamps of their own,
+    of a device ``size`` metres away."""
+    lies = []
+    for arrival in stream:
+        m = hit.measured(arrival)
+        if m is None:
+            continue
+        source = m.rsu_id, m.vue_id, m.reference_rsu_id
+        gap_ns = m.stamp_ns - hit.memory.get(source, m.stamp_ns)
+        hit.memory[source] = m.stamp_ns
+        for k in range(1, _BESIDE) if 0 < gap_ns < _PAUSE_NS else ():
+            later_ns = k * gap_ns // _BESIDE
+            ghost = _of_ghost(replace(m, stamp_ns=m.stamp_ns + later_ns), hit, 1.0)
+            if ghost is not None:
+                lies.append(Arrival(arrival.at_ns + later_ns, ghost))
+    return in_order([*stream, *lies])
 
 
 def replayed(stream: Stream, hit: Hit) -> Stream:

@@ -60,6 +60,7 @@ FAULTS: dict[str, Fault] = {
     "colluding": Fault(of_attackers.colluding, "m"),
     "creeping": Fault(of_attackers.creeping, "m"),
     "injected": Fault(of_attackers.injected, "m"),
+    "beside": Fault(of_attackers.beside, "m"),
     "replayed": Fault(of_attackers.replayed, "s"),
     "invented_rsus": Fault(of_attackers.invented_rsus, "m"),
     "invented_devices": Fault(of_attackers.invented_devices, "devices"),
