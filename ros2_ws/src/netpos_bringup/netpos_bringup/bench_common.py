@@ -6,13 +6,14 @@ from __future__ import annotations
 import struct
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from netpos.messages import topics
+from netpos.messages.values import RsuInfo as Description
 from netpos_msgs.msg import RsuInfo, RsuMeasurement
 from netpos_node import BACKLOG, CODEC, LATCHED
 from rclpy.node import Node
@@ -28,12 +29,13 @@ _STAMP = struct.Struct("<iI")  # the first field of a serialised message with a 
 
 
 class Probe:
-    """Publishers and raw subscriptions, taken from without an executor: its time is not ours."""
+    """Publishers and raw subscriptions, taken from without an executor: its time is not ours.
+    ``rsus`` are described."""
 
-    def __init__(self) -> None:
+    def __init__(self, rsus: Iterable[Description] = RSUS) -> None:
         self.node = Node("bench_probe", start_parameter_services=False)
         info = self.node.create_publisher(RsuInfo, topics.RSU_INFO, LATCHED)
-        for rsu in RSUS:
+        for rsu in rsus:
             info.publish(CODEC.rsu_info_to_msg(rsu))
         self.tracker = self.node.create_publisher(RsuMeasurement, topics.RSU_MEASUREMENTS, BACKLOG)
 
