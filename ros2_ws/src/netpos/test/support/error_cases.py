@@ -1,0 +1,213 @@
+"""Simulated errors of ranges around a yard, and of arrays on the walls of a room: white noise, a
+first-order Gauss-Markov bias each, and late paths, against what is declared."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.tracker import Tracker
+
+DURATION_S = 90.0
+GO_S, STOP_AND_GO_S = 5.0, 20.0
+WALK_MPS = 1.3
+DEVICE_M = {False: 0.0, True: 1.13}  # height, for ranges and for arrays
+FACING_RAD = np.radians([0.0, 90.0, 180.0, 270.0])  # of the arrays
+INWARDS_M = np.array([[0.0, 3.0, 2.3], [6.0, 0.0, 2.3], [12.0, 3.0, 2.3], [6.0, 6.0, 2.3]])
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """True errors: variance over the one declared, bias [sd of the noise declared], correlation
+    time [s] and length [m], share of blocked paths; RSUs; whether the device moves, and whether it
+    stops in between; whether the RSUs are arrays."""
+
+    variance: float = 1.0
+    bias: float = 1.0
+    time_s: float = 60.0
+    length_m: float = math.inf
+    blocked: float = 0.0
+    rsus: int = 5
+    moving: bool = True
+    stops: bool = False
+    arrays: bool = False
+
+    @property
+    def noise_sd(self) -> float:
+        """Declared [m], or of a direction cosine."""
+        return math.radians(5.0) if self.arrays else 0.1
+
+    @property
+    def rate_hz(self) -> float:
+        """Of measurements of each RSU."""
+        return 10.0 if self.arrays else 5.0
+
+
+def walk(case: Case, times: Array) -> Array:
+    """(n, 2) m: a loop in the yard or in the room, all the time or by turns, or a place."""
+    if not case.moving:
+        return np.tile([8.0, 2.0] if case.arrays else [2.0, -1.5], (times.size, 1))
+    if case.stops:
+        rounds, begun_s = np.divmod(times, STOP_AND_GO_S)
+        times = GO_S * rounds + np.minimum(begun_s, GO_S)
+    if case.arrays:
+        return _in_room(WALK_MPS * times)
+    angle = times / 8.0
+    return np.column_stack([8.0 * np.cos(angle), 5.0 * np.sin(angle)])
+
+
+def _in_room(way_m: Array) -> Array:
+    """(n, 2) m on an ellipse about the middle of the room, ``way_m`` (n,) from its start."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 721)
+    loop = np.column_stack([6.0 + 4.0 * np.cos(angle), 3.0 + 1.8 * np.sin(angle)])
+    along = np.concatenate([[0.0], np.linalg.norm(np.diff(loop, axis=0), axis=1).cumsum()])
+    return np.column_stack([np.interp(way_m % along[-1], along, axis) for axis in loop.T])
+
+
+def anchors(case: Case) -> Array:
+    """(n, 3) m, evenly around the yard, or on the four walls."""
+    if case.arrays:
+        return INWARDS_M
+    angle = 2.0 * np.pi * (np.arange(case.rsus) + 0.3) / case.rsus
+    return np.column_stack([15.0 * np.cos(angle), 12.0 * np.sin(angle), np.full(case.rsus, 3.0)])
+
+
+def decays(case: Case, places: Array) -> Array:
+    """(n - 1,): what is left of a bias from one of ``places`` (n, 2) to the next."""
+    way_m = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    per_s = math.inf if case.time_s == 0.0 else 1.0 / case.time_s
+    left: Array = np.exp(-per_s / case.rate_hz - way_m / case.length_m)
+    return left
+
+
+def true_values(case: Case, places: Array) -> Array:
+    """(n, rsus, k): ranges, k = 1, or direction cosines along the y and z axes of arrays."""
+    device = np.column_stack([places, np.full(len(places), DEVICE_M[case.arrays])])
+    offset = device[:, None] - anchors(case)
+    distance = np.linalg.norm(offset, axis=2)
+    if not case.arrays:
+        return distance[:, :, None]
+    across = offset[:, :, 1] * np.cos(FACING_RAD) - offset[:, :, 0] * np.sin(FACING_RAD)
+    return np.stack([across, offset[:, :, 2]], axis=2) / distance[:, :, None]
+
+
+def measured(case: Case, seed: int) -> tuple[Array, Array]:
+    """True places (n, 2) and what is measured there (n, rsus, k) in one run."""
+    rng = np.random.default_rng(seed)
+    times = np.arange(0.0, DURATION_S, 1.0 / case.rate_hz)
+    places = walk(case, times)
+    values = true_values(case, places)
+    noise_sd, bias_sd = math.sqrt(case.variance) * case.noise_sd, case.bias * case.noise_sd
+    bias = np.empty_like(values)
+    bias[0] = rng.normal(0.0, bias_sd, values.shape[1:])
+    for k, decay in enumerate(decays(case, places).tolist(), start=1):
+        step_sd = bias_sd * math.sqrt(1.0 - decay**2)
+        bias[k] = decay * bias[k - 1] + rng.normal(0.0, step_sd, values.shape[1:])
+    late = rng.exponential(3.0, values.shape) * (rng.random(values.shape) < case.blocked)
+    seen = values + bias + rng.normal(0.0, noise_sd, values.shape) + late
+    return places, np.clip(seen, -0.99, 0.99) if case.arrays else seen
+
+
+def tracker_of(case: Case, places: Array, *, told: bool, learn: bool) -> tuple[Tracker, float]:
+    """A tracker that knows the RSUs, and the variance that they state. ``told``: noise, bias and
+    its correlation time on the way along ``places`` (n, 2) are the true ones."""
+    variance = (case.variance if told else 1.0) * case.noise_sd**2
+    bias_sd, time_s = case.bias * case.noise_sd, 0.0
+    if told and case.time_s > 0.0:
+        rate = -case.rate_hz * float(np.log(decays(case, places)).mean())
+        time_s = 1.0 / max(rate, 1e-6)
+    elif told:
+        variance += bias_sd**2
+    config = TrackerConfig(
+        accel_density_mps2_sqrthz=0.3,
+        initial_speed_sd_mps=1.0,
+        learn_errors=learn,
+        nlos_probability=0.2 if case.blocked > 0.0 else 0.0,
+        nlos_mean_excess_m=3.0,
+    )
+    if case.arrays:
+        config = replace(
+            config,
+            accel_density_mps2_sqrthz=0.6,  # v^2 / T of a person at 1.3 m/s, turns of some seconds
+            device_height_m=DEVICE_M[True],
+            coverage_radius_m=6.0,
+            gate_probability=1.0,
+            manoeuvre_speed_sd_mps=0.0,
+        )
+    tracker = Tracker(config)
+    tells = time_s > 0.0 and case.bias > 0.0
+    slow = {
+        "bias_correlation_time_s": time_s if tells else 0.0,
+        **{
+            f"{quantity}_sd_{unit}": bias_sd if tells and case.arrays == (unit == "rad") else 0.0
+            for quantity, unit in (
+                ("range_bias", "m"),
+                ("azimuth_bias", "rad"),
+                ("elevation_bias", "rad"),
+            )
+        },
+    }
+    for info in rsus_of(case):
+        tracker.add_rsu(replace(info, **slow))
+    return tracker, variance
+
+
+def rsus_of(case: Case) -> list[RsuInfo]:
+    """The RSUs, without slow errors."""
+    if not case.arrays:
+        return [RsuInfo(rsu_id=f"a{i}", position=p) for i, p in enumerate(anchors(case))]
+    return [
+        RsuInfo(
+            rsu_id=f"a{i}",
+            position=position,
+            quaternion=np.array([0.0, 0.0, math.sin(facing / 2.0), math.cos(facing / 2.0)]),
+            angle_convention=AngleConvention.CONE,
+        )
+        for i, (position, facing) in enumerate(zip(anchors(case), FACING_RAD, strict=True))
+    ]
+
+
+def message(
+    case: Case, stamp_ns: int, k: int, i: int, values: Array, var: float
+) -> RsuMeasurement:
+    """What the RSU ``i`` measures, ``values`` (k,), each of variance ``var``."""
+    bare = RsuMeasurement(
+        stamp_ns=stamp_ns, rsu_id=f"a{i}", vue_id="vue_1", sequence=k, expected=case.rsus
+    )
+    if not case.arrays:
+        return replace(bare, fields=Field.RANGE, range_m=float(values[0]), range_var=var)
+    angles, angle_vars = np.arcsin(values), var / (1.0 - values**2)
+    return replace(
+        bare,
+        fields=Field.AZIMUTH | Field.ELEVATION,
+        azimuth_rad=float(angles[0]),
+        azimuth_var=float(angle_vars[0]),
+        elevation_rad=float(angles[1]),
+        elevation_var=float(angle_vars[1]),
+    )
+
+
+def run(case: Case, seed: int, *, told: bool, learn: bool) -> tuple[Array, Array, Array]:
+    """True places (n, 2), estimated ones (n, 2) and their covariances (n, 2, 2); an epoch without
+    an estimate is not a number."""
+    places, seen = measured(case, seed)
+    tracker, variance = tracker_of(case, places, told=told, learn=learn)
+    means, covs = np.full_like(places, math.nan), np.full((len(places), 2, 2), math.nan)
+    for k, values in enumerate(seen):
+        stamp_ns = round(1e9 * (1.0 + k / case.rate_hz))
+        for i in range(case.rsus):
+            tracker.add(message(case, stamp_ns, k, i, values[i], variance))
+        for output in tracker.process():
+            if output.odometry is not None:
+                means[k] = output.odometry.position[:2]
+                covs[k] = output.odometry.pose_cov[:2, :2]
+    return places, means, covs
+
+
+def nees_of(errors: Array, covs: Array) -> Array:
+    """Squared errors (n, 2) over their covariances (n, 2, 2): (n,), 2 is expected."""
+    nees: Array = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covs), errors)
+    return nees
