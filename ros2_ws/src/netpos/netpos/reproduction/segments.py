@@ -212,10 +212,13 @@ class Follower:
         """Epoch and components of a first fix by the rows from ``first`` on; None where they do
         not suffice."""
         initialiser = Initialiser(self._config)
+        variance = np.append(epochs.bias[0] ** 2, 0.0)  # the last: no bias
         for k in range(first, epochs.stamps_ns.size):
             rows = epochs.rows[epochs.row_start[k] : epochs.row_start[k + 1]]
+            index = rows[:, BIAS].astype(int)
+            bias_var = variance[np.where(index < 0, -1, index - self.first_bias)]
             heard = tuple(self._rsus[i] for i in epochs.rsu[k] if i >= 0)
-            initialiser.add(int(epochs.stamps_ns[k]), rows, epochs.bias, heard)
+            initialiser.add(int(epochs.stamps_ns[k]), rows, bias_var, heard)
             fix = initialiser.solve()
             if fix is not None:
                 return k, fix

@@ -1,11 +1,11 @@
 """The first fix: the most probable state behind the first measurements, with the covariance it
 deserves.
 
-A maximum a posteriori fit of the state of the filter at the newest stamp, with the slow errors of
-the RSUs and the height where it is unknown, and of an acceleration, to all measurements of a short
-window: Gauss-Newton from several starts, under a prior as wide as the coverage of the RSUs, the
-initial speed and the clock allow. It takes any mixture of angles, times, ranges and fixes, and it
-waits while the measurements leave the position open.
+A maximum a posteriori fit of [x, y, vx, vy, clock, drift], and of the height where it is unknown,
+at the newest stamp to all measurements of a short window: Gauss-Newton from several starts, under
+a prior as wide as the coverage of the RSUs, the initial speed and the clock allow. It takes any
+mixture of angles, times, ranges and fixes, and it waits while the measurements leave the position
+open.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 
 from netpos.common.least_squares import minimise
-from netpos.estimation.accel_density import START
 from netpos.estimation.chi_square import chi_square_bound
 from netpos.estimation.fit import map_cost
 from netpos.estimation.fusion import workspace
@@ -30,6 +29,7 @@ from netpos.estimation.measurement import (
     COMMON,
     GROUP,
     HEADING,
+    HEIGHT,
     KIND,
     LEVER,
     ORIGIN,
@@ -45,10 +45,10 @@ from netpos.estimation.mixture.ring import RING_MERGE_COST
 from netpos.estimation.mixture.window import normal_equations
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.estimation.sensors.table import BY_KIND
-from netpos.estimation.state import N_CORE, X
+from netpos.estimation.state import N_CORE
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.models import carries_modes, height_state, initial_extra_sd
+from netpos.tracking.models import carries_modes
 from netpos.tracking.rsus import Rsu
 
 _REFINED = 12
@@ -62,9 +62,6 @@ _HEADINGS = 16
 _HEADING_SD_MAX = 0.5
 _RAY_M = (2.0, 6.0, 15.0, 40.0, 100.0)
 _CIRCLE = tuple(2.0 * math.pi * i / 12 for i in range(12))
-_LASTING_S = 0.1  # what lasts no longer is new at every epoch
-_ROUNDS = 3  # of the scale of slow errors
-_KNOWN = 1e-6  # sd of what is known
 
 
 Problem = tuple[Array, Array, float, Array, Array]
@@ -77,35 +74,15 @@ class _Solution(NamedTuple):
     problem: Problem
     fits: list[Fit]
 
-    def mixture(self, is_possible: Callable[[Array], bool]) -> Mixture:
-        """The posterior of the filter's state: that of the acceleration is left out."""
+    def mixture(self, misfit: float, is_possible: Callable[[Array], bool]) -> Mixture:
+        """The posterior; a ``misfit`` above 1 enlarges all variances."""
 
         def equations(state: Array) -> tuple[float, Array, Array]:
-            found: tuple[float, Array, Array] = normal_equations(state, *self.problem)
-            return found
+            cost, b, A = normal_equations(state, *self.problem)
+            return cost / misfit, b / misfit, A / misfit
 
-        means, covs, log_weights = components_of(equations, self.fits, is_possible)
-        end = means.shape[1] - 2
-        return Mixture(means[:, :end].copy(), covs[:, :end, :end].copy(), log_weights)
-
-    def scaled(self, noise: float, slow: float, first: int) -> _Solution:
-        """With variances of the rows, and of the slow errors from the entry ``first`` on, times
-        factors."""
-        ages, rows, height_m, prior, prior_var = self.problem
-        rows, prior_var = rows.copy(), prior_var.copy()
-        rows[:, VARIANCE] *= noise
-        prior_var[first:-2] *= slow
-        problem = ages, rows, height_m, prior, prior_var
-        fits = [_solve(state, problem) for _, state, _ in self.fits]
-        return _Solution(problem, sorted(fits, key=lambda fit: fit[0]))
-
-    def slow_misfit(self, first: int) -> float:
-        """Variance of the slow errors from the entry ``first`` on, by the best fit, over their
-        prior (MacKay 1992): squares over what the measurements say of them."""
-        prior_var = self.problem[4][first:-2]
-        _, mean, cov = self.fits[0]
-        known = float((1.0 - cov.diagonal()[first:-2] / prior_var).sum())
-        return float((mean[first:-2] ** 2 / prior_var).sum()) / max(known, 1.0)
+        fits = [(cost / misfit, mean, cov * misfit) for cost, mean, cov in self.fits]
+        return components_of(equations, fits, is_possible)
 
 
 def joined(mixtures: Sequence[Mixture]) -> Mixture:
@@ -135,8 +112,6 @@ class Initialiser:
     def __init__(self, config: TrackerConfig) -> None:
         self._config = config
         self._window: deque[tuple[int, Array, tuple[Rsu, ...]]] = deque()
-        self._slow = np.zeros((2, 0))
-        self._extra_sd, self._height = initial_extra_sd(config), height_state(config).entry
         self._next_attempt_ns = 0
         self.missing = ""
         """What a first fix lacks, for people; empty before the first attempt."""
@@ -144,34 +119,27 @@ class Initialiser:
     def copy(self) -> Initialiser:
         """An independent copy."""
         twin = Initialiser(self._config)
-        twin._window, twin._slow = self._window.copy(), self._slow
+        twin._window = self._window.copy()
         twin._next_attempt_ns = self._next_attempt_ns
         twin.missing = self.missing
         return twin
 
-    def add(self, stamp_ns: int, rows: Array, slow: Array, rsus: tuple[Rsu, ...]) -> None:
-        """Take the rows (m, ROW_WIDTH) of one epoch; ``slow`` (2, k): sd and time constant of the
-        slow states up to now, the first of which follow the motion model's own."""
+    def add(self, stamp_ns: int, rows: Array, bias_var: Array, rsus: tuple[Rsu, ...]) -> None:
+        """Take the rows (m, ROW_WIDTH) of one epoch; ``bias_var`` (m,) is the variance of the
+        biases in each."""
         rows = rows.copy()
-        rows[:, HEADING] = -1
-        first = N_CORE + self._extra_sd.size
-        sd, lasts = slow[0], slow[1] > _LASTING_S
-        for column in (BIAS, COMMON):
-            states = rows[:, column].astype(int) - first
-            new = (states >= 0) & ~np.append(lasts, True)[np.maximum(states, -1)]
-            rows[new, VARIANCE] += sd[states[new]] ** 2
-            rows[new, column] = -1
-        self._window.append((stamp_ns, rows, rsus))
-        self._slow = slow
+        rows[:, BIAS] = rows[:, COMMON] = rows[:, HEADING] = -1
+        rows[rows[:, HEIGHT] > 0, HEIGHT] = N_CORE
+        self._window.append((stamp_ns, np.column_stack([rows, bias_var]), rsus))
         oldest = stamp_ns - int(self._config.initial_window_s * 1e9)
         while self._window[0][0] < oldest:
             self._window.popleft()
 
     def solve(self) -> Mixture | None:
-        """State of the filter at the newest stamp, with the motion model's own states and the slow
-        ones, as a mixture: a place that is a thin arc is a row of components, and places that
-        cannot be told apart are modes. None while the position is open, or for most of the window
-        while there are several modes.
+        """State (6,) at the newest stamp, the height of the device over its mean as the seventh
+        where it is unknown, as a mixture: a place that is a thin arc is a row of components, and
+        places that cannot be told apart are modes. None while the position is open, or for most
+        of the window while there are several modes.
 
         Where the measurements contradict each other and leaving out one of three or more RSUs
         makes them agree, the fix is that of the others.
@@ -204,7 +172,7 @@ class Initialiser:
                 " they in m, rad and s, and the RSUs where RsuInfo says?"
             )
             return None
-        mixture = joined([self._scaled(s, misfit).mixture(self._plausible) for s in solutions])
+        mixture = joined([s.mixture(misfit, self._plausible) for s in solutions])
         waited_s = (newest - self._window[0][0]) * 1e-9
         waits = waited_s < 0.8 * self._config.initial_window_s or not carries_modes(self._config)
         if waits and has_modes(mixture, _RIVAL_SHARE):
@@ -270,18 +238,6 @@ class Initialiser:
                 solutions.append(_Solution(problem, fits))
         return sorted(solutions, key=lambda solution: solution.fits[0][0])
 
-    def _scaled(self, solution: _Solution, misfit: float) -> _Solution:
-        """With the variances of the rows, and the prior of the errors that last, as large as the
-        fit says; no smaller than they are."""
-        first = N_CORE + self._extra_sd.size + (1 if self._height else 0)
-        solution = solution.scaled(misfit, misfit, first) if misfit > 1.0 else solution
-        for _ in range(_ROUNDS if self._slow.shape[1] else 0):
-            slow = solution.slow_misfit(first)
-            if slow <= 1.0:
-                break
-            solution = solution.scaled(1.0, slow, first)
-        return solution
-
     def _problem(self, rows: Array, ages: Array) -> Problem:
         cfg = self._config
         c = SPEED_OF_LIGHT_MPS
@@ -289,14 +245,14 @@ class Initialiser:
         fixes = rows[rows[:, KIND] == Kind.LINEAR]
         centre = origins.mean(axis=0) if len(origins) else np.zeros(2)
         reach = cfg.coverage_radius_m if len(origins) or not len(fixes) else 1e6
-        core_sd = np.array([reach, reach, *([cfg.initial_speed_sd_mps] * 2)])
-        clock_sd = c * np.array([cfg.clock_offset_sd_s, cfg.clock_drift_sd])
-        accel_sd = _acceleration_sd(cfg, -float(ages.min()))
-        sd = [core_sd, clock_sd, self._extra_sd, self._slow[0], np.full(2, accel_sd)]
-        prior_var = np.maximum(np.concatenate(sd), _KNOWN) ** 2
-        prior = np.zeros(prior_var.size)
-        prior[:2], prior[X.DRIFT] = centre, c * cfg.clock_drift_mean
-        return ages, rows, cfg.device_height_m, prior, prior_var
+        prior = np.array([*centre, 0.0, 0.0, 0.0, c * cfg.clock_drift_mean])
+        sd = np.array([reach, reach, *([cfg.initial_speed_sd_mps] * 2)])
+        clock_sd = c * np.array([cfg.clock_offset_sd_s, max(cfg.clock_drift_sd, 1e-15)])
+        prior_var = np.concatenate([sd, np.maximum(clock_sd, 1e-6)]) ** 2
+        if cfg.device_height_sd_m > 0.0:
+            prior = np.append(prior, 0.0)
+            prior_var = np.append(prior_var, cfg.device_height_sd_m**2)
+        return ages, _bias_inflated(rows), cfg.device_height_m, prior, prior_var
 
     def _fits(self, rows: Array, problem: Problem) -> list[Fit]:
         """Solutions from the most promising starts, best first."""
@@ -322,10 +278,7 @@ class Initialiser:
         }
         for rsu in heard.values():
             dx, dy = state[:2] - rsu.info.position[:2]
-            height_m = self._config.device_height_m
-            if self._height:
-                height_m += state[self._height]
-            dz = height_m - rsu.info.position[2]
+            dz = self._config.device_height_m + state[N_CORE:].sum() - rsu.info.position[2]
             near = dx * dx + dy * dy + dz * dz < _NEAREST_M**2
             if not rsu.in_front(dx, dy) or (near and tuple(rsu.info.position) not in ranged):
                 return False
@@ -371,14 +324,17 @@ def _is_sound(fit: Fit) -> bool:
     return bool(math.isfinite(cost) and np.linalg.eigvalsh(cov[:2, :2])[0] > 0.0)
 
 
-def _acceleration_sd(config: TrackerConfig, span_s: float) -> float:
-    """sd per axis [m/s^2] of a constant acceleration that takes a device in ``span_s`` as far as
-    white acceleration does: q^2 t^3 / 3 = sd^2 t^4 / 4. Other process noises are of papers, whose
-    devices go straight on in a window."""
-    if config.process_noise != "continuous":
-        return 0.0
-    density = config.accel_density_mps2_sqrthz or START
-    return 2.0 * density / math.sqrt(3.0 * max(span_s, _LASTING_S))
+def _bias_inflated(rows: Array) -> Array:
+    """Rows with a variance under which averaging many biased values never beats the bias.
+
+    A bias shared by k rows of the same sensor counts k times in each, so that their mean keeps the
+    bias' variance.
+    """
+    rows, bias_var = rows[:, :-1].copy(), rows[:, -1]
+    sensors, sensor = np.unique(rows[:, [KIND, *range(ORIGIN, AXES)]], axis=0, return_inverse=True)
+    count = np.bincount(sensor.reshape(-1), minlength=len(sensors))
+    rows[:, VARIANCE] += count[sensor.reshape(-1)] * bias_var
+    return rows
 
 
 def _starts(rows: Array, centre: Array) -> list[Array]:

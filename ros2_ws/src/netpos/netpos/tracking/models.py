@@ -137,11 +137,19 @@ def slow_states(config: TrackerConfig, learned: LearnedErrors | None = None) -> 
 
 def start_state(config: TrackerConfig, mean: Array, cov: Array) -> tuple[Array, Array]:
     """Mean and covariance that a filter starts from: core states (6,), (6, 6), to which the
-    motion model's own states and the height come. What has all of them stays as it is."""
-    sd = initial_extra_sd(config)
-    if height_state(config).entry:
-        sd = np.append(sd, config.device_height_sd_m)
-    return augmented(mean, cov, sd)
+    motion model's own states and the height come; a height that was fitted with them is the
+    seventh. What has all of them stays as it is."""
+    height = height_state(config).entry
+    if not height:
+        return augmented(mean, cov, initial_extra_sd(config))
+    sd = np.append(initial_extra_sd(config), config.device_height_sd_m)
+    if mean.size in (N_CORE, N_CORE + sd.size):
+        return augmented(mean, cov, sd)
+    fitted = [*range(N_CORE), height]
+    start, start_cov = np.zeros(height + 1), np.diag(np.append(np.zeros(N_CORE), np.square(sd)))
+    start[fitted] = mean
+    start_cov[np.ix_(fitted, fitted)] = cov
+    return start, start_cov
 
 
 def pose_state(config: TrackerConfig, position: Array, position_cov: Array) -> tuple[Array, Array]:

@@ -13,7 +13,7 @@ from netpos.estimation.fit import innovations_with_sd
 from netpos.estimation.measurement import VARIANCE
 from netpos.estimation.mixture.gaussians import Mixture, moments, one_component
 from netpos.estimation.protection import level_of_epochs
-from netpos.estimation.state import N_CORE, POSITION, VELOCITY
+from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import (
     Array,
     InitialPose,
@@ -137,7 +137,7 @@ class PlanarEstimator(Estimator):
     def pose_cost(self, stamp_ns: int, pose: InitialPose, recent: Recent | None) -> float:
         window = self._initialiser if recent is None else Initialiser(self._config)
         for then_ns, rows in recent or ():
-            window.add(then_ns, rows.rows, self.bias, self.heard(rows))
+            window.add(then_ns, rows.rows, rows.slow_variance(self.biases), self.heard(rows))
         return self._excess_cost(window, stamp_ns, pose)
 
     def start_from_pose(self, stamp_ns: int, pose: InitialPose) -> bool:
@@ -156,7 +156,7 @@ class PlanarEstimator(Estimator):
         pose = self._pose_at(stamp_ns)
         if pose is None:
             heard = self.heard(epoch_rows)
-            self._initialiser.add(stamp_ns, epoch_rows.rows, self.bias, heard)
+            self._initialiser.add(stamp_ns, epoch_rows.rows, bias_var, heard)
         fix = one_component(*pose) if pose is not None else self._initialiser.solve()
         if fix is None:
             return FirstFix(False)
@@ -164,8 +164,7 @@ class PlanarEstimator(Estimator):
             rows = epoch_rows.rows.copy()
             rows[:, VARIANCE] += bias_var
             mean, cov = moments(fix)
-            core = mean[:N_CORE], cov[:N_CORE, :N_CORE]
-            turned = with_heading(*core, rows, self._config.device_height_m)
+            turned = with_heading(mean, cov, rows, self._config.device_height_m)
             if turned is None:
                 self._initialiser.missing = _OPEN_HEADING
                 return FirstFix(False, refused="heading_open")

@@ -18,8 +18,6 @@ from netpos.estimation.conditioning import Robust
 from netpos.estimation.engine import is_sound
 from netpos.estimation.error_state import MEMORY, Imu, Sensors, advance, correct, doubt_standstill
 from netpos.estimation.measurement import (
-    BIAS,
-    COMMON,
     GATE_VARIANCE,
     GROUP,
     HEADING,
@@ -45,7 +43,6 @@ from netpos.estimation.state import (
     ERR_CLOCK_DRIFT,
     ERR_GYRO_BIAS,
     ERR_POSITION,
-    N_CORE,
     NAV_CLOCK_DRIFT,
     NAV_GYRO_BIAS,
     NAV_POSITION,
@@ -143,14 +140,12 @@ def innovations_with_sd_3d(rows: Array, nav: Array, cov: Array) -> Array:
 
 def planar_rows(rows: Array, height_m: float) -> Array:
     """``rows`` (m, ROW_WIDTH) of a spatial epoch as those of a device at ``height_m``: a direction
-    of a position fix as a LINEAR row, speeds in base_link left out, biases behind the core."""
+    of a position fix as a LINEAR row, speeds in base_link left out."""
     planar: Array = rows[rows[:, KIND] != Kind.BODY_VELOCITY]
     fixes = planar[:, KIND] == Kind.PLACE
     planar[fixes, VALUE] -= planar[fixes, ORIGIN + 2] * height_m
     planar[fixes, ORIGIN + 2 : HEADING] = 0.0
     planar[fixes, KIND] = Kind.LINEAR
-    for column in (BIAS, COMMON):
-        planar[planar[:, column] >= 0.0, column] -= ERR_BIASES - N_CORE
     return planar
 
 
@@ -265,8 +260,9 @@ class SpatialEstimator(Estimator):
             height_m = float(np.clip(estimate.nav[Nav.PZ], -_HEIGHT_MAX_M, _HEIGHT_MAX_M))
         window = Initialiser(replace(self._config, device_height_m=height_m))
         for then_ns, epoch_rows in self._heard if recent is None else recent:
-            flat = planar_rows(epoch_rows.rows, height_m)
-            window.add(then_ns, flat, self.bias, self.heard(epoch_rows))
+            flat = replace(epoch_rows, rows=planar_rows(epoch_rows.rows, height_m))
+            bias_var = flat.slow_variance(self.biases)
+            window.add(then_ns, flat.rows, bias_var, self.heard(epoch_rows))
         return self._excess_cost(window, stamp_ns, pose)
 
     def start_from_pose(self, stamp_ns: int, pose: InitialPose) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.rows import rsu_rows
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
@@ -65,12 +64,12 @@ def solve(
 ) -> tuple[Array, Array] | None:
     initialiser = Initialiser(config)
     rows = np.vstack([measure(s, state, fields, rng, group=i) for i, s in enumerate(stations)])
-    initialiser.add(T0, rows, NO_BIAS, tuple(stations))
+    initialiser.add(T0, rows, np.zeros(len(rows)), tuple(stations))
     return fix_of(initialiser)
 
 
 def fix_of(initialiser: Initialiser) -> tuple[Array, Array] | None:
-    """Mean (n,) and covariance (n, n) of a first fix."""
+    """Mean (6,) and covariance (6, 6) of a first fix."""
     fix = initialiser.solve()
     if fix is None:
         return None

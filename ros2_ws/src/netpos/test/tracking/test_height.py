@@ -232,20 +232,18 @@ def test_the_first_fix_is_that_of_least_squares(seed: int) -> None:
     said = fed(tracker(), items)[-1].odometry
     assert said is not None
 
-    def residuals(p: Array, noise: float = 1.0) -> Array:
-        sd = noise * SD_M
-        left = [(np.linalg.norm(p - HALL[m.rsu_id]) - m.range_m) / sd for m in items]
+    def residuals(p: Array) -> Array:
+        left = [(np.linalg.norm(p - HALL[m.rsu_id]) - m.range_m) / SD_M for m in items]
         return np.array([*left, (p[2] - MEAN_M) / HEIGHT_SD_M, *(p[:2] - [4.0, 3.0]) / 20.0])
 
     found = least_squares(residuals, [4.0, 3.0, MEAN_M])
-    noise = math.sqrt(max(1.0, 2.0 * found.cost / len(items)))
-    found = least_squares(residuals, found.x, args=(noise,))
+    misfit = max(1.0, 2.0 * found.cost / len(items))
     # The posterior about it, summed over samples: where it bends, its mean is not its top.
-    width = 1.5 * np.linalg.cholesky(np.linalg.inv(found.jac.T @ found.jac))
+    width = 1.5 * np.linalg.cholesky(misfit * np.linalg.inv(found.jac.T @ found.jac))
     unit = rng.normal(size=(20000, 3))
     points = found.x + unit @ width.T
-    cost = np.array([(residuals(p, noise) ** 2).sum() for p in points])
-    weights = np.exp(-0.5 * (cost - cost.min()) + 0.5 * (unit**2).sum(axis=1))
+    cost = np.array([(residuals(p) ** 2).sum() for p in points])
+    weights = np.exp(-0.5 * (cost - cost.min()) / misfit + 0.5 * (unit**2).sum(axis=1))
     mean = np.average(points, axis=0, weights=weights)
     cov = np.cov(points.T, aweights=weights)
     sd = np.sqrt(np.diag(cov))
@@ -411,16 +409,19 @@ def test_anchors_heard_after_a_silence_split_and_join_again() -> None:
 
 
 def test_where_the_states_of_a_start_go() -> None:
-    """The core, then two states of a motion model, then the height."""
+    """Fitted core and height, round two states of a motion model."""
     config = TrackerConfig(
         motion_model="constant_acceleration", accel_state_sd_mps2=2.0, device_height_sd_m=0.5
     )
-    mean, A = np.arange(6.0), np.random.default_rng(1).normal(size=(6, 6))
+    mean, A = np.arange(7.0), np.random.default_rng(1).normal(size=(7, 7))
     x, P = start_state(config, mean, A @ A.T)
-    np.testing.assert_array_equal(x, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 0.0, 0.0, 0.0])
-    np.testing.assert_array_equal(P[:6, :6], A @ A.T)
-    np.testing.assert_array_equal(P[6:, 6:], np.diag([4.0, 4.0, 0.25]))
-    assert not P[6:, :6].any()
+    np.testing.assert_array_equal(x, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 0.0, 0.0, 6.0])
+    fitted = [0, 1, 2, 3, 4, 5, 8]
+    np.testing.assert_array_equal(P[np.ix_(fitted, fitted)], A @ A.T)
+    np.testing.assert_array_equal(P[6:8, 6:8], 4.0 * np.eye(2))
+    assert not P[6:8][:, fitted].any()
+    x, P = start_state(config, mean[:6], np.eye(6))
+    assert (x[8], P[8, 8]) == (0.0, 0.25)
     assert start_state(config, x, P)[0] is x
 
 
