@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -151,8 +151,18 @@ def settings_from(source: str) -> TrackerSettings:
             vue_ids = sorted({topics.split(topic)[0] for topic in bag.topics} - {""})
             known = TRACKER_FACT in bag.facts or FUSION_FACT in bag.facts
             settings = bag_settings(bag) if known else DEFAULTS
-            return replace(settings, vue_ids=tuple(vue_ids) or DEFAULTS.vue_ids)
+            devices, names = tuple(vue_ids) or DEFAULTS.vue_ids, _names_in(bag.topics)
+            return replace(settings, vue_ids=devices, names=names)
     return _scenario_settings(source)
+
+
+def _names_in(bag_topics: Iterable[str]) -> dict[str, tuple[str, ...]]:
+    """Names that networks give devices, by network, as the topics of a bag have them."""
+    names: dict[str, set[str]] = {}
+    for network, vue_id, _ in map(topics.split_network, bag_topics):
+        if network:
+            names.setdefault(network, set()).add(vue_id)
+    return {network: tuple(sorted(own)) for network, own in names.items()}
 
 
 def _scenario_settings(source: str) -> TrackerSettings:

@@ -77,10 +77,17 @@ def test_settings_of_scenario_and_bag(simulated: Path) -> None:
         settings = settings_from(source)
         assert settings.networks == ("wimax", "wifi")
         assert settings.fusion["hold_s"] == 2.0
-    named = settings_from("two_networks")
-    assert named.names_by("wifi") == ("wifi_1",)
-    assert named.names_by("wimax") == ("vue_1",)
     assert settings_from("fast_pass").networks == ()
+
+
+def test_names_that_networks_give_devices(simulated: Path, tmp_path: Path) -> None:
+    """Of a scenario, and of a bag that holds estimates of the networks."""
+    out = tmp_path / "out"
+    replay_bag(simulated, out)
+    for source in ("two_networks", str(out)):
+        settings = settings_from(source)
+        assert settings.names_by("wifi") == ("wifi_1",)
+        assert settings.names_by("wimax") == ("vue_1",)
 
 
 def test_a_single_network_has_no_fusion_to_set(tmp_path: Path) -> None:
