@@ -84,10 +84,10 @@ def test_names_that_networks_give_devices(simulated: Path, tmp_path: Path) -> No
     """Of a scenario, and of a bag that holds estimates of the networks."""
     out = tmp_path / "out"
     replay_bag(simulated, out)
-    for source in ("two_networks", str(out)):
-        settings = settings_from(source)
-        assert settings.names_by("wifi") == ("wifi_1",)
-        assert settings.names_by("wimax") == ("vue_1",)
+    for source, count in (("two_networks", 1), (str(out), 2)):
+        settings, numbers = settings_from(source), range(1, count + 1)
+        assert settings.names_by("wifi") == tuple(f"wifi_{k}" for k in numbers)
+        assert settings.names_by("wimax") == tuple(f"vue_{k}" for k in numbers)
 
 
 def test_a_single_network_has_no_fusion_to_set(tmp_path: Path) -> None:
