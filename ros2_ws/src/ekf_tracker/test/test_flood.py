@@ -50,7 +50,7 @@ def test_a_flood_makes_no_device_known(make: Any) -> None:
     know_rsus(node)
     for k in range(40):
         arrive(node, "/rsu/measurements", measurement("a", 0.1, f"device_{k // 10}"))
-    assert {"device_0", "device_1"} == set(node.tracker._tracks)
+    assert {"device_0", "device_1"} == set(node.tracker.rejected())
 
 
 def topics_of(node: EkfTrackerNode, device: str) -> set[str]:
@@ -127,7 +127,7 @@ def test_many_new_devices_get_their_topics_one_after_the_other(
         for k in range(8):
             drive(node, range(first, first + 2), f"new_{k}")
         assert len(node._outputs) == 1 + count
-    assert len(node.tracker._tracks) == 8
+    assert len(node.tracker.rejected()) == 8
 
 
 def test_a_device_that_was_silent_makes_room_and_its_topics_go(make: Any) -> None:
@@ -142,7 +142,7 @@ def test_a_device_that_was_silent_makes_room_and_its_topics_go(make: Any) -> Non
     drive(node, range(20, 22), "second")
     assert "/second/odometry" in topics_of(node, "second")
     assert not topics_of(node, "first")
-    assert list(node.tracker._tracks) == ["second"]
+    assert list(node.tracker.rejected()) == ["second"]
 
 
 ALONE = {"expected": 1, "fields": Field.AZIMUTH}
