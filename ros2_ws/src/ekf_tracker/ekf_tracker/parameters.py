@@ -47,7 +47,7 @@ class Parameters:
         self._settings = settings_from(declare(node, "scenario", "", text))
         defaults = TrackerConfig.from_mapping(self._settings.parameters)
         config = declare_config(node, TrackerConfig, asdict(defaults), read_only=False)
-        text = "devices whose topics exist from the start; others appear when first heard"
+        text = "devices whose topics exist from the start; others appear with their first fix"
         names = list(self._settings.names_by(config.network))
         declare(node, "vues", names, text, read_only=False)
         text = "YAML or CSV file with the network's own RSUs; default: the list of the bag, if any"
