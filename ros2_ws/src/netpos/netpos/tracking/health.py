@@ -225,12 +225,16 @@ class RsuHealth:
         for item in items:
             if isinstance(item, RsuMeasurement) and (
                 self.excluded(item.rsu_id, stamp_ns)
-                or (self._probation.holds(item.rsu_id, item.vue_id, stamp_ns) and not agrees(item))
+                or (self.is_on_probation(item.rsu_id, item.vue_id, stamp_ns) and not agrees(item))
             ):
                 watched.append(item)
             else:
                 used.append(item)
         return used, watched
+
+    def is_on_probation(self, rsu_id: str, vue_id: str, stamp_ns: int) -> bool:
+        """Whether an RSU is too new to have a vote in a measurement of this device and stamp."""
+        return self._with_probation and self._probation.holds(rsu_id, vue_id, stamp_ns)
 
     def excluded(self, rsu_id: str, stamp_ns: int) -> bool:
         """Whether a measurement of this RSU with this stamp is to be refused."""
@@ -315,9 +319,7 @@ class RsuHealth:
     def _is_held(self, rsu_id: str, vote: Vote) -> bool:
         """Whether an RSU was on probation in a slot."""
         newest = vote.entries[-1]
-        return self._with_probation and self._probation.holds(
-            rsu_id, newest.vue_id, newest.stamp_ns
-        )
+        return self.is_on_probation(rsu_id, newest.vue_id, newest.stamp_ns)
 
     def _extend(self, rsu_id: str, against: list[Vote], agree: list[Vote]) -> None:
         """Lengthen the run of verdicts the majority of devices is for, end the other."""
@@ -419,7 +421,7 @@ class RsuHealth:
                 consistent_s = (rsu.agrees.last_ns - rsu.agrees.first_ns) * 1e-9
                 faults.append(f"consistent again for {consistent_s:.0f} s")
             return RsuState.EXCLUDED, "; ".join(faults)
-        if rsu.window and self._probation.holds(rsu_id, rsu.last_vue, rsu.last_ns):
+        if rsu.window and self.is_on_probation(rsu_id, rsu.last_vue, rsu.last_ns):
             faults.append("new: used where it agrees with the RSUs that track already")
         if rsu.against is not None and rsu.against.count >= _SPEAKS:
             faults.append(rsu.cause)

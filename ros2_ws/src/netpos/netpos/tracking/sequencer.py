@@ -12,7 +12,7 @@ result depends on stamps alone, never on a clock.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -77,18 +77,18 @@ class Epoch:
     _expected: int = 0
     _poses: int = 0
 
-    def put(self, key: tuple[str, str], item: Item) -> None:
-        """Take an item under its channel and source; a second one of an RSU withdraws both."""
+    def put(self, key: tuple[str, str], item: Item, *, awaited: bool = True) -> None:
+        """Take an item under its channel and source; a second one of an RSU withdraws both.
+        ``awaited``: whether it is among those that the epoch is complete with."""
         if key[0] == RSU and (key in self.items or key in self.withdrawn):
             self.items.pop(key, None)
             self.withdrawn |= {key}
             return
         self.items[key] = item
-        if key[0] == RSU:
+        if key[0] == RSU and awaited:
             self._measured += 1
             self._expected = max(self._expected, item.expected)  # type: ignore[union-attr]
-        elif key[0] == POSE:
-            self._poses += 1
+        self._poses += key[0] == POSE
 
     def sorted(self) -> Iterator[Item]:
         """Items in the order in which they are applied."""
@@ -98,7 +98,7 @@ class Epoch:
 
     @property
     def measured(self) -> int:
-        """RSU measurements that are here."""
+        """RSU measurements awaited that are here."""
         return self._measured
 
     def rsu_complete(self, least: int = 0, silenced: int = 0) -> bool:
@@ -160,18 +160,21 @@ class Sequencer:
         live_ns: int = _LIVE_NS,
         tick_ns: int = 0,
         clocks: Clocks | None = None,
+        awaits: Callable[[RsuMeasurement], bool] | None = None,
     ) -> None:
         """``needs_pose``: nothing is complete before an initial pose, so that it is waited for.
 
         ``history_ns``: how much older than the newest applied epoch an item may be. ``future_ns``:
         an only source this far ahead counts once its next stamp confirms it. ``clocks``: those of
-        the device as known before a new start. ``live_ns``: a
+        the device as known before a new start. ``awaits``: whether an epoch waits for the RSU of
+        a measurement, and for those that it announces; None: for all. ``live_ns``: a
         channel this far, or ``max_delay_ns``, behind the newest stamp is not waited for.
         ``tick_ns``: once an RSU was heard, an epoch, without items if need be, at every multiple
         of it that the IMU reaches; 0: none.
         """
         self._max_delay_ns = max_delay_ns
         self._needs_pose = needs_pose
+        self._awaits = awaits
         self._history_ns = history_ns
         self.clocks = clocks or Clocks(future_ns)
         """Whose clock is right; outlasts a new start."""
@@ -218,7 +221,8 @@ class Sequencer:
     def _admit(self, item: Item, stamp: int) -> str | None:
         """Put an item into its epoch."""
         key = channel_and_source(item)
-        if key[0] == RSU:
+        awaited = self._is_awaited(item)
+        if awaited:
             behind = max(self._watermark.get(RSU, stamp) - stamp, 0)
             self._delays.arrived(key[1], stamp, behind)
         in_past = stamp <= self._released_ns and not isinstance(item, InitialPose)
@@ -234,7 +238,7 @@ class Sequencer:
             epoch = self._pending[stamp] = Epoch(stamp)
         fault, withdraws = self._second(epoch, key, item, [])
         if fault is None or withdraws:
-            epoch.put(key, item)
+            epoch.put(key, item, awaited=awaited)
         if fault is not None:
             return fault
         self.mark(key[0], stamp)
@@ -242,6 +246,12 @@ class Sequencer:
         complete = epoch.rsu_complete(self._delays.count, self.silenced)
         self.idle = alone and not complete and not self._waiting
         return None
+
+    def _is_awaited(self, item: Item) -> bool:
+        """Whether epochs wait for the RSU of an item."""
+        if not isinstance(item, RsuMeasurement):
+            return False
+        return self._awaits is None or self._awaits(item)
 
     def mark(self, channel: str, stamp_ns: int) -> None:
         """Note that a channel has reached a stamp."""
@@ -308,8 +318,8 @@ class Sequencer:
             self._late.append((stamp, item))
         if fault is not None:
             return fault
-        if key[0] == RSU and epoch is not None and epoch.rsu_complete():
-            more = sum(s == stamp for s, _ in self._late)
+        if self._is_awaited(item) and epoch is not None and epoch.rsu_complete():
+            more = sum(s == stamp and self._is_awaited(i) for s, i in self._late)
             self._delays.announced_too_few(epoch.measured + more)
         return None
 

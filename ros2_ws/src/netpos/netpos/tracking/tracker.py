@@ -425,8 +425,13 @@ class Tracker:
                 int(self._config.max_future_s * 1e9),
                 tick_ns=round(1e9 / rate_hz) if rate_hz > 0.0 else 0,
                 clocks=self._clocks.pop(vue_id, None),
+                awaits=self._is_awaited,
             )
         return self._sequencers[vue_id]
+
+    def _is_awaited(self, item: RsuMeasurement) -> bool:
+        """Whether epochs wait for an RSU: one that has yet to prove itself delays nobody."""
+        return not self._health.is_on_probation(item.rsu_id, item.vue_id, item.stamp_ns)
 
     def track(self, vue_id: str) -> Track:
         """Track of a device, new where there is none."""

@@ -502,3 +502,29 @@ def test_of_too_few_announced_one_that_goes_away_is_waited_for_once() -> None:
         sequencer.add(item)
         found.append(stamps_ms(sequencer.release()))
     assert found == [[], [], [420], [440], [], [460]]
+
+
+@pytest.mark.parametrize("expected", [0, 1, 50])
+def test_an_rsu_that_is_not_awaited_completes_and_delays_nothing(expected: int) -> None:
+    s = Sequencer(HOLD, history_ns=2 * HOLD, awaits=lambda m: m.rsu_id != "new")
+    assert s.add(rsu(100, "a", expected=2)) is None
+    assert s.add(rsu(100, "new", expected)) is None
+    assert s.release() == []
+    assert s.add(rsu(100, "b", expected=2)) is None
+    assert [list(epoch.items) for epoch in s.release()] == [
+        [("rsu", "a"), ("rsu", "new"), ("rsu", "b")]
+    ]
+
+
+def test_more_measurements_than_announced_make_epochs_wait_only_if_awaited() -> None:
+    for awaited in (True, False):
+        s = Sequencer(HOLD, history_ns=2 * HOLD, awaits=lambda m, a=awaited: a or m.rsu_id == "a")
+        at_once = 0
+        for k in range(1, 8):
+            assert s.add(rsu(100 * k, "a", expected=1)) is None
+            at_once += 100 * k in stamps_ms(s.release())
+            for extra in "bcd":
+                assert s.add(rsu(100 * k, extra, expected=1)) is None
+            s.release()
+            s.take_late()
+        assert at_once == (1 if awaited else 7)
