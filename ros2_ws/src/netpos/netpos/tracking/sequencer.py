@@ -75,6 +75,7 @@ class Epoch:
     withdrawn: frozenset[tuple[str, str]] = frozenset()
     _measured: int = 0
     _expected: int = 0
+    _watched: int = 0
     _poses: int = 0
 
     def put(self, key: tuple[str, str], item: Item, *, awaited: bool = True) -> None:
@@ -85,7 +86,9 @@ class Epoch:
             self.withdrawn |= {key}
             return
         self.items[key] = item
-        if key[0] == RSU and awaited:
+        if key[0] == RSU and not awaited:
+            self._watched += 1
+        elif key[0] == RSU:
             self._measured += 1
             self._expected = max(self._expected, item.expected)  # type: ignore[union-attr]
         self._poses += key[0] == POSE
@@ -103,9 +106,10 @@ class Epoch:
 
     def rsu_complete(self, least: int = 0, silenced: int = 0) -> bool:
         """Every RSU measurement announced by ``expected`` is here, but for those of ``silenced``
-        RSUs, and at least as many as ``least``; False where the number is not announced."""
+        RSUs, and at least as many as ``least``; False where the number is not announced, or where
+        nobody awaited has spoken yet."""
         if not self._measured:
-            return True
+            return self._watched == 0
         return 0 < self._expected <= self._measured + silenced and least <= self._measured
 
     def is_late_pose(self) -> bool:

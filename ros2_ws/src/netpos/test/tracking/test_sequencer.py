@@ -507,13 +507,22 @@ def test_of_too_few_announced_one_that_goes_away_is_waited_for_once() -> None:
 @pytest.mark.parametrize("expected", [0, 1, 50])
 def test_an_rsu_that_is_not_awaited_completes_and_delays_nothing(expected: int) -> None:
     s = Sequencer(HOLD, history_ns=2 * HOLD, awaits=lambda m: m.rsu_id != "new")
-    assert s.add(rsu(100, "a", expected=2)) is None
     assert s.add(rsu(100, "new", expected)) is None
+    assert s.release() == []  # those that are awaited are not late then
+    assert s.add(rsu(100, "a", expected=2)) is None
     assert s.release() == []
     assert s.add(rsu(100, "b", expected=2)) is None
-    assert [list(epoch.items) for epoch in s.release()] == [
-        [("rsu", "a"), ("rsu", "new"), ("rsu", "b")]
+    assert [sorted(source for _, source in epoch.items) for epoch in s.release()] == [
+        ["a", "b", "new"]
     ]
+
+
+def test_an_epoch_of_an_rsu_that_is_not_awaited_ends_with_the_next_stamp() -> None:
+    s = Sequencer(HOLD, awaits=lambda m: m.rsu_id != "new")
+    assert s.add(rsu(100, "new", 1)) is None
+    assert s.release() == []
+    assert s.add(rsu(150, "a", expected=1)) is None
+    assert stamps_ms(s.release()) == [100, 150]
 
 
 def test_more_measurements_than_announced_make_epochs_wait_only_if_awaited() -> None:
