@@ -68,30 +68,29 @@ def channel_and_source(item: Item) -> tuple[str, str]:
 @dataclass(slots=True)
 class Epoch:
     """All items of one stamp, ordered by channel and source. ``withdrawn``: of whom two items
-    contradicted each other; neither is among the items."""
+    contradicted each other; neither is among the items. ``unawaited``: RSUs without which the
+    epoch is complete."""
 
     stamp_ns: int
     items: dict[tuple[str, str], Item] = field(default_factory=dict)
     withdrawn: frozenset[tuple[str, str]] = frozenset()
+    unawaited: frozenset[tuple[str, str]] = frozenset()
     _measured: int = 0
     _expected: int = 0
-    _watched: int = 0
     _poses: int = 0
 
-    def put(self, key: tuple[str, str], item: Item, *, awaited: bool = True) -> None:
-        """Take an item under its channel and source; a second one of an RSU withdraws both.
-        ``awaited``: whether it is among those that the epoch is complete with."""
+    def put(self, key: tuple[str, str], item: Item) -> None:
+        """Take an item under its channel and source; a second one of an RSU withdraws both."""
         if key[0] == RSU and (key in self.items or key in self.withdrawn):
             self.items.pop(key, None)
             self.withdrawn |= {key}
             return
         self.items[key] = item
-        if key[0] == RSU and not awaited:
-            self._watched += 1
-        elif key[0] == RSU:
+        if key[0] == RSU and key not in self.unawaited:
             self._measured += 1
             self._expected = max(self._expected, item.expected)  # type: ignore[union-attr]
-        self._poses += key[0] == POSE
+        elif key[0] == POSE:
+            self._poses += 1
 
     def sorted(self) -> Iterator[Item]:
         """Items in the order in which they are applied."""
@@ -109,7 +108,7 @@ class Epoch:
         RSUs, and at least as many as ``least``; False where the number is not announced, or where
         nobody awaited has spoken yet."""
         if not self._measured:
-            return self._watched == 0
+            return not self.unawaited
         return 0 < self._expected <= self._measured + silenced and least <= self._measured
 
     def is_late_pose(self) -> bool:
@@ -241,8 +240,10 @@ class Sequencer:
         if epoch is None:
             epoch = self._pending[stamp] = Epoch(stamp)
         fault, withdraws = self._second(epoch, key, item, [])
+        if key[0] == RSU and not awaited:
+            epoch.unawaited |= {key}
         if fault is None or withdraws:
-            epoch.put(key, item, awaited=awaited)
+            epoch.put(key, item)
         if fault is not None:
             return fault
         self.mark(key[0], stamp)
@@ -322,7 +323,11 @@ class Sequencer:
             self._late.append((stamp, item))
         if fault is not None:
             return fault
-        if self._is_awaited(item) and epoch is not None and epoch.rsu_complete():
+        if key[0] != RSU or epoch is None:
+            return None
+        if not self._is_awaited(item):
+            epoch.unawaited |= {key}
+        elif epoch.rsu_complete():
             more = sum(s == stamp and self._is_awaited(i) for s, i in self._late)
             self._delays.announced_too_few(epoch.measured + more)
         return None

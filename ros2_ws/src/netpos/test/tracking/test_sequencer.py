@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from netpos.messages.values import Field, GroundSpeed, InitialPose, RsuMeasurement, Velocity
+from netpos.tracking.history import merge
 from netpos.tracking.sequencer import IMU, Epoch, Item, Sequencer, channel_and_source
 
 MS = 1_000_000
@@ -537,3 +538,13 @@ def test_more_measurements_than_announced_make_epochs_wait_only_if_awaited() -> 
             s.release()
             s.take_late()
         assert at_once == (1 if awaited else 7)
+
+
+def test_a_late_item_that_is_not_awaited_does_not_count_in_its_epoch() -> None:
+    s = Sequencer(HOLD, history_ns=2 * HOLD, awaits=lambda m: m.rsu_id != "new")
+    assert s.add(rsu(100, "a", expected=1)) is None
+    (epoch,) = s.release()
+    assert s.add(rsu(100, "new", expected=50)) is None
+    ((stamp_ns, late),) = s.take_late()
+    assert merge([epoch], stamp_ns, late) is None
+    assert (len(epoch.items), epoch.measured, epoch.rsu_complete()) == (2, 1, True)
