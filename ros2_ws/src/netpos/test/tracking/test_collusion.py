@@ -88,6 +88,37 @@ def test_five_that_agree_do_not_outvote_four_that_track(seed: int) -> None:
     assert all(reports[name].state is RsuState.EXCLUDED for name in INVENTED)
 
 
+@pytest.mark.parametrize("expected", [4, 50])
+@pytest.mark.parametrize("first", [True, False])
+def test_no_epoch_waits_for_them(expected: int, first: bool) -> None:
+    """They measure at the stamps of the honest RSUs, before or after these, and announce more
+    than there are."""
+    tracker, delayed = tracker_of(HONEST | INVENTED, history_s=0.5), 0
+    for k in range(200):
+        t_s = k / 10.0
+        honest = [
+            replace(m, expected=len(HONEST)) for m in measured(HONEST, t_s, truth(t_s), 0.3, 1)
+        ]
+        false = [
+            replace(m, expected=expected)
+            for m in measured(INVENTED, t_s, truth(t_s) + ASIDE, 0.01, 1)
+        ]
+        false = false if t_s >= 10.0 else []
+        for m in false if first else []:
+            tracker.add(m)
+        outputs = tracker.process()
+        for m in honest:
+            tracker.add(m)
+        outputs += tracker.process()
+        told = {o.status.stamp_ns for o in outputs if not o.revised}
+        delayed += honest[0].stamp_ns not in told
+        assert all(o.status.stamp_ns <= honest[0].stamp_ns for o in outputs)
+        for m in [] if first else false:
+            tracker.add(m)
+        tracker.process()
+    assert delayed == 0
+
+
 def test_they_take_over_only_after_the_track_is_lost() -> None:
     tracker = tracker_of(HONEST | INVENTED)
 
