@@ -38,7 +38,7 @@ def trial(folder: Path, name: str) -> dict[str, Any]:
 def test_an_attack_moves_nothing_and_is_named(tmp_path: Path, name: str, words: str) -> None:
     found = trial(tmp_path, name)
     for side in ("victim", "others"):
-        assert found[side]["missing"] <= 1  # the last epoch waits for what attackers announce
+        assert found[side]["missing"] == 0
         assert found[side]["error_m"] < ERROR_M
         assert found[side]["beyond"] == 0
         assert found[side]["tracking"] > 30
