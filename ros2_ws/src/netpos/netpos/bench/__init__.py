@@ -6,7 +6,7 @@
 ``replay``      offline replay against real time and rosbags
 ``memory``      the tracker's core over an hour
 ``routes``      Monte Carlo over METIS routes
-``live``        the running node: latency, load, start
+``live``        the running node: latency, load, flood, start
 ``soak``        a simulated day of the core, an hour of the running node; only where asked for
 """
 
@@ -43,6 +43,7 @@ PARTS = {
     "ready": ("live", "ready_rows"),
     "latency": ("live", "latency_rows"),
     "load": ("live", "load_rows"),
+    "flood": ("live", "flood_rows"),
     "soak": ("soak", "soak_rows"),
     "live_soak": ("soak", "live_soak_rows"),
 }

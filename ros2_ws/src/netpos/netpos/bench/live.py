@@ -24,6 +24,7 @@ _STOP_S = 15.0
 _PERIOD_S = 0.1
 _READY_S = 2.0
 _MEMORY_MB = 250.0
+_FLOOD_HZ = 20_000
 
 
 def executable(package: str, name: str) -> Path:
@@ -169,6 +170,45 @@ def _load(run: dict[str, Any]) -> list[Result]:
             _MEMORY_MB,
             1.0,
             unit="MB",
+        ),
+    ]
+
+
+def flood_rows(quick: bool) -> list[Result]:
+    """Ten devices while one RSU sends 20,000 messages a second, beside the same without it."""
+    seconds = "4" if quick else "20"
+    quiet, run = (
+        probe("flood", "--rate", f"{rate_hz}", "--seconds", seconds) for rate_hz in (0, _FLOOD_HZ)
+    )
+    what = f"{run['devices']} devices beside {_FLOOD_HZ} messages/s of one RSU"
+    cpu = {name: r["cpu_idle"] + r["cpu_traffic"] for name, r in (("run", run), ("quiet", quiet))}
+    return [
+        within(
+            f"{what}: epochs without odometry",
+            run["epochs"] - run["odometry"],
+            "epochs",
+            run["epochs"],
+            0.0,
+            unit="epochs",
+            note=f"{run['refused_of_flood']} messages of the flood refused and counted.",
+        ),
+        within(
+            f"{what}: lag of odometry, 99th percentile",
+            run["lag_p99_s"],
+            "one period",
+            _PERIOD_S,
+            1.0,
+            note=f"Without the flood {1e3 * quiet['lag_p99_s']:.1f} ms; median "
+            f"{1e3 * run['lag_median_s']:.1f} ms, without {1e3 * quiet['lag_median_s']:.1f} ms.",
+        ),
+        within(
+            f"{what}: processor time of the tracker",
+            cpu["run"],
+            "one core",
+            1.0,
+            1.0,
+            unit="s/s",
+            note=f"Without the flood {cpu['quiet']:.3f} s/s.",
         ),
     ]
 

@@ -12,6 +12,7 @@ from netpos.bench.common import LeftOut, Row, Unavailable
 from netpos.bench.domains import claim_domain
 from netpos.bench.live import (
     executable,
+    flood_rows,
     latency_rows,
     load_rows,
     probe,
@@ -124,6 +125,22 @@ def test_quadratic_cost_is_not_ok(prefix: Prefix) -> None:
     assert not exponent.ok
 
 
+def test_a_flood_is_measured_beside_the_same_without_it(prefix: Prefix) -> None:
+    """What the tracker needs for the flood alone is its idling beside it."""
+    flooded = load_figures(
+        10, 0.2, cpu_idle=0.4, lag_p99_s=0.12, odometry=399, refused_of_flood=70_000
+    )
+    quiet = load_figures(10, 0.19, refused_of_flood=0)
+    prefix.answers({"--rate 0 ": quiet, "--rate 20000 ": flooded})
+    missing, lag, cpu = as_rows(flood_rows(quick=True))
+    assert (missing.ours, missing.ok) == (1.0, False)
+    assert "70000 messages of the flood" in missing.note
+    assert (lag.ratio, lag.ok) == (pytest.approx(1.2), False)
+    assert "Without the flood 4.0 ms" in lag.note
+    assert (cpu.ours, cpu.ok) == (pytest.approx(0.6), True)
+    assert "Without the flood 0.200 s/s" in cpu.note
+
+
 def test_ready_takes_the_median(prefix: Prefix) -> None:
     figures = {
         "ready_s": [9.0, 1.0, 1.5],
@@ -157,7 +174,7 @@ def test_a_probe_that_hangs_is_ended(prefix: Prefix, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize("path", ["", "/nowhere"])
 def test_without_ros_the_part_is_left_out(monkeypatch: pytest.MonkeyPatch, path: str) -> None:
     monkeypatch.setenv("AMENT_PREFIX_PATH", path)
-    for part in ("ready", "latency", "load"):
+    for part in ("ready", "latency", "load", "flood"):
         ((name, (left_out,)),) = bench([part])
         assert name == part
         assert isinstance(left_out, LeftOut)
