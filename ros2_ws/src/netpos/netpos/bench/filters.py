@@ -24,6 +24,7 @@ from netpos.bench.problem import (
     MOTION,
     ROWS,
     Problem,
+    bends,
     model,
     problem,
     variances,
@@ -122,27 +123,30 @@ def called_srukf(p: Problem) -> tuple[Array, Array]:
     return mean, spread @ spread.T
 
 
-def epoch_noise(p: Problem) -> list[Array]:
-    """R (4, 4) of every epoch with what linearising leaves out, as our filter finds it."""
+def epoch_terms(p: Problem) -> list[tuple[Array, Array]]:
+    """Of every epoch the values (4,) less what linearising leaves out of their means, and R (4, 4)
+    with what it leaves out of their variances, as our filter finds them."""
     mean, cov = p.mean.copy(), p.cov.copy()
     accepted, work = np.zeros(2), ekf.workspace(6, ROWS)
-    noises = []
+    terms = []
     for rows in p.rows:
         ekf.predict(mean, cov, DT_S, MOTION, NO_BIAS)
-        noises.append(np.diag(variances(rows, mean, cov)))
+        values = rows[:, VALUE] - bends(rows, mean, cov)
+        terms.append((values, np.diag(variances(rows, mean, cov))))
         ekf.update(mean, cov, rows, HEIGHT_M, NO_GATE, 1, accepted, work)
-    return noises
+    return terms
 
 
 class FilterPyEkf:
-    """FilterPy's filter on the same problem. R is given to it; with ``compiled`` its h and H are
-    our kernels, so that only its own cost counts, else they are written in NumPy."""
+    """FilterPy's filter on the same problem. Second-order terms are given to it; with ``compiled``
+    its h and H are our kernels, so that only its own cost counts, else they are written in
+    NumPy."""
 
     def __init__(self, p: Problem, compiled: bool = True) -> None:
         from filterpy.kalman import ExtendedKalmanFilter  # noqa: PLC0415
 
         self._problem = p
-        self._noise = epoch_noise(p)
+        self._terms = epoch_terms(p)
         self._filter = ExtendedKalmanFilter(6, ROWS)
         self._filter.F, self._filter.Q = model()
         self._models = (_jacobian, _expected) if compiled else (numpy_jacobian, numpy_expected)
@@ -151,9 +155,9 @@ class FilterPyEkf:
         """Posterior after all epochs."""
         p, reference, (jacobian, expected) = self._problem, self._filter, self._models
         reference.x, reference.P = p.mean.copy(), p.cov.copy()
-        for rows, R in zip(p.rows, self._noise, strict=True):
+        for rows, (values, R) in zip(p.rows, self._terms, strict=True):
             reference.predict()
-            reference.update(rows[:, VALUE], jacobian, expected, R, args=rows, hx_args=rows)
+            reference.update(values, jacobian, expected, R, args=rows, hx_args=rows)
         return np.asarray(reference.x), np.asarray(reference.P)
 
 

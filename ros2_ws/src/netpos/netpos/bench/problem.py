@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netpos.estimation.measurement import VARIANCE, curvature_variance
+from netpos.estimation.measurement import VARIANCE, curvature_mean, curvature_variance
 from netpos.estimation.motion import (
     NO_BIAS,
     SPEED_OF_LIGHT_MPS,
@@ -91,6 +91,11 @@ def model() -> tuple[Array, Array]:
     transition(np.zeros(6), DT_S, MOTION, NO_BIAS, F)
     noise(np.zeros(6), DT_S, MOTION, NO_BIAS, Q)
     return F, Q
+
+
+def bends(rows: Array, mean: Array, cov: Array) -> Array:
+    """How far the mean of each row (4,) of an epoch is above its value at ``mean``."""
+    return np.array([curvature_mean(r, mean, cov, HEIGHT_M) for r in rows])
 
 
 def variances(rows: Array, mean: Array, cov: Array) -> Array:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from netpos.bench.common import LeftOut, Result, faster, side_by_side
-from netpos.bench.filters import called_ekf, epoch_noise
+from netpos.bench.filters import called_ekf, epoch_terms
 from netpos.bench.problem import HEIGHT_M, ROWS, Problem, model, problem
 from netpos.estimation.measurement import VALUE, linearise
 from netpos.messages.values import Array
@@ -54,10 +54,10 @@ class StoneSoupEkf:
         self._updater = part("updater.kalman").ExtendedKalmanUpdater(measurement_model=None)
         self._detections = [
             part("types.detection").Detection(
-                part("types.array").StateVector(rows[:, VALUE]),
+                part("types.array").StateVector(values),
                 measurement_model=_measurement_model(part, rows, R),
             )
-            for rows, R in zip(p.rows, epoch_noise(p), strict=True)
+            for rows, (values, R) in zip(p.rows, epoch_terms(p), strict=True)
         ]
 
     def run(self) -> tuple[Array, Array]:

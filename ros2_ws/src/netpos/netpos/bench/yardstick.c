@@ -34,7 +34,8 @@ static void predict(double *restrict x, double (*restrict P)[N], double dt, doub
             P[i][j] = P[j][i] = (P[i][j] + P[j][i]) / 2.0;
 }
 
-/* Innovation of one row at x, its Jacobian, and its variance with what linearising leaves out. */
+/* Innovation of one row from its mean, its Jacobian, and its variance with what linearising
+ * leaves out. */
 static double linearise(const double *row, const double *x, double (*P)[N], double height,
                         double *h, double *variance)
 {
@@ -53,7 +54,7 @@ static double linearise(const double *row, const double *x, double (*P)[N], doub
         h[4] = 1.0;
         *variance = row[VARIANCE] +
                     0.5 * (square - 2.0 * (px * px + py * py) / r2 + along * along) / r2;
-        return row[VALUE] - (r + x[4]);
+        return row[VALUE] - (r + x[4]) - 0.5 * (P[0][0] + P[1][1] - along) / r;
     }
     const double *A = row + AXES;
     const double ux = A[0] * dx + A[1] * dy + A[2] * dz, uy = A[3] * dx + A[4] * dy + A[5] * dz;

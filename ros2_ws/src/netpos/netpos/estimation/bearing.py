@@ -32,6 +32,7 @@ from netpos.estimation.measurement import (
     VALUE,
     VARIANCE,
     Kind,
+    curvature_mean,
     curvature_variance,
     linearise,
 )
@@ -156,4 +157,5 @@ def fuse_around(mean: Array, cov: Array, rows: Array, height_m: float, work: Arr
     variance = rows[:, VARIANCE].copy()
     for i in range(m):
         variance[i] += curvature_variance(rows[i], mean, cov, height_m)
+        innovation[i] -= curvature_mean(rows[i], mean, cov, height_m)
     fuse(mean, cov, innovation, H, variance, use, work)

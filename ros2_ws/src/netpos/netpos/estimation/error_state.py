@@ -33,7 +33,7 @@ from netpos.estimation.measurement import (
     Kind,
 )
 from netpos.estimation.motion import add_walk
-from netpos.estimation.space import innovation_at, linearise_in_space
+from netpos.estimation.space import bend_mean, innovation_at, linearise_in_space
 from netpos.estimation.state import ERR_BIASES, Err, Nav
 from netpos.inertial.strapdown import (
     ACCEL_BIAS,
@@ -163,7 +163,8 @@ def correct(
             break
         rotation_of(nav[QUATERNION:ACCEL_BIAS], C)
         for i in index:
-            innovation[i] = innovation_at(rows[i], nav, C, H[i])
+            at_mean = innovation_at(rows[i], nav, C, H[i])
+            innovation[i] = at_mean - bend_mean(rows[i], nav, posterior)
     cov[:] = posterior
     return nis, index.size
 

@@ -10,7 +10,14 @@ import numpy as np
 from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.fit import map_cost
 from netpos.estimation.fusion import W_COV, W_INNOVATION, W_PH, W_PRIOR, W_USE, W_VARIANCE, fuse
-from netpos.estimation.measurement import VARIANCE, curvature_variance, innovation_row, linearise
+from netpos.estimation.measurement import (
+    VALUE,
+    VARIANCE,
+    curvature_mean,
+    curvature_variance,
+    innovation_row,
+    linearise,
+)
 from netpos.estimation.state import X
 from netpos.messages.values import Array
 
@@ -100,7 +107,8 @@ def is_curved(rows: Array, mean: Array, height_m: float, work: Array) -> bool:
         tangent = work[W_INNOVATION, i]
         for a in range(n):
             tangent -= work[W_COV + n + i, a] * (mean[a] - work[W_PRIOR, a])
-        away = abs(innovation_row(rows[i], mean, height_m, h) - tangent)
+        bend = curvature_mean(rows[i], work[W_PRIOR, :n], work[W_COV : W_COV + n, :n], height_m)
+        away = abs(innovation_row(rows[i], mean, height_m, h) - bend - tangent)
         if away > _STRAIGHT_SD * math.sqrt(work[W_VARIANCE, i]):
             return True
     return False
@@ -110,12 +118,15 @@ def is_curved(rows: Array, mean: Array, height_m: float, work: Array) -> bool:
 def iterate_used(
     mean: Array, cov: Array, rows: Array, height_m: float, iterations: int, work: Array
 ) -> None:
-    """``iterate`` the rows used from the prior kept in the workspace."""
+    """``iterate`` the rows used from the prior kept in the workspace; their mean values are those
+    of the first posterior."""
     n, m = mean.size, rows.shape[0]
     prior, prior_cov = work[W_PRIOR, :n].copy(), work[W_COV : W_COV + n, :n].copy()
     keep = work[W_USE, :m] == 1.0
-    variance = work[W_VARIANCE, :m][keep]
-    x, P = iterate(prior, prior_cov, rows[keep], variance, height_m, iterations, work)
+    variance, kept = work[W_VARIANCE, :m][keep], rows[keep]
+    for i in range(kept.shape[0]):
+        kept[i, VALUE] -= curvature_mean(kept[i], mean, cov, height_m)
+    x, P = iterate(prior, prior_cov, kept, variance, height_m, iterations, work)
     mean[:] = x
     cov[:] = P
 

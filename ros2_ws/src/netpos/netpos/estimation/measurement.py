@@ -53,6 +53,7 @@ __all__ = [
     "VALUE",
     "VARIANCE",
     "Kind",
+    "curvature_mean",
     "curvature_variance",
     "has_clock",
     "innovation_row",
@@ -64,6 +65,7 @@ __all__ = [
     "of_offset",
     "offset_up",
     "predict_row",
+    "second_order_mean_of_offset",
     "second_order_of_offset",
     "second_order_variance",
     "wrap",
@@ -101,12 +103,18 @@ second_order_of_offset = choose(
 )
 """``(kind, row, dx, dy, dz, cov, axes)``: variance of what linearising leaves out, or a bound."""
 _exact_second_order = choose([(s.kind, s.exact_second_order) for s in SENSORS], _no_second_order)
+second_order_mean_of_offset = choose(
+    [(s.kind, s.second_order_mean) for s in SENSORS], _no_second_order
+)
+"""``(kind, row, dx, dy, dz, cov, axes)``: how far the mean value is above that of the mean."""
+_FOR_UPDATE, _EXACT, _OF_MEAN = range(3)  # which second-order term
 _of_state = choose([(s.kind, s.of_state) for s in SENSORS], _no_state_value)
 _state_second_order = choose(
     [(s.kind, s.second_order) for s in SENSORS if s.of_state], _no_state_second_order
 )
 
 _has_state_model = is_one_of(s.kind for s in SENSORS if s.of_state)
+_has_second_order_mean = is_one_of(s.kind for s in SENSORS if s.second_order_mean)
 _has_exact_second_order = is_one_of(s.kind for s in SENSORS if s.exact_second_order)
 _adds_biases = is_one_of(s.kind for s in SENSORS if s.adds_biases)
 _has_clock = is_one_of(s.kind for s in SENSORS if s.has_clock)
@@ -216,17 +224,18 @@ def innovation_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
 
 @leaf
 def _second_order_in_3d(
-    choice: int, kind: int, row: Array, d: tuple[float, float, float], cov: Array
+    term: int, kind: int, row: Array, d: tuple[float, float, float], cov: Array
 ) -> float:
-    """Second-order term of a row for a prior ``cov`` (n, n) of position and height; ``choice`` 1:
-    the exact one where the update has a bound."""
+    """Second-order ``term`` of a row for a prior ``cov`` (n, n) of position and height."""
     P, height = local_array(3, 3), int(row[HEIGHT])
     for a in range(2):
         P[a, 2] = P[2, a] = cov[a, height]
         for b in range(2):
             P[a, b] = cov[a, b]
     P[2, 2] = cov[height, height]
-    if choice == 1:
+    if term == _OF_MEAN:
+        return float(second_order_mean_of_offset(kind, row, d[0], d[1], d[2], P, 3))
+    if term == _EXACT:
         return float(_exact_second_order(kind, row, d[0], d[1], d[2], P, 3))
     return float(second_order_of_offset(kind, row, d[0], d[1], d[2], P, 3))
 
@@ -249,8 +258,25 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
     dy = mean[X.PY] + ly - row[ORIGIN + 1]
     dz = offset_up(row, mean, height_m)
     if row[HEIGHT] > 0.0:
-        return float(_second_order_in_3d(0, kind, row, (dx, dy, dz), cov))
+        return float(_second_order_in_3d(_FOR_UPDATE, kind, row, (dx, dy, dz), cov))
     return float(second_order_of_offset(kind, row, dx, dy, dz, cov, 2))
+
+
+@inlined
+def curvature_mean(row: Array, mean: Array, cov: Array, height_m: float) -> float:
+    """How far the mean value of ``row`` is above that at ``mean`` (n,), for a prior ``cov`` (n,
+    n): half the trace of h'' P of the second-order extended Kalman filter (Bar-Shalom, Li and
+    Kirubarajan 2001, eq. 10.3.3-10)."""
+    kind = int(row[KIND])
+    if not _has_second_order_mean(kind):
+        return 0.0
+    lx, ly = _lever(row, mean)
+    dx = mean[X.PX] + lx - row[ORIGIN]
+    dy = mean[X.PY] + ly - row[ORIGIN + 1]
+    dz = offset_up(row, mean, height_m)
+    if row[HEIGHT] > 0.0:
+        return float(_second_order_in_3d(_OF_MEAN, kind, row, (dx, dy, dz), cov))
+    return float(second_order_mean_of_offset(kind, row, dx, dy, dz, cov, 2))
 
 
 @leaf
@@ -267,7 +293,7 @@ def second_order_variance(row: Array, mean: Array, cov: Array, height_m: float) 
     dx, dy = mean[X.PX] - row[ORIGIN], mean[X.PY] - row[ORIGIN + 1]
     dz = offset_up(row, mean, height_m)
     if row[HEIGHT] > 0.0:
-        return float(_second_order_in_3d(1, kind, row, (dx, dy, dz), cov))
+        return float(_second_order_in_3d(_EXACT, kind, row, (dx, dy, dz), cov))
     return float(_exact_second_order(kind, row, dx, dy, dz, cov, 2))
 
 

@@ -9,7 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from netpos.estimation.compile import kernel, leaf
-from netpos.estimation.measurement import GATE_VARIANCE, curvature_variance, innovation_row
+from netpos.estimation.measurement import (
+    GATE_VARIANCE,
+    curvature_mean,
+    curvature_variance,
+    innovation_row,
+)
 from netpos.messages.values import Array
 
 
@@ -17,7 +22,7 @@ class PredictedRows(NamedTuple):
     """Rows (m, ROW_WIDTH) at a prediction mean (n,), cov (n, n). In a workspace the arrays are
     wider: the first m and n entries count.
 
-    innovation : (m,) measured minus predicted value, wrapped where it is an angle
+    innovation : (m,) measured minus predicted mean value, wrapped where it is an angle
     H, HP : (m, n) Jacobian, and the same times cov
     prior_var : (m,) variance that the prediction has along H
     second_order_var : (m,) variance of what linearising leaves out (``curvature_variance``)
@@ -42,7 +47,8 @@ def predict_rows(
     for i in range(rows.shape[0]):
         h, hp = predicted.H[i], predicted.HP[i]
         predicted.second_order_var[i] = curvature_variance(rows[i], mean, cov, height_m)
-        predicted.innovation[i] = innovation_row(rows[i], mean, height_m, h)
+        bend = curvature_mean(rows[i], mean, cov, height_m)
+        predicted.innovation[i] = innovation_row(rows[i], mean, height_m, h) - bend
         total = 0.0
         for a in range(n):
             value = 0.0

@@ -22,6 +22,7 @@ from netpos.estimation.measurement import (
     GATE_VARIANCE,
     GROUP,
     VARIANCE,
+    curvature_mean,
     curvature_variance,
     innovation_row,
 )
@@ -234,6 +235,7 @@ def apply_about(
             variance[i] = rows[i, VARIANCE]
             if again:
                 variance[i] += curvature_variance(rows[i], x, P, height_m)
+                innovation[i] -= curvature_mean(rows[i], x, P, height_m)
         for a in range(n):
             x[a] = prior_mean[a]
             for b in range(n):

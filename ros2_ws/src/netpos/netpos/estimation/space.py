@@ -40,6 +40,7 @@ from netpos.estimation.measurement import (
     has_clock,
     is_cyclic,
     of_offset,
+    second_order_mean_of_offset,
     second_order_of_offset,
     wrap,
 )
@@ -142,16 +143,26 @@ def bend_variance(row: Array, nav: Array, cov: Array) -> float:
     return float(second_order_of_offset(kind, row, dx, dy, dz, cov, 3))
 
 
+@leaf
+def bend_mean(row: Array, nav: Array, cov: Array) -> float:
+    """How far the mean value of ``row`` is above that of the mean, for the position covariance in
+    ``cov``: ``measurement.curvature_mean`` in space (lever arm left out)."""
+    dx = nav[Nav.PX] - row[ORIGIN]
+    dy = nav[Nav.PY] - row[ORIGIN + 1]
+    dz = nav[Nav.PZ] - row[ORIGIN + 2]
+    return float(second_order_mean_of_offset(int(row[KIND]), row, dx, dy, dz, cov, 3))
+
+
 @kernel
 def linearise_in_space(rows: Array, nav: Array, cov: Array) -> tuple[Array, Array, Array]:
-    """Innovations (m,), Jacobian H (m, n) and ``bend_variance`` (m,) of ``rows`` (m, ROW_WIDTH) at
-    nav (n + 1,), cov (n, n)."""
+    """Innovations (m,) from the mean values, Jacobian H (m, n) and ``bend_variance`` (m,) of
+    ``rows`` (m, ROW_WIDTH) at nav (n + 1,), cov (n, n)."""
     m = rows.shape[0]
     innovation, H, bend = np.empty(m), np.empty((m, cov.shape[0])), np.empty(m)
     C = np.empty((3, 3))
     rotation_of(nav[QUATERNION:ACCEL_BIAS], C)
     for i in range(m):
-        innovation[i] = innovation_at(rows[i], nav, C, H[i])
+        innovation[i] = innovation_at(rows[i], nav, C, H[i]) - bend_mean(rows[i], nav, cov)
         bend[i] = bend_variance(rows[i], nav, cov)
     return innovation, H, bend
 

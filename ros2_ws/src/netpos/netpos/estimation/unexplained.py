@@ -9,6 +9,7 @@ from netpos.estimation.measurement import (
     BIAS,
     HEIGHT,
     VARIANCE,
+    curvature_mean,
     curvature_variance,
     innovation_row,
 )
@@ -27,6 +28,7 @@ def unexplained(mean: Array, cov: Array, rows: Array, height_m: float) -> Array:
     for i in range(rows.shape[0]):
         row = rows[i]
         residual = innovation_row(row, mean, height_m, h)
+        residual -= curvature_mean(row, mean, cov, height_m)
         q = 0.0
         for a in range(n):
             for b in range(n):

@@ -7,6 +7,7 @@ import math
 import filter_rows
 import numpy as np
 import pytest
+from curved_rows import bends
 from netpos.estimation.bearing import fuse_around, fuse_bearing, is_plain_bearing, on_top
 from netpos.estimation.forms import ekf
 from netpos.estimation.fusion import W_COV, W_PRIOR, W_USE
@@ -148,6 +149,7 @@ def test_other_rows_follow_at_the_result() -> None:
             assert fuse_bearing(expected, expected_cov, rows[1], SD**2)
             linear = rows[:1]
         z, H = linearise(linear, expected, 0.5)
+        z -= bends(expected, expected_cov, linear, 0.5)
         extra = [curvature_variance(r, expected, expected_cov, 0.5) for r in linear]
         gain = expected_cov @ H.T
         gain @= np.linalg.inv(H @ gain + np.diag(linear[:, VARIANCE] + extra))

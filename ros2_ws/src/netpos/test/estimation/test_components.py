@@ -250,21 +250,25 @@ def test_an_outlier_leaves_the_wide_prior_as_it_was_with_its_weight() -> None:
 
 
 @pytest.mark.parametrize(
-    ("distance", "sd", "wide"),
+    ("blocked", "distance", "sd", "wide"),
     [
-        # range sd 0.2 m at 30 m: 0.5 (sd^2 / 30)^2 = 0.04 / 4 at sd = 2.06 m
-        (30.0, 2.05, False),
-        (30.0, 2.07, True),
-        (30.0, 0.5, False),
-        (1.0, 0.7, False),  # narrow, however it bends
+        # range sd 0.2 m at 30 m: 0.5 (sd^2 / 30)^2 = 0.04 / 20 at sd = 1.377 m,
+        (0.0, 30.0, 1.37, False),
+        (0.0, 30.0, 1.38, True),
+        # and 0.04 / 4 at 2.06 m
+        (0.1, 30.0, 2.05, False),
+        (0.1, 30.0, 2.07, True),
+        (0.0, 30.0, 0.5, False),
+        (0.0, 1.0, 0.7, False),  # narrow, however it bends
     ],
 )
-def test_a_component_is_wide_where_the_tangent_costs_a_quarter_of_the_noise(
-    distance: float, sd: float, wide: bool
+def test_a_component_is_wide_where_the_tangent_costs_a_share_of_the_noise(
+    blocked: float, distance: float, sd: float, wide: bool
 ) -> None:
+    options = options_of(TrackerConfig(filter="ekf", nlos_probability=blocked))
     x, P = prior((distance, 0.0), (0.1, sd))
-    assert is_wide(row(Kind.RANGE, distance, 0.04), x, P, 0.0) is wide
-    assert not is_wide(row(Kind.AZIMUTH, 0.0, 0.04), x, P, 0.0)
+    assert is_wide(row(Kind.RANGE, distance, 0.04), x, P, options) is wide
+    assert not is_wide(row(Kind.AZIMUTH, 0.0, 0.04), x, P, options)
 
 
 def test_modes_are_chains_of_components() -> None:

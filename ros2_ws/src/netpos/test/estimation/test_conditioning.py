@@ -26,7 +26,7 @@ from netpos.estimation.measurement import (
     curvature_variance,
 )
 from netpos.estimation.predicted import predicted_rows
-from netpos.estimation.state import X
+from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array
 from scipy.integrate import quad
 
@@ -79,7 +79,15 @@ def mixed_groups(rng: np.random.Generator) -> tuple[Array, Array, Array]:
     return mean, cov, np.array(rows)
 
 
-def innovations(mean: Array, rows: Array) -> tuple[Array, Array]:
+def longer_m(mean: Array, cov: Array, origin: Array) -> float:
+    """How much longer than the distance of the mean the mean distance is, to second order."""
+    d = np.append(mean[POSITION], 0.0) - origin
+    r = float(np.linalg.norm(d))
+    along = d[:2] @ cov[POSITION, POSITION] @ d[:2] / r**2
+    return float(cov[X.PX, X.PX] + cov[X.PY, X.PY] - along) / (2.0 * r)
+
+
+def innovations(mean: Array, cov: Array, rows: Array) -> tuple[Array, Array]:
     """Of ``mixed_groups``, written out (device on the ground)."""
     nu, H = np.empty(len(rows)), np.zeros((len(rows), 6))
     for i, r in enumerate(rows):
@@ -92,13 +100,13 @@ def innovations(mean: Array, rows: Array) -> tuple[Array, Array]:
             nu[i] = math.remainder(r[VALUE] - math.atan2(dy, dx), 2 * math.pi)
         else:
             H[i, :2] = np.array([dx, dy]) / math.hypot(dx, dy, dz)
-            nu[i] = r[VALUE] - math.hypot(dx, dy, dz)
+            nu[i] = r[VALUE] - math.hypot(dx, dy, dz) - longer_m(mean, cov, r[ORIGIN:AXES])
     return nu, H
 
 
 def distances2(mean: Array, cov: Array, rows: Array) -> Array:
     """Squared distance of each group with its gate variances."""
-    nu, H = innovations(mean, rows)
+    nu, H = innovations(mean, cov, rows)
     out = []
     for group in np.unique(rows[:, GROUP]):
         i = rows[:, GROUP] == group
@@ -166,10 +174,12 @@ def test_nothing_asked_nothing_changed() -> None:
 
 
 def range_row(kind: Kind, excess_m: float, variance: float = 0.25) -> tuple[Array, Array, Array]:
-    """A range from 1 km away, where it is straight, ``excess_m`` longer than predicted."""
+    """A range from 1 km away, ``excess_m`` longer than predicted."""
     mean = np.array([600.0, 800.0, 1.0, 0.0, 40.0, 0.0])
     cov = random_spd(np.random.default_rng(7), 6)
-    value = 1000.0 + excess_m + (40.0 if kind is Kind.TOA else 0.0)
+    value = (
+        1000.0 + longer_m(mean, cov, np.zeros(3)) + excess_m + (40.0 if kind is Kind.TOA else 0.0)
+    )
     return mean, cov, np.array([row(kind, value, variance, 0, np.zeros(3))])
 
 
@@ -241,14 +251,14 @@ def test_on_time_is_left_almost_alone_and_late_is_pulled(kind: Kind) -> None:
 @pytest.mark.parametrize("height_m", [0.0, 3.0])
 def test_late_range_near_an_rsu_counts_its_curvature(kind: Kind, height_m: float) -> None:
     """5 m ahead of the RSU and as high, 4 m^2 sideways: (4 / 5)^2 / 2 of variance, which the
-    update adds again to what the row is left with."""
+    update adds again to what the row is left with, and a mean that is 4 / 5 / 2 longer."""
     mean, cov = np.array([5.0, 0, 0, 0, 2.0, 0]), np.diag([1.0, 4.0, 1, 1, 9.0, 1])
     value = 6.5 + (2.0 if kind is Kind.TOA else 0.0)
     rows = np.array([row(kind, value, 0.5, 0, np.array([0.0, 0.0, height_m]))])
     out = conditioned(mean, cov, rows, late=(0.3, 4.0), height_m=height_m)
     R = 0.5 + (4.0 / 5.0) ** 2 / 2
     S = R + 1.0 + (9.0 if kind is Kind.TOA else 0.0)
-    _, shift, equivalent = robust.nlos_mixture_exponential(1.5, S, R, 0.3, 4.0)
+    _, shift, equivalent = robust.nlos_mixture_exponential(1.5 - 0.4, S, R, 0.3, 4.0)
     assert out[0, VALUE] == pytest.approx(value - shift, rel=1e-12)
     assert out[0, VARIANCE] == pytest.approx(0.5 + equivalent - R, rel=1e-12)
     assert out[0, GATE_VARIANCE] == pytest.approx(0.25 + equivalent - R, rel=1e-12)
@@ -264,11 +274,11 @@ def test_two_rival_explanations_say_nothing() -> None:
     shift, variance = robust.nlos_mixture_exponential(12.0, S, 0.25, prior, 30.0)[1:]
     assert (shift, variance) == (12.0, math.inf)
     (out,) = conditioned(mean, cov, rows, late=(prior, 30.0))
-    assert out[VALUE] == pytest.approx(1000.0, rel=1e-12)
+    assert out[VALUE] == pytest.approx(1000.0 + longer_m(mean, cov, np.zeros(3)), rel=1e-12)
     assert out[VARIANCE] == pytest.approx(1e12)
     assert out[GATE_VARIANCE] == pytest.approx(1e12)
     x, P = updated(mean, cov, out[None])
-    np.testing.assert_allclose(x, mean, rtol=1e-9)
+    np.testing.assert_allclose(x, mean, rtol=1e-9, atol=1e-20)
     np.testing.assert_allclose(P, cov, rtol=1e-9)
 
 

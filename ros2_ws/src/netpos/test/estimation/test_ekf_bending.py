@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from curved_rows import log_posterior_cost, range_problem, two_variances
+from curved_rows import bends, log_posterior_cost, range_problem, two_variances
 from ekf_update import exact_fuse, fused, iterated, scratch, updated
 from filter_rows import NO_GATE, linear_row, row
 from netpos.estimation import fit, fusion
@@ -55,10 +55,11 @@ def test_curved_group_passes_by_its_most_probable_state_only_when_iterating() ->
 
 
 def test_gate_threshold_itself_is_inside_and_one_iteration_decides_by_the_tangent() -> None:
-    """y 0.5 m, range 36 m with 2 m sd: 8.7 by the tangent, 4.9 at the state the EKF ends in."""
+    """y 0.5 m, range 31 m with 2 m sd: 8.0 from the mean range, 0.2 at the most probable state."""
     mean, cov, rows = curved_group()
-    mean[X.PY], rows[0, VALUE], rows[0, VARIANCE], rows[0, GATE_VARIANCE] = 0.5, 36.0, 4.0, 4.0
+    mean[X.PY], rows[0, VALUE], rows[0, VARIANCE], rows[0, GATE_VARIANCE] = 0.5, 31.0, 4.0, 4.0
     innovation, H = linearise(rows, mean, 0.0)
+    innovation -= bends(mean, cov, rows)
     # As the kernel rounds it: the last bit decides here.
     nis = innovation[0] ** 2 / (4.0 + (H @ (H @ cov).T).item())
     assert nis == pytest.approx(ekf.group_nis(cov, innovation, H, np.array([4.0])), rel=1e-14)
@@ -77,13 +78,15 @@ def test_gate_threshold_itself_is_inside_and_one_iteration_decides_by_the_tangen
 
 
 def test_update_adds_the_curvature_to_both_variances() -> None:
-    """half of (sideways variance / range)^2: 400^2 / 2 / 30^2."""
+    """half of (sideways variance / range)^2: 400^2 / 2 / 30^2; and to the range half of sideways
+    variance / range."""
     mean, cov, rows = curved_group()
     before = rows.copy()
     x, P, _, nis, _ = updated(mean, cov, rows, 0.0, NO_GATE, 1)
     np.testing.assert_array_equal(rows, before)  # the caller's rows are left alone
     variance = 0.01 + 400.0**2 / 2 / 30.0**2
     innovation, H = linearise(rows, mean, 0.0)
+    innovation -= 400.0 / 2 / 30.0
     expected = fused(mean, cov, innovation, H, np.array([variance]))
     np.testing.assert_allclose(x, expected[0], rtol=1e-7)
     np.testing.assert_allclose(P, expected[1], rtol=1e-7, atol=1e-9)
@@ -94,7 +97,8 @@ def test_update_adds_the_curvature_to_both_variances() -> None:
 def test_height_of_the_device_reaches_every_stage() -> None:
     """An RSU 3 m up: with the right height the range fits, with another it does not."""
     mean, cov = np.array([4.0, 0, 0, 0, 0, 0]), 0.01 * np.eye(6)
-    rows = np.array([row(Kind.RANGE, 5.0, 1e-4, 0, np.array([0.0, 0.0, 3.0]))])
+    longer = 0.01 * (2.0 - 0.8**2) / 2.0 / 5.0
+    rows = np.array([row(Kind.RANGE, 5.0 + longer, 1e-4, 0, np.array([0.0, 0.0, 3.0]))])
     gate = np.array([0.0, 9.0])
     for iterations in (1, 8):
         good = updated(mean, cov, rows, 0.0, gate, iterations)
@@ -172,11 +176,15 @@ def test_only_what_was_accepted_is_iterated_with_the_variances_of_the_update(
     rows[:, GATE_VARIANCE] = rows[:, VARIANCE] / 3.0
     result = updated(mean, cov, rows, 0.0, np.array([0.0, 1e3]), iterations)
     kept, variance = rows[::2].copy(), two_variances(mean, cov, rows)[::2].copy()
-    expected = iterated(mean, cov, kept, variance, iterations)
+    innovation, H = linearise(kept, mean, 0.0)
+    innovation -= bends(mean, cov, kept)
+    x, P, _ = fused(mean, cov, innovation, H, variance)
+    at_mean = kept.copy()
+    at_mean[:, VALUE] -= bends(x, P, kept)
+    expected = iterated(mean, cov, at_mean, variance, iterations)
     np.testing.assert_array_equal(result[0], expected[0])
     np.testing.assert_array_equal(result[1], expected[1])
     assert result[2].tolist() == [1.0, 0.0, 1.0]
-    innovation, H = linearise(kept, mean, 0.0)
     S = H @ cov @ H.T + np.diag(variance - kept[:, VARIANCE] + kept[:, GATE_VARIANCE])
     assert result[3] == pytest.approx(innovation @ np.linalg.inv(S) @ innovation, rel=1e-9)
 
@@ -226,3 +234,20 @@ def test_where_rounding_makes_iterating_indefinite_the_tangent_serves() -> None:
         np.testing.assert_allclose((mean - expected_mean) / sd, 0.0, atol=0.01)
         np.testing.assert_allclose((cov - expected_cov) / np.outer(sd, sd), 0.0, atol=1e-6)
     assert lost >= 3
+
+
+@pytest.mark.parametrize("iterations", [1, 8])
+def test_ranges_of_an_arc_keep_its_mean(iterations: int) -> None:
+    """40 equal ranges of 25 m across a prior 1.6 m wide: the sum over a grid is 4.5 cm nearer
+    than the range, three sd of what is known along it."""
+    mean, cov = np.array([25.0, 0, 0, 0, 0, 0]), np.diag([0.3**2, 1.6**2, 1, 1, 1, 1.0])
+    rows = np.array([row(Kind.RANGE, 25.0, 0.1**2, 0, np.zeros(3))])
+    x, y = np.meshgrid(np.linspace(23.5, 26.5, 1501), np.linspace(-8.0, 8.0, 801))
+    cost = (x - 25.0) ** 2 / 0.3**2 + y**2 / 1.6**2
+    cost += 40 * (np.hypot(x, y) - 25.0) ** 2 / 0.1**2
+    weight = np.exp(-0.5 * (cost - cost.min()))
+    expected = float((weight * x).sum() / weight.sum())
+    assert expected == pytest.approx(24.955, abs=0.001)
+    for _ in range(40):
+        mean, cov, *_ = updated(mean, cov, rows, 0.0, NO_GATE, iterations)
+    assert mean[X.PX] == pytest.approx(expected, abs=0.012)

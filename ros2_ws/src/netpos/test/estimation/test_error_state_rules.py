@@ -17,7 +17,7 @@ from netpos.estimation.error_state import (
     doubt_standstill,
 )
 from netpos.estimation.measurement import GATE_VARIANCE, GROUP, VALUE, VARIANCE, Kind
-from netpos.estimation.space import bend_variance, direction_rows, place_rows
+from netpos.estimation.space import bend_mean, bend_variance, direction_rows, place_rows
 from netpos.estimation.state import NAV_POSITION, NAV_VELOCITY
 from netpos.inertial.strapdown import ERR, GYRO_BIAS, NAV, inject, still_earth
 from netpos.messages.values import Array
@@ -33,19 +33,25 @@ def rsu_row(kind: Kind, origin: Array, group: int) -> Array:
 def correct_by_the_rule(nav: Array, cov: Array, rows: Array) -> tuple[Array, Array, float, int]:
     """All rows at once by NumPy, linearised again at the result until the place has settled: six
     times at most; nav, cov, NIS and how many."""
+
+    def from_mean(x: Array, P: Array) -> tuple[Array, Array]:
+        z, H = linearised(rows, x)
+        return z - [bend_mean(r, x, P) for r in rows], H
+
     bend = np.array([bend_variance(r, nav, cov) for r in rows])
-    z, H = linearised(rows, nav)
+    z, H = from_mean(nav, cov)
     S = H @ cov @ H.T + np.diag(rows[:, GATE_VARIANCE] + bend)
-    nis, error, x, count = float(z @ np.linalg.solve(S, z)), np.zeros(ERR), nav, 0
+    nis, error, x, P, count = float(z @ np.linalg.solve(S, z)), np.zeros(ERR), nav, cov, 0
     moved = np.inf
     while moved >= 1e-4 and count < 6:
-        z, H = linearised(rows, x)
+        z, H = from_mean(x, P)
         gain = cov @ H.T @ np.linalg.inv(H @ cov @ H.T + np.diag(rows[:, VARIANCE] + bend))
         last, error = error, gain @ (z + H @ error)
         x = nav.copy()
         inject(x, error)
         moved, count = np.abs(error - last)[:3].max(), count + 1
-    return x, cov - gain @ H @ cov, nis, count
+        P = cov - gain @ H @ cov
+    return x, P, nis, count
 
 
 def problem(seed: int) -> tuple[Array, Array, Array]:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from curved_rows import log_posterior_cost, range_problem
+from curved_rows import bends, log_posterior_cost, range_problem
 from filter_rows import random_spd
 from netpos.estimation import fit
 from netpos.estimation.measurement import (
@@ -77,6 +77,7 @@ def test_misfit_is_twice_the_negative_log_posterior(seed: int) -> None:
 def test_surprise_is_what_scipy_makes_of_it() -> None:
     mean, cov, rows = range_problem(3)
     innovation, H = linearise(rows, mean, 0.0)
+    innovation -= bends(mean, cov, rows)
     bent = [second_order_variance(row, mean, cov, 0.0) for row in rows]
     S = H @ cov @ H.T + np.diag(rows[:, VARIANCE] + bent)
     distance, size = neg2_log_likelihood(mean, cov, rows)

@@ -17,6 +17,7 @@ from netpos.estimation.measurement import (
     ORIGIN,
     VALUE,
     Kind,
+    curvature_mean,
     curvature_variance,
     predict_row,
     second_order_variance,
@@ -90,6 +91,9 @@ def test_second_order_term_of_ranges_is_exact(kind: Kind, seed: int) -> None:
     expected = half_trace(row, x, cov)
     assert curvature_variance(row, x, cov, 1.3) == pytest.approx(expected, rel=2e-3)
     assert second_order_variance(row, x, cov, 1.3) == pytest.approx(expected, rel=2e-3)
+    position = np.ix_([0, 1, UP], [0, 1, UP])
+    longer = 0.5 * float(np.trace(hessian(row, x) @ cov[position]))
+    assert curvature_mean(row, x, cov, 1.3) == pytest.approx(longer, rel=2e-3, abs=1e-6)
 
 
 @pytest.mark.parametrize("kind", [Kind.COSINE_Y, Kind.COSINE_Z, Kind.PHASE])

@@ -13,6 +13,7 @@ from netpos.estimation.measurement import (
     LEVER,
     ORIGIN,
     Kind,
+    curvature_mean,
     curvature_variance,
     innovation_row,
     innovation_variance,
@@ -47,6 +48,11 @@ def half_trace(row: Array, x: Array, cov: Array, height_m: float) -> float:
     """Variance of the second-order term of a Gaussian prior."""
     product = hessian(row, x, height_m) @ cov[POSITION, POSITION]
     return 0.5 * float(np.trace(product @ product))
+
+
+def half_trace_of_mean(row: Array, x: Array, cov: Array, height_m: float) -> float:
+    """By how much a Gaussian prior makes the mean value larger."""
+    return 0.5 * float(np.trace(hessian(row, x, height_m) @ cov[POSITION, POSITION]))
 
 
 def level_row(kind: Kind, origin: Array) -> Array:
@@ -142,6 +148,38 @@ def test_curvature_of_azimuth_bounds_the_second_order_term(seed: int) -> None:
     for kind in (Kind.ELEVATION, Kind.COSINE_Y, Kind.COSINE_Z):
         row[KIND] = kind
         assert curvature_variance(row, x, cov, 2.0) == pytest.approx(frobenius2 / 2 / slant2**2)
+
+
+@pytest.mark.parametrize("heading", [-1, 7])
+@pytest.mark.parametrize("kind", [Kind.RANGE, Kind.TOA, Kind.TDOA])
+@pytest.mark.parametrize("seed", range(8))
+def test_the_mean_distance_is_longer_than_that_of_the_mean(
+    kind: Kind, seed: int, heading: int
+) -> None:
+    rng = np.random.default_rng(100 + seed)
+    row, x, A = random_row(rng, kind, heading), random_state(rng), rng.normal(size=(9, 9))
+    cov = A @ A.T
+    found = curvature_mean(row, x, cov, 2.0)
+    assert found == pytest.approx(half_trace_of_mean(row, x, cov, 2.0), rel=1e-3, abs=1e-8)
+    assert kind == Kind.TDOA or found > 0.0
+
+
+def test_the_mean_of_drawn_distances_is_that_of_the_second_order() -> None:
+    rng = np.random.default_rng(7)
+    row, x = level_row(Kind.RANGE, np.array([0.0, 0.0, 3.0])), np.zeros(9)
+    x[POSITION] = 20.0, 5.0
+    cov = np.eye(9)
+    cov[POSITION, POSITION] = [[1.0, -1.5], [-1.5, 4.0]]
+    drawn = rng.multivariate_normal(x[POSITION], cov[POSITION, POSITION], 400_000)
+    distances = np.sqrt((drawn**2).sum(axis=1) + 9.0)
+    longer = float(distances.mean() - np.sqrt(x[X.PX] ** 2 + x[X.PY] ** 2 + 9.0))
+    assert curvature_mean(row, x, cov, 0.0) == pytest.approx(longer, abs=0.01)
+
+
+@pytest.mark.parametrize("kind", [Kind.AZIMUTH, Kind.COSINE_Y, Kind.PHASE, Kind.SPEED])
+def test_other_values_are_predicted_at_the_mean(kind: Kind) -> None:
+    row, x = random_row(np.random.default_rng(1), kind), random_state(np.random.default_rng(2))
+    assert curvature_mean(row, x, np.eye(9), 2.0) == 0.0
 
 
 def test_curvature_at_the_rsu_is_finite_and_linear_rows_have_none() -> None:

@@ -168,11 +168,12 @@ def test_log_likelihood_equals_scipys(row: Maker, random_cov: Maker) -> None:
 
 
 def test_likelihood_counts_the_curvature(row: Maker) -> None:
-    """What the filter adds to a variance where a range bends is in its likelihood too."""
+    """What the filter adds to a variance where a range bends is in its likelihood too,
+    and by how much the mean range is longer."""
     mean, cov = np.array([3.0, 0, 0, 0, 0, 0]), np.diag([1e-12, 4.0, 1, 1, 1, 1])
     rows = np.array([row(Kind.RANGE, 4.0, 0.5)])
     spread = 0.5 + 0.5 * (4.0 / 3.0) ** 2
-    expected = multivariate_normal(3.0, spread).logpdf(4.0)
+    expected = multivariate_normal(3.0 + 0.5 * 4.0 / 3.0, spread).logpdf(4.0)
     assert log_likelihood(mean, cov, rows) == pytest.approx(expected, rel=1e-9)
 
 

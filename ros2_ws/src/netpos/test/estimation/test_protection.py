@@ -7,6 +7,7 @@ import math
 import filter_rows
 import numpy as np
 import pytest
+from curved_rows import bends
 from engine_cases import opened
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -271,13 +272,15 @@ def test_level_of_a_manoeuvre_is_linearised_at_its_own_answer() -> None:
     nodes, weights = np.polynomial.legendre.leggauss(3)
     times_s = longest_s * (nodes + 1.0) / 2.0
     wide = sum(w / 2.0 * opened(cov, 4.0, s) for s, w in zip(times_s, weights, strict=True))
-    x, bent, used = mean, np.zeros(2), rows[:2]
+    x, bent, longer, used = mean, np.zeros(2), np.zeros(2), rows[:2]
     for _ in range(2):
         z, H = linearise(used, x, height_m)
+        z -= longer
         S = H @ wide @ H.T + np.diag(used[:, VARIANCE] + bent)
         x = prior + wide @ H.T @ np.linalg.solve(S, z + H @ (x - prior))
         P = wide - wide @ H.T @ np.linalg.solve(S, H @ wide)
         bent = np.array([curvature_variance(row, x, P, height_m) for row in used])
+        longer = bends(x, P, used, height_m)
     assert (bent[1:] > 0.01 * used[1:, VARIANCE]).all()
     expected = np.linalg.norm(x[POSITION] - mean[POSITION]) + protection_level(
         P[POSITION, POSITION], 1e-4

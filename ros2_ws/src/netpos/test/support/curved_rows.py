@@ -7,6 +7,7 @@ from filter_rows import row
 from netpos.estimation.measurement import (
     VARIANCE,
     Kind,
+    curvature_mean,
     curvature_variance,
     linearise,
 )
@@ -36,6 +37,11 @@ def range_problem(seed: int) -> tuple[Array, Array, Array]:
         ]
     )
     return mean, cov, rows
+
+
+def bends(mean: Array, cov: Array, rows: Array, height_m: float = 0.0) -> Array:
+    """How far the mean of each row is above its value at the mean."""
+    return np.array([curvature_mean(r, mean, cov, height_m) for r in rows])
 
 
 def two_variances(mean: Array, cov: Array, rows: Array) -> Array:

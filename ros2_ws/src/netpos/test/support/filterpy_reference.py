@@ -13,6 +13,7 @@ from netpos.estimation.measurement import (
     GROUP,
     VALUE,
     VARIANCE,
+    curvature_mean,
     curvature_variance,
     is_cyclic,
     linearise,
@@ -73,8 +74,9 @@ def _ekf(mean: Array, cov: Array, rows: Array, variance: Array, height_m: float)
     reference = kalman.ExtendedKalmanFilter(dim_x=mean.size, dim_z=len(rows))
     reference.x, reference.P = mean.copy(), cov.copy()
     curvature = [curvature_variance(row, mean, cov, height_m) for row in rows]
+    bend = np.array([curvature_mean(row, mean, cov, height_m) for row in rows])
     reference.update(
-        rows[:, VALUE],
+        rows[:, VALUE] - bend,
         lambda x: linearise(rows, x, height_m)[1],
         lambda x: _values(rows, x, height_m),
         R=np.diag(variance + curvature),

@@ -161,7 +161,7 @@ class NumpyEkf:
     def update(self, h: list[Any], z: Array, sd: float) -> None:
         at = [0, 1, 4]
         P3, e, eps = self.P[np.ix_(at, at)], np.eye(3), 1e-4
-        place, H, R = self.x[at], np.zeros((len(h), 5)), np.zeros(len(h))
+        place, H, R, longer = self.x[at], np.zeros((len(h), 5)), np.zeros(len(h)), np.zeros(len(h))
         for i, f in enumerate(h):
             H[i, at] = [(f(place + eps * u) - f(place - eps * u)) / (2 * eps) for u in e]
             bend = np.array(
@@ -180,7 +180,8 @@ class NumpyEkf:
                 ]
             )
             R[i] = sd**2 + 0.5 * np.trace(bend @ P3 @ bend @ P3)
-        left = z - np.array([f(place) for f in h])
+            longer[i] = 0.5 * np.trace(bend @ P3)
+        left = z - np.array([f(place) for f in h]) - longer
         K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + np.diag(R))
         self.x = self.x + K @ left
         self.P = self.P - K @ H @ self.P

@@ -322,7 +322,7 @@ def _start_of_the_second(first: list[RsuMeasurement], seed: int, bias: Array) ->
 def test_a_device_takes_over_what_others_have_learned() -> None:
     """Of biases of 6 sd that nobody declared, it knows from the start how large they are."""
     alone, helped = [], []
-    for seed in range(12):
+    for seed in range(36):
         bias = np.random.default_rng(seed).normal(0.0, 0.6, 5)
         alone.append(_start_of_the_second([], seed, bias))
         first = _measurements(100 + seed, 90.0, 0.1, bias)

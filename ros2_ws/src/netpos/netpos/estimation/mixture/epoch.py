@@ -211,7 +211,7 @@ def is_too_wide(
         return False
     own = Dynamics(dynamics.motions.copy(), dynamics.sojourn_s, dynamics.bias)
     moved = move(one_component(mean, cov), epoch.dt_s, own, options)
-    return bool(any_splits(moved, epoch.rows, options.height_m))
+    return bool(any_splits(moved, epoch.rows, options))
 
 
 @kernel
@@ -227,7 +227,7 @@ def apply_epoch(
     rows, blocked = epoch.rows, options.robust.nlos_probability > 0.0
     at = ambiguous_phase(rows, options)
     one_model = options.models == 1 and at < 0
-    splits = one_model and any_splits(components, rows, options.height_m)
+    splits = one_model and any_splits(components, rows, options)
     if one_model and blocked and not splits:
         found: Update = along_paths(components, epoch, options, since_turn_s, accepted)
         return found

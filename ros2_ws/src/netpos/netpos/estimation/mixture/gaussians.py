@@ -13,6 +13,14 @@ from netpos.messages.values import Array
 
 Ints = npt.NDArray[np.int64]
 
+BENT = 0.05
+"""A component is too long where its second-order variance exceeds this share of the variance
+across it,"""
+BENT_OR_BLOCKED = 0.25
+"""or this where a path may be blocked: components along a ring take one Gaussian for a direct and
+a blocked path, which loses more than a shorter arc gains."""
+SPACING_SD = 1.2
+"""Of equal Gaussians side by side: their sum is flat to 1e-3."""
 _APART2 = 9.0  # squared Mahalanobis distance of means from which components are two modes
 
 

@@ -3,10 +3,10 @@
 Ranges of near anchors, or an angle and few ranges, leave a thin arc: long one way, narrow across,
 and bent. One Gaussian at its most probable point is too short, too thick or off. Here the arc is
 followed from that point both ways, and becomes a row of Gaussians, each so short that its
-second-order variance is a quarter of the variance across (Tuggle and Zanetti 2018 split along the
-direction of greatest curvature, too). Each is the product of the posterior and of a Gaussian along
-the arc, by Laplace's approximation: the Gaussians along the arc add up to a constant, so that
-the products add up to the posterior.
+second-order variance is a twentieth of the variance across (Tuggle and Zanetti 2018 split along
+the direction of greatest curvature, too). Each is the product of the posterior and of a Gaussian
+along the arc, by Laplace's approximation: the Gaussians along the arc add up to a constant, so
+that the products add up to the posterior.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netpos.common.least_squares import minimise
-from netpos.estimation.mixture.gaussians import Mixture
+from netpos.estimation.mixture.gaussians import BENT, SPACING_SD, Mixture
 from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import Array
 
@@ -27,11 +27,9 @@ Fit = tuple[float, Array, Array]
 Equations = Callable[[Array], tuple[float, Array, Array]]
 """Cost, gradient (n,) and normal matrix (n, n) at a state, as ``minimise`` takes them."""
 
-_SHARE = 0.25  # second-order variance over the variance across
 # A cost one sd away that differs by so much from the one of a Gaussian (1) shifts the mean by 1.5
 # times as many sd, where it is higher on one side.
 _UNEVEN = 0.05
-_SPACING_SD = 1.2  # as of Gaussians along a ring
 _TIGHT = 0.01  # sd, over a component's, that holds a point at its place along the arc
 _COST_MAX = 37.0  # twice the log of the least weight of a component
 _PIECES_MAX = 32  # one way from the most probable point
@@ -139,10 +137,10 @@ def _along(equations: Equations, fit: Fit, cost_max: float) -> list[_Piece]:
         away = state[POSITION] - fit[1][POSITION]
         bend += float(away[1] * u[0] - away[0] * u[1]) / sd**2
         differs |= abs(cost - fit[0] - 1.0) > _UNEVEN
-    is_bent = 0.5 * bend**2 * sd**4 > _SHARE * across**2
+    is_bent = 0.5 * bend**2 * sd**4 > BENT * across**2
     if not is_bent and not differs:
         return [_whole(fit)]
-    short = min(math.sqrt(math.sqrt(2.0 * _SHARE) * across / max(abs(bend), 1e-9)), 0.5 * sd)
+    short = min(math.sqrt(math.sqrt(2.0 * BENT) * across / max(abs(bend), 1e-9)), 0.5 * sd)
     pieces = [_piece(equations, _Line(fit[1][POSITION], u, short), fit[1])]
     for side in (-1.0, 1.0):
         pieces += _one_way(equations, fit, side * u, short, cost_max)
@@ -159,7 +157,7 @@ def _one_way(
         _, u, follows, _ = _axis(cov)
         side = 1.0 if float(u @ towards) > 0.0 else -1.0
         towards = side * u
-        q = state + _SPACING_SD * short * side * follows
+        q = state + SPACING_SD * short * side * follows
         line = _Line(q[POSITION], towards, _TIGHT * short)
         cost, state, _ = _minimum(equations, line, q)
         if not math.isfinite(cost) or cost > cost_max:
@@ -174,5 +172,5 @@ def _piece(equations: Equations, line: _Line, start: Array) -> _Piece:
     """The product of the posterior and of a Gaussian along the arc, times their spacing."""
     whole = _whole(_minimum(equations, line, start))
     return whole._replace(
-        log_weight=whole.log_weight + math.log(_SPACING_SD / math.sqrt(2.0 * math.pi))
+        log_weight=whole.log_weight + math.log(SPACING_SD / math.sqrt(2.0 * math.pi))
     )

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from netpos.estimation.compile import kernel
+from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.engine import FilterOptions
 from netpos.estimation.fusion import workspace
 from netpos.estimation.measurement import (
@@ -29,17 +29,22 @@ from netpos.estimation.mixture.candidates import (
     first_of,
     outlier_log,
 )
-from netpos.estimation.mixture.gaussians import Mixture, fuse_value
+from netpos.estimation.mixture.gaussians import (
+    BENT,
+    BENT_OR_BLOCKED,
+    SPACING_SD,
+    Mixture,
+    fuse_value,
+)
 from netpos.estimation.mixture.reduction import reduced
 from netpos.estimation.sensors.row import group_end
 from netpos.messages.values import Array
 
 _VELOCITY_END = 4  # position and velocity come first
-# A component is split where the second-order variance exceeds this share of the row's,
-_WIDE = 0.25
-# or where it reaches the RSU within so many sd; narrower components (m) never are.
+# A component is split where it is too long, or reaches the RSU within so many sd; narrower
+# components (m) never are.
 _REACH_SD, _NARROW_M = 3.0, 1.0
-_SPACING_SD = 1.2  # of Gaussians along a ring: their sum is flat to 1e-3 there
+_END_SD = 6.0  # where a component ends along a ring: what lies beyond is pruned
 _RING_MIN, RING_MAX = 12, 128
 RING_MERGE_COST = 2e-4  # divergence (Runnalls' bound) that merging parts of a ring may cost
 
@@ -55,34 +60,44 @@ def _own_variance(row: Array, cov: Array, h: Array) -> float:
 
 
 @kernel
-def is_wide(row: Array, mean: Array, cov: Array, height_m: float) -> bool:
+def is_wide(row: Array, mean: Array, cov: Array, options: FilterOptions) -> bool:
     """Whether a component is to be split for a row: a range or time of arrival that narrows the
     position, but whose tangent does not hold over the component's width."""
     width2 = cov[0, 0] + cov[1, 1]
     if not is_range(row) or width2 < _NARROW_M * _NARROW_M:
         return False
     h = np.empty(mean.size)
-    innovation_row(row, mean, height_m, h)
+    innovation_row(row, mean, options.height_m, h)
     own = _own_variance(row, cov, h)
     if own > width2:
         return False
-    if curvature_variance(row, mean, cov, height_m) > _WIDE * own:
+    share = BENT_OR_BLOCKED if options.robust.nlos_probability > 0.0 else BENT
+    if curvature_variance(row, mean, cov, options.height_m) > share * own:
         return True
     dx, dy = mean[0] - row[ORIGIN], mean[1] - row[ORIGIN + 1]
     return bool(_REACH_SD * _REACH_SD * width2 > dx * dx + dy * dy)
 
 
 @kernel
-def splits(rows: Array, mean: Array, cov: Array, height_m: float) -> bool:
+def splits(rows: Array, mean: Array, cov: Array, options: FilterOptions) -> bool:
     """Whether the ``rows`` of one measurement split a component: a range alone that ``is_wide``.
     An angle measured with it tells where on the ring the device is."""
-    return bool(rows.shape[0] == 1 and is_wide(rows[0], mean, cov, height_m))
+    return bool(rows.shape[0] == 1 and is_wide(rows[0], mean, cov, options))
+
+
+@leaf
+def _half_angle(distance_m: float, cov: Array) -> float:
+    """Half of the angle in which a component of ``cov`` (n, n) is seen from an RSU
+    ``distance_m`` from its mean; all around where it reaches the RSU."""
+    reach = _END_SD * math.sqrt(cov[0, 0] + cov[1, 1])
+    return math.asin(reach / distance_m) if reach < distance_m else math.pi
 
 
 @kernel
 def split_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Mixture:
     """The product of the Gaussian ``mean`` (n,), ``cov`` (n, n) and the likelihood of a range or
-    time of arrival: components along the ring, their log weights not normalised."""
+    time of arrival: components along the ring as far as the Gaussian reaches, their log weights
+    not normalised."""
     n = mean.size
     h, at, along = np.empty(n), mean.copy(), np.zeros(n)
     residual = innovation_row(row, mean, height_m, h)
@@ -91,19 +106,21 @@ def split_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Mi
     slant = math.sqrt(dx * dx + dy * dy + dz * dz) + residual  # measured, less clock and biases
     own = _own_variance(row, cov, h)
     radius = math.sqrt(max(slant * slant - dz * dz, 0.25 * own, 1e-4))
-    sd = math.sqrt(radius * math.sqrt(2.0 * _WIDE * own))  # whose second-order variance is own
-    wanted = math.ceil(2.0 * math.pi * radius / (_SPACING_SD * sd))
+    towards, half = math.atan2(dy, dx), _half_angle(math.hypot(dx, dy), cov)
+    sd = math.sqrt(radius * math.sqrt(2.0 * BENT * own))  # no longer than that
+    wanted = math.ceil(2.0 * half * radius / (SPACING_SD * sd))
     count = int(min(max(wanted, _RING_MIN), RING_MAX))
-    arc = 2.0 * math.pi * radius / count
-    sd = arc / _SPACING_SD
+    arc = 2.0 * half * radius / count
+    sd = arc / SPACING_SD
     means, covs, logs = np.empty((count, n)), np.empty((count, n, n)), np.empty(count)
     for k in range(count):
-        angle = 2.0 * math.pi * (k + 0.5) / count
+        angle = towards + half * ((2.0 * k + 1.0) / count - 1.0)
         c, s = math.cos(angle), math.sin(angle)
         at[0], at[1] = row[ORIGIN] + radius * c, row[ORIGIN + 1] + radius * s
         means[k], covs[k] = mean, cov
         residual = innovation_row(row, at, height_m, h)
         residual -= h[0] * (mean[0] - at[0]) + h[1] * (mean[1] - at[1])
+        residual -= 0.5 * sd * sd / slant  # a Gaussian along the tangent is outside of the ring
         logs[k] = math.log(arc) + fuse_value(means[k], covs[k], h, residual, row[VARIANCE])
         along[0], along[1] = -s, c
         residual = c * (at[1] - means[k, 1]) - s * (at[0] - means[k, 0])
@@ -112,14 +129,14 @@ def split_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Mi
 
 
 @kernel
-def any_splits(components: Mixture, rows: Array, height_m: float) -> bool:
+def any_splits(components: Mixture, rows: Array, options: FilterOptions) -> bool:
     """Whether a range of ``rows`` splits a component along its ring."""
     start = 0
     while start < rows.shape[0]:
         stop = group_end(rows, start)
         for k in range(components.log_weights.size):
             mean, cov = components.means[k], components.covs[k]
-            if splits(rows[start:stop], mean, cov, height_m):
+            if splits(rows[start:stop], mean, cov, options):
                 return True
         start = stop
     return False
@@ -161,7 +178,7 @@ def one_by_one(
         work = workspace(n, alone.shape[0])
         for k in range(count):
             mean, cov = components.means[k], components.covs[k]
-            if splits(alone, mean, cov, options.height_m):
+            if splits(alone, mean, cov, options):
                 end = ring(k, components, alone, end, options.height_m, found)
             else:
                 found.means[end], found.covs[end] = mean, cov

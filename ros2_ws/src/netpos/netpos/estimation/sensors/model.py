@@ -95,6 +95,8 @@ class Sensor:
     second_order : variance of what linearising leaves out, or a bound of it, as an update takes
         it: ``(row, dx, dy, dz, cov, axes)`` beside ``of_offset``, ``(row, mean, cov)`` beside
         ``of_state``. ``axes`` is 2 or 3, the size of the position in ``cov``. None: 0.
+    second_order_mean : ``(row, dx, dy, dz, cov, axes)``, beside ``of_offset``: how far the mean
+        value is above that of the mean. None: 0
     is_bound : ``second_order`` is the term with the largest curvature in every direction
     exact_second_order : ``(row, dx, dy, dz, cov, axes)`` of the true curvature, where
         ``second_order`` is a bound and weights of priors need better
@@ -109,6 +111,7 @@ class Sensor:
     of_antenna: Kernel | None = None
     of_navigation: Kernel | None = None
     second_order: Kernel | None = None
+    second_order_mean: Kernel | None = None
     is_bound: bool = False
     exact_second_order: Kernel | None = None
     wraps: Wraps = Wraps.NEVER

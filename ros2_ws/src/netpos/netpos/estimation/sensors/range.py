@@ -35,11 +35,28 @@ def exact(_row: Array, dx: float, dy: float, dz: float, cov: Array, axes: int) -
     return float(0.5 * max(total, 0.0) / r2)
 
 
+@inlined
+def bend(_row: Array, dx: float, dy: float, dz: float, cov: Array, axes: int) -> float:
+    """Half the trace of h'' P: how much longer the mean distance is than that of the mean
+    (Bar-Shalom, Li and Kirubarajan 2001, eq. 10.3.3-10)."""
+    r2 = max(dx * dx + dy * dy + dz * dz, 1e-6)
+    d = (dx, dy, dz)
+    total, along = 0.0, 0.0
+    for i in range(axes):
+        Pd = 0.0
+        for j in range(axes):
+            Pd += cov[i, j] * d[j]
+        total += cov[i, i]
+        along += d[i] * Pd
+    return float(0.5 * (total - along / r2) / math.sqrt(r2))
+
+
 SENSOR = Sensor(
     name="RANGE",
     kind=3,
     of_offset=distance,
     second_order=exact,
+    second_order_mean=bend,
     is_range=True,
     in_strapdown=True,
     bias_sd="range_bias_sd_m",

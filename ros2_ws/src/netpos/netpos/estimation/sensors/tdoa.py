@@ -10,7 +10,7 @@ from __future__ import annotations
 from netpos.estimation.compile import inlined
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.estimation.sensors.model import Reading, Sensor
-from netpos.estimation.sensors.range import distance
+from netpos.estimation.sensors.range import bend, distance
 from netpos.estimation.sensors.row import AXES
 from netpos.messages.values import Array, Field
 
@@ -50,11 +50,20 @@ def exact(row: Array, dx: float, dy: float, dz: float, cov: Array, axes: int) ->
     return float(0.5 * max(total, 0.0))
 
 
+@inlined
+def bends(row: Array, dx: float, dy: float, dz: float, cov: Array, axes: int) -> float:
+    """Half the trace of h'' P, of both distances."""
+    bx, by, bz = row[AXES], row[AXES + 1], row[AXES + 2]
+    other = bend(row, dx - bx, dy - by, dz - bz, cov, axes)
+    return float(bend(row, dx, dy, dz, cov, axes) - other)
+
+
 SENSOR = Sensor(
     name="TDOA",
     kind=14,
     of_offset=difference,
     second_order=exact,
+    second_order_mean=bends,
     in_strapdown=True,
     bias_sd="range_bias_sd_m",
     reading=Reading(

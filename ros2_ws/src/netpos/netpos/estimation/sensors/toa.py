@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.estimation.sensors.model import Reading, Sensor
-from netpos.estimation.sensors.range import distance, exact
+from netpos.estimation.sensors.range import bend, distance, exact
 from netpos.messages.values import Field
 
 SENSOR = Sensor(
@@ -13,6 +13,7 @@ SENSOR = Sensor(
     kind=2,
     of_offset=distance,
     second_order=exact,
+    second_order_mean=bend,
     has_clock=True,
     is_range=True,
     in_strapdown=True,

@@ -11,8 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from netpos.estimation.engine import Epochs
-from netpos.estimation.error_state import UNCONSTRAINED, Sensors
-from netpos.estimation.measurement import ORIGIN, VALUE
+from netpos.estimation.error_state import (
+    MEMORY,
+    UNCONSTRAINED,
+    Imu,
+    Sensors,
+    advance,
+    correct,
+)
+from netpos.estimation.measurement import GROUP, ORIGIN, VALUE
 from netpos.estimation.space import linearise_in_space
 from netpos.estimation.state import NAV_POSITION
 from netpos.evaluation.work import Work
@@ -99,13 +106,22 @@ def true_states(simulation: Simulation, epochs: Epochs) -> Array:
     return np.array([nav_of(*state) for state in states])
 
 
-def without_errors(epochs: Epochs, states: Array, cov: Array) -> Epochs:
-    """The same epochs, each row as it would be without an error, at states (N, NAV)."""
-    rows = epochs.rows.copy()
-    for nav, first, last in zip(states, epochs.row_start, epochs.row_start[1:], strict=False):
-        if last > first:
-            rows[first:last, VALUE] -= linearise_in_space(rows[first:last], nav, cov)[0]
-    return epochs._replace(rows=rows)
+def on_the_way(epochs: Epochs, states: Array, cov: Array, imu: Imu, sensors: Sensors) -> Drive:
+    """A filter from ``cov`` (n, n) whose rows and IMU have no errors, and which is put back on the
+    true way, ``states`` (N, NAV), after each epoch; what it made of them before that."""
+    navs, covs, dof = np.empty_like(states), np.empty((len(states), *cov.shape)), []
+    P, memory, gate, before_ns = cov.copy(), np.zeros(MEMORY), gate_thresholds(1.0), None
+    for i, (stamp_ns, first) in enumerate(zip(epochs.stamps_ns, epochs.row_start, strict=False)):
+        nav = states[max(i - 1, 0)].copy()
+        if before_ns is not None:
+            advance(nav, P, memory, before_ns, stamp_ns, imu, sensors)
+        rows, before_ns, used = epochs.rows[first : epochs.row_start[i + 1]].copy(), stamp_ns, 0
+        if len(rows) > 0:
+            rows[:, VALUE] -= linearise_in_space(rows, nav, P)[0]
+            _, used = correct(nav, P, rows, gate, np.zeros(int(rows[-1, GROUP]) + 1))
+        navs[i], covs[i] = nav, P
+        dof.append(used)
+    return Drive(navs, covs, np.zeros(len(states)), np.array(dof))
 
 
 def bound_drives(case: Case, seed: int) -> tuple[Epochs, dict[str, Drive]]:
@@ -114,12 +130,9 @@ def bound_drives(case: Case, seed: int) -> tuple[Epochs, dict[str, Drive]]:
     exact = Simulation(load_scenario(SCENARIO, seed=seed, changes=changes))
     config, cov = config_of(case), np.diag(start_sd(config_of(case), *START_SD) ** 2)
     epochs = with_silence_ends(epochs_of(simulation_of(case).with_seed(seed), case))
-    states = true_states(exact, epochs)
-    epochs = without_errors(epochs, states, cov)
-    begin, imu = (int(epochs.stamps_ns[0]), states[0], cov), imu_of(exact)
-    gate = gate_thresholds(1.0)
+    states, imu = true_states(exact, epochs), imu_of(exact)
     return epochs, {
-        name: drive(*begin, imu, epochs, by, gate)
+        name: on_the_way(epochs, states, cov, imu, by)
         for name, by in variants(sensors_of(config)).items()
     }
 
