@@ -108,10 +108,16 @@ def test_the_map_comes_to_who_is_late(seen: Seen) -> None:
 def test_markers_are_where_the_estimate_is(seen: Seen) -> None:
     """The device and its ellipse, with the odometry of the same position as oracle."""
     frames = drawn(seen)
-    estimates = {
-        (o.pose.pose.position.x, o.pose.pose.position.y): np.reshape(o.pose.covariance, (6, 6))
-        for o in list(seen.odometry.messages)
-    }
+    shown = {(d.pose.position.x, d.pose.position.y) for f in frames for d in devices(f)}
+
+    def estimates_shown() -> dict[tuple[float, float], Any]:
+        estimates = {
+            (o.pose.pose.position.x, o.pose.pose.position.y): np.reshape(o.pose.covariance, (6, 6))
+            for o in list(seen.odometry.messages)
+        }
+        return estimates if shown <= estimates.keys() else {}
+
+    estimates = wait_until(estimates_shown, "the odometry behind the markers")
     compared = 0
     for frame in frames:
         (device,) = devices(frame)
@@ -133,17 +139,22 @@ def test_a_marker_keeps_its_number_and_lives_for_a_while(seen: Seen) -> None:
 
 
 def test_levels_and_lines_of_sight_are_those_of_the_status(seen: Seen) -> None:
-    levels = {s.protection_level for s in list(seen.status.messages)}
-    shown = 0
-    for frame in drawn(seen):
-        (device,) = devices(frame)
-        place = device.pose.position
-        for ring in (m for m in frame.markers if m.ns == "protection levels"):
-            radii = [np.hypot(p.x - place.x, p.y - place.y) for p in ring.points]
-            assert min(abs(radii[0] - level) for level in levels) < 1e-6
-            assert radii == pytest.approx([radii[0]] * len(radii))
-            shown += 1
-    assert shown >= 10
+    rings = [
+        [np.hypot(p.x - device.pose.position.x, p.y - device.pose.position.y) for p in ring.points]
+        for frame in drawn(seen)
+        for device in devices(frame)
+        for ring in frame.markers
+        if ring.ns == "protection levels"
+    ]
+    assert len(rings) >= 10
+    for radii in rings:
+        assert radii == pytest.approx([radii[0]] * len(radii))
+
+    def all_are_levels() -> bool:
+        levels = np.array([s.protection_level for s in list(seen.status.messages)])
+        return all(np.abs(levels - radii[0]).min() < 1e-6 for radii in rings)
+
+    wait_until(all_are_levels, "the statuses behind the rings")
     with_lines = [f for f in drawn(seen) if any(m.ns == "lines of sight" for m in f.markers)]
     assert len(with_lines) >= 10
     for frame in with_lines[-5:]:
@@ -155,13 +166,16 @@ def test_levels_and_lines_of_sight_are_those_of_the_status(seen: Seen) -> None:
 def test_the_path_goes_through_estimates(seen: Seen) -> None:
     seen.path.wait_for(2)
     path = seen.path.messages[-1]
-    known = {
-        (stamp_ns(o.header.stamp), o.pose.pose.position.x, o.pose.pose.position.y)
-        for o in list(seen.odometry.messages)
-    }
     points = [(stamp_ns(p.header.stamp), p.pose.position.x, p.pose.position.y) for p in path.poses]
     assert len(points) >= 2
-    assert set(points) <= known
+
+    def all_are_estimates() -> bool:
+        return set(points) <= {
+            (stamp_ns(o.header.stamp), o.pose.pose.position.x, o.pose.pose.position.y)
+            for o in list(seen.odometry.messages)
+        }
+
+    wait_until(all_are_estimates, "the odometry behind the path")
     assert points == sorted(points)
     assert path.header.frame_id == "map"
 
