@@ -75,11 +75,15 @@ def devices(frame: Any) -> list[Any]:
     return [m for m in frame.markers if m.ns == "devices" and m.action == Marker.ADD]
 
 
-def drawn(seen: Seen) -> list[Any]:
-    """Frames that show the device."""
-    frames = [frame for frame in list(seen.markers.messages) if devices(frame)]
-    assert len(frames) >= 10
-    return frames
+def drawn(seen: Seen, also: str = "devices") -> list[Any]:
+    """Ten frames or more that show the device and markers of ``also``, once there are so many."""
+
+    def found() -> list[Any]:
+        frames = [frame for frame in list(seen.markers.messages) if devices(frame)]
+        frames = [frame for frame in frames if any(m.ns == also for m in frame.markers)]
+        return frames if len(frames) >= 10 else []
+
+    return list(wait_until(found, f"ten frames with {also}"))
 
 
 def test_the_map_comes_to_who_is_late(seen: Seen) -> None:
@@ -155,9 +159,7 @@ def test_levels_and_lines_of_sight_are_those_of_the_status(seen: Seen) -> None:
         return all(np.abs(levels - radii[0]).min() < 1e-6 for radii in rings)
 
     wait_until(all_are_levels, "the statuses behind the rings")
-    with_lines = [f for f in drawn(seen) if any(m.ns == "lines of sight" for m in f.markers)]
-    assert len(with_lines) >= 10
-    for frame in with_lines[-5:]:
+    for frame in drawn(seen, "lines of sight")[-5:]:
         (device,) = devices(frame)
         for line in (m for m in frame.markers if m.ns == "lines of sight" and not m.action):
             assert line.points[1] == device.pose.position
