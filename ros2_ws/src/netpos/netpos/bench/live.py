@@ -145,24 +145,13 @@ def _load(run: dict[str, Any]) -> list[Result]:
             unit="messages",
             note=f"Measurements not handled: {unhandled}; epochs without odometry: {unanswered}.",
         ),
-        within(
-            f"{what}: lag of odometry, 99th percentile",
-            run["lag_p99_s"],
-            "one period",
-            _PERIOD_S,
-            1.0,
-            note=f"{lags}. The probe used {run['cpu_probe']:.2f} s/s and was at most "
+        _lag_row(
+            what,
+            run,
+            f"{lags}. The probe used {run['cpu_probe']:.2f} s/s and was at most "
             f"{1e3 * run['probe_late_s']:.1f} ms late.",
         ),
-        within(
-            f"{what}: processor time of the tracker",
-            run["cpu_idle"] + run["cpu_traffic"],
-            "one core",
-            1.0,
-            1.0,
-            unit="s/s",
-            note=f"{run['cpu_idle']:.3f} s/s of it when nothing comes.",
-        ),
+        _processor_row(what, run, f"{run['cpu_idle']:.3f} s/s of it when nothing comes."),
         within(
             f"{what}: resident memory",
             run["memory_mb"],
@@ -181,7 +170,6 @@ def flood_rows(quick: bool) -> list[Result]:
         probe("flood", "--rate", f"{rate_hz}", "--seconds", seconds) for rate_hz in (0, _FLOOD_HZ)
     )
     what = f"{run['devices']} devices beside {_FLOOD_HZ} messages/s of one RSU"
-    cpu = {name: r["cpu_idle"] + r["cpu_traffic"] for name, r in (("run", run), ("quiet", quiet))}
     return [
         within(
             f"{what}: epochs without odometry",
@@ -192,25 +180,30 @@ def flood_rows(quick: bool) -> list[Result]:
             unit="epochs",
             note=f"{run['refused_of_flood']} messages of the flood refused and counted.",
         ),
-        within(
-            f"{what}: lag of odometry, 99th percentile",
-            run["lag_p99_s"],
-            "one period",
-            _PERIOD_S,
-            1.0,
-            note=f"Without the flood {1e3 * quiet['lag_p99_s']:.1f} ms; median "
+        _lag_row(
+            what,
+            run,
+            f"Without the flood {1e3 * quiet['lag_p99_s']:.1f} ms; median "
             f"{1e3 * run['lag_median_s']:.1f} ms, without {1e3 * quiet['lag_median_s']:.1f} ms.",
         ),
-        within(
-            f"{what}: processor time of the tracker",
-            cpu["run"],
-            "one core",
-            1.0,
-            1.0,
-            unit="s/s",
-            note=f"Without the flood {cpu['quiet']:.3f} s/s.",
-        ),
+        _processor_row(what, run, f"Without the flood {_processor_s(quiet):.3f} s/s."),
     ]
+
+
+def _lag_row(what: str, run: dict[str, Any], note: str) -> Result:
+    lag_s = run["lag_p99_s"]
+    name = f"{what}: lag of odometry, 99th percentile"
+    return within(name, lag_s, "one period", _PERIOD_S, 1.0, note=note)
+
+
+def _processor_s(run: dict[str, Any]) -> float:
+    """Processor time of the tracker per second."""
+    return float(run["cpu_idle"] + run["cpu_traffic"])
+
+
+def _processor_row(what: str, run: dict[str, Any], note: str) -> Result:
+    name = f"{what}: processor time of the tracker"
+    return within(name, _processor_s(run), "one core", 1.0, 1.0, unit="s/s", note=note)
 
 
 def ready_rows(quick: bool) -> list[Result]:
