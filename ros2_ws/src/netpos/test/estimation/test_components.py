@@ -82,6 +82,14 @@ def test_a_ring_is_the_product_of_prior_and_range(
     np.testing.assert_allclose(found_cov[:2, :2], cov, atol=0.05 * scale**2)
 
 
+@pytest.mark.parametrize("measured_m", [0.0, 1e-9, -3.0])
+def test_a_ring_without_a_radius_is_finite(measured_m: float) -> None:
+    """A range of nothing, and one that biases would have to make longer."""
+    x, P = prior((5.0, 0.0), (8.0, 8.0))
+    for part in split_along_ring(x, P, row(Kind.RANGE, measured_m, 0.2**2), 0.0):
+        assert np.isfinite(part).all()
+
+
 def test_the_other_states_follow_the_position() -> None:
     """A velocity that hangs together with the position is told by it, component by component."""
     x, P = prior((14.0, 0.0), (6.0, 6.0), rho=0.8)

@@ -112,6 +112,7 @@ def split_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Mi
     count = int(min(max(wanted, _RING_MIN), RING_MAX))
     arc = 2.0 * half * radius / count
     sd = arc / SPACING_SD
+    bend = 0.5 * sd * sd / math.hypot(radius, dz)
     means, covs, logs = np.empty((count, n)), np.empty((count, n, n)), np.empty(count)
     for k in range(count):
         angle = towards + half * ((2.0 * k + 1.0) / count - 1.0)
@@ -120,7 +121,7 @@ def split_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Mi
         means[k], covs[k] = mean, cov
         residual = innovation_row(row, at, height_m, h)
         residual -= h[0] * (mean[0] - at[0]) + h[1] * (mean[1] - at[1])
-        residual -= 0.5 * sd * sd / slant  # a Gaussian along the tangent is outside of the ring
+        residual -= bend  # a Gaussian along the tangent is outside of the ring
         logs[k] = math.log(arc) + fuse_value(means[k], covs[k], h, residual, row[VARIANCE])
         along[0], along[1] = -s, c
         residual = c * (at[1] - means[k, 1]) - s * (at[0] - means[k, 0])
