@@ -176,12 +176,17 @@ def offset_up(row: Array, mean: Array, height_m: float) -> float:
 
 
 @inlined
+def _offset(row: Array, mean: Array, height_m: float) -> tuple[float, float, float]:
+    """Offset d of the device's antenna from the RSU, in map [m]."""
+    lx, ly = _lever(row, mean)
+    dx, dy = mean[X.PX] + lx - row[ORIGIN], mean[X.PY] + ly - row[ORIGIN + 1]
+    return dx, dy, offset_up(row, mean, height_m)
+
+
+@inlined
 def _from_rsu(kind: int, row: Array, mean: Array, height_m: float, h: Array) -> float:
     """Value of a sensor of the offset between the RSU and the device's antenna."""
-    lx, ly = _lever(row, mean)
-    dx = mean[X.PX] + lx - row[ORIGIN]
-    dy = mean[X.PY] + ly - row[ORIGIN + 1]
-    dz = offset_up(row, mean, height_m)
+    dx, dy, dz = _offset(row, mean, height_m)
     value, h[X.PX], h[X.PY], up = of_offset(kind, row, dx, dy, dz)
     height = int(row[HEIGHT])
     if height > 0:
@@ -191,6 +196,7 @@ def _from_rsu(kind: int, row: Array, mean: Array, height_m: float, h: Array) -> 
         value += mean[X.CLOCK]
     heading = int(row[HEADING])
     if heading >= 0:
+        lx, ly = _lever(row, mean)
         h[heading] = h[X.PY] * lx - h[X.PX] * ly
     return float(value)
 
@@ -253,10 +259,7 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
     kind = int(row[KIND])
     if _has_state_model(kind):
         return float(_state_second_order(kind, row, mean, cov))
-    lx, ly = _lever(row, mean)
-    dx = mean[X.PX] + lx - row[ORIGIN]
-    dy = mean[X.PY] + ly - row[ORIGIN + 1]
-    dz = offset_up(row, mean, height_m)
+    dx, dy, dz = _offset(row, mean, height_m)
     if row[HEIGHT] > 0.0:
         return float(_second_order_in_3d(_FOR_UPDATE, kind, row, (dx, dy, dz), cov))
     return float(second_order_of_offset(kind, row, dx, dy, dz, cov, 2))
@@ -270,10 +273,7 @@ def curvature_mean(row: Array, mean: Array, cov: Array, height_m: float) -> floa
     kind = int(row[KIND])
     if not _has_second_order_mean(kind):
         return 0.0
-    lx, ly = _lever(row, mean)
-    dx = mean[X.PX] + lx - row[ORIGIN]
-    dy = mean[X.PY] + ly - row[ORIGIN + 1]
-    dz = offset_up(row, mean, height_m)
+    dx, dy, dz = _offset(row, mean, height_m)
     if row[HEIGHT] > 0.0:
         return float(_second_order_in_3d(_OF_MEAN, kind, row, (dx, dy, dz), cov))
     return float(second_order_mean_of_offset(kind, row, dx, dy, dz, cov, 2))

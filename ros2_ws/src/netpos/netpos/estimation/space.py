@@ -130,6 +130,13 @@ def innovation_at(row: Array, nav: Array, C: Array, h: Array) -> float:
     return float(wrap(difference)) if is_cyclic(row) else float(difference)
 
 
+@inlined
+def _away(row: Array, nav: Array) -> tuple[float, float, float]:
+    """Offset of the device from the RSU in map [m], its lever arm left out."""
+    dx, dy = nav[Nav.PX] - row[ORIGIN], nav[Nav.PY] - row[ORIGIN + 1]
+    return dx, dy, nav[Nav.PZ] - row[ORIGIN + 2]
+
+
 @leaf
 def bend_variance(row: Array, nav: Array, cov: Array) -> float:
     """Variance of what linearising ``row`` leaves out, for the position covariance in ``cov``:
@@ -137,9 +144,7 @@ def bend_variance(row: Array, nav: Array, cov: Array) -> float:
     kind = int(row[KIND])
     if not _has_offset_model(kind):
         return 0.0
-    dx = nav[Nav.PX] - row[ORIGIN]
-    dy = nav[Nav.PY] - row[ORIGIN + 1]
-    dz = nav[Nav.PZ] - row[ORIGIN + 2]
+    dx, dy, dz = _away(row, nav)
     return float(second_order_of_offset(kind, row, dx, dy, dz, cov, 3))
 
 
@@ -147,9 +152,7 @@ def bend_variance(row: Array, nav: Array, cov: Array) -> float:
 def bend_mean(row: Array, nav: Array, cov: Array) -> float:
     """How far the mean value of ``row`` is above that of the mean, for the position covariance in
     ``cov``: ``measurement.curvature_mean`` in space (lever arm left out)."""
-    dx = nav[Nav.PX] - row[ORIGIN]
-    dy = nav[Nav.PY] - row[ORIGIN + 1]
-    dz = nav[Nav.PZ] - row[ORIGIN + 2]
+    dx, dy, dz = _away(row, nav)
     return float(second_order_mean_of_offset(int(row[KIND]), row, dx, dy, dz, cov, 3))
 
 

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netpos.common.least_squares import minimise
-from netpos.estimation.mixture.gaussians import BENT, SPACING_SD, Mixture
+from netpos.estimation.mixture.gaussians import CURVATURE_SHARE, SPACING_SD, Mixture
 from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import Array
 
@@ -137,10 +137,12 @@ def _along(equations: Equations, fit: Fit, cost_max: float) -> list[_Piece]:
         away = state[POSITION] - fit[1][POSITION]
         bend += float(away[1] * u[0] - away[0] * u[1]) / sd**2
         differs |= abs(cost - fit[0] - 1.0) > _UNEVEN
-    is_bent = 0.5 * bend**2 * sd**4 > BENT * across**2
+    is_bent = 0.5 * bend**2 * sd**4 > CURVATURE_SHARE * across**2
     if not is_bent and not differs:
         return [_whole(fit)]
-    short = min(math.sqrt(math.sqrt(2.0 * BENT) * across / max(abs(bend), 1e-9)), 0.5 * sd)
+    short = min(
+        math.sqrt(math.sqrt(2.0 * CURVATURE_SHARE) * across / max(abs(bend), 1e-9)), 0.5 * sd
+    )
     pieces = [_piece(equations, _Line(fit[1][POSITION], u, short), fit[1])]
     for side in (-1.0, 1.0):
         pieces += _one_way(equations, fit, side * u, short, cost_max)

@@ -30,8 +30,8 @@ from netpos.estimation.mixture.candidates import (
     outlier_log,
 )
 from netpos.estimation.mixture.gaussians import (
-    BENT,
-    BENT_OR_BLOCKED,
+    CURVATURE_SHARE,
+    CURVATURE_SHARE_BLOCKED,
     SPACING_SD,
     Mixture,
     fuse_value,
@@ -71,7 +71,7 @@ def is_wide(row: Array, mean: Array, cov: Array, options: FilterOptions) -> bool
     own = _own_variance(row, cov, h)
     if own > width2:
         return False
-    share = BENT_OR_BLOCKED if options.robust.nlos_probability > 0.0 else BENT
+    share = CURVATURE_SHARE_BLOCKED if options.robust.nlos_probability > 0.0 else CURVATURE_SHARE
     if curvature_variance(row, mean, cov, options.height_m) > share * own:
         return True
     dx, dy = mean[0] - row[ORIGIN], mean[1] - row[ORIGIN + 1]
@@ -107,7 +107,7 @@ def split_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Mi
     own = _own_variance(row, cov, h)
     radius = math.sqrt(max(slant * slant - dz * dz, 0.25 * own, 1e-4))
     towards, half = math.atan2(dy, dx), _half_angle(math.hypot(dx, dy), cov)
-    sd = math.sqrt(radius * math.sqrt(2.0 * BENT * own))  # no longer than that
+    sd = math.sqrt(radius * math.sqrt(2.0 * CURVATURE_SHARE * own))  # no longer than that
     wanted = math.ceil(2.0 * half * radius / (SPACING_SD * sd))
     count = int(min(max(wanted, _RING_MIN), RING_MAX))
     arc = 2.0 * half * radius / count
