@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from netpos.bags import BagReader, codec
+from netpos.bags import BagReader, BagWriter, codec
 from netpos.bags.importers.common import recordings
 from netpos.bags.importers.own import Columns, Truth, import_csv
 from netpos.bags.importers.own.truth import TruthColumns
@@ -20,6 +20,7 @@ from netpos.scenario import load_scenario
 from netpos.scenario.offline import simulate_to_bag
 from netpos.scenario.replay import replay_bag
 from netpos.tracking import Tracker, TrackerConfig
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.optimize import least_squares
 
 C = 299_792_458.0
@@ -269,18 +270,48 @@ def test_the_yard_is_tracked_close_to_its_bound(tmp_path: Path) -> None:
     assert 1.5 < np.mean(nees) < 2.5
 
 
+def rewrite_without_differences(recorded: Path, older: Path) -> None:
+    """Copy a bag; its measurements take the definition that had no time differences yet."""
+    kind = "netpos_msgs/msg/RsuMeasurement"
+    topic = "/rsu/measurements"
+    with BagReader(recorded) as bag, BagWriter(older, metadata=bag.metadata) as writer:
+        for name, info in bag.topics.items():
+            text = info.definition
+            if name == topic:
+                lines = text.splitlines(keepends=True)
+                lines = [x for x in lines if "tdoa" not in x.lower() and "reference" not in x]
+                text = "".join(lines)
+            writer.add_topic(name, info.type_name, info.qos, text=text)
+            if name == topic:
+                store = get_typestore(Stores.ROS2_JAZZY)
+                store.register(get_types_from_msg(text, kind))
+        for entry in bag.messages():
+            cdr = entry.cdr
+            if entry.topic == topic:
+                old_class = store.types[kind]
+                kept = [field.name for field in fields(old_class) if field.init]
+                message = old_class(**{name: getattr(entry.message, name) for name in kept})
+                cdr = bytes(store.serialize_cdr(message, kind))
+            writer.write_raw(entry.topic, entry.type_name, cdr, entry.log_time_ns)
+
+
 def test_a_bag_written_before_there_were_differences_is_read(tmp_path: Path) -> None:
-    """The shipped bag carries the older definition."""
-    shipped = Path(__file__).parents[5] / "bags" / "fast_pass"
-    with BagReader(shipped) as bag:
+    recorded = Path(__file__).parents[5] / "bags" / "fast_pass"
+    rewrite_without_differences(recorded, tmp_path / "older")
+    with BagReader(tmp_path / "older") as bag:
         assert "tdoa" not in bag.topics["/rsu/measurements"].definition
-    replay_bag(shipped, tmp_path / "out")
-    with BagReader(shipped) as before, BagReader(tmp_path / "out") as after:
-        topic = ["/rsu/measurements"]
-        assert [e.cdr for e in before.messages(topic)] == [e.cdr for e in after.messages(topic)]
-        values = [codec().measurement_from_msg(e.message) for e in after.messages(topic)]
-    assert values
-    assert all(v.fields & Field.TOA and not v.reference_rsu_id for v in values)
+    replay_bag(tmp_path / "older", tmp_path / "out")
+    measurements = []
+    for name in (recorded, tmp_path / "older", tmp_path / "out"):
+        with BagReader(name) as bag:
+            found = bag.messages(["/rsu/measurements"])
+            measurements.append([(e.log_time_ns, e.cdr, e.message) for e in found])
+    values = [[codec().measurement_from_msg(m) for *_, m in one] for one in measurements]
+    assert all(repr(one) == repr(values[0]) for one in values[1:])
+    assert len(values[0]) > 100
+    assert all(v.fields & Field.TOA and not v.reference_rsu_id for v in values[0])
+    assert [m[:2] for m in measurements[2]] == [m[:2] for m in measurements[1]]
+    assert [m[1] for m in measurements[1]] != [m[1] for m in measurements[0]]
 
 
 def test_a_real_drone(tmp_path: Path) -> None:
