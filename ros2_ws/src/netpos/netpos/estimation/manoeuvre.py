@@ -56,15 +56,30 @@ def detection_delay_s(
 
 
 @leaf
-def measures_velocity(H: Array) -> bool:
-    """Whether rows with the Jacobian H (m, n) measure both axes of the velocity."""
+def _measures_both(H: Array, x: int, y: int) -> bool:
+    """Whether rows with the Jacobian H (m, n) measure the states ``x`` and ``y`` in more than one
+    direction, however steep each row is."""
     xx = xy = yy = 0.0
     for i in range(H.shape[0]):
-        xx += H[i, X.VX] * H[i, X.VX]
-        xy += H[i, X.VX] * H[i, X.VY]
-        yy += H[i, X.VY] * H[i, X.VY]
+        slope2 = H[i, x] * H[i, x] + H[i, y] * H[i, y]
+        if slope2 > 0.0:
+            xx += H[i, x] * H[i, x] / slope2
+            xy += H[i, x] * H[i, y] / slope2
+            yy += H[i, y] * H[i, y] / slope2
     least, largest = eigenvalues(xx, xy, yy)
     return bool(least > 1e-6 * largest)
+
+
+@leaf
+def measures_velocity(H: Array) -> bool:
+    """Whether rows with the Jacobian H (m, n) measure both axes of the velocity."""
+    return bool(_measures_both(H, X.VX, X.VY))
+
+
+@leaf
+def measures_position(H: Array) -> bool:
+    """Whether rows with the Jacobian H (m, n) measure both axes of the position."""
+    return bool(_measures_both(H, X.PX, X.PY))
 
 
 @leaf

@@ -8,7 +8,6 @@ an optimistic filter (``noise_scale``) and a manoeuvre not yet noticed (``manoeu
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,9 +16,8 @@ from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.engine import FilterOptions
 from netpos.estimation.factor import eigenvalues
 from netpos.estimation.fusion import W_GAIN, fuse
-from netpos.estimation.manoeuvre import add_manoeuvre, detection_delay_s
+from netpos.estimation.manoeuvre import add_manoeuvre
 from netpos.estimation.measurement import (
-    GATE_VARIANCE,
     GROUP,
     VARIANCE,
     curvature_mean,
@@ -27,8 +25,7 @@ from netpos.estimation.measurement import (
     innovation_row,
 )
 from netpos.estimation.mixture.gaussians import Mixture
-from netpos.estimation.predicted import PredictedRows, predicted_rows
-from netpos.estimation.state import POSITION, X
+from netpos.estimation.state import X
 from netpos.messages.values import Array
 
 _ANGLES = 16
@@ -37,7 +34,6 @@ _WEIGHT = np.append(np.append(0.5, np.ones(_ANGLES - 1)), 0.5) / _ANGLES
 _ITERATIONS = 20
 _NEGLIGIBLE = 40.0  # exponent of a term too small for the sum's digits
 RISK_MIN, RISK_MAX = 1e-15, 0.5
-_BLIND = 1e-12  # share of the information along the line that rows see best
 
 
 @leaf
@@ -179,21 +175,19 @@ def level_scratch(n: int, m: int) -> LevelScratch:
 
 @leaf
 def manoeuvre_level(
-    epoch: FusedEpoch, predicted: PredictedRows, options: FilterOptions, scratch: LevelScratch
+    epoch: FusedEpoch, longest_s: float, options: FilterOptions, scratch: LevelScratch
 ) -> float:
     """Radius [m] round the posterior mean that a device leaves with probability ``integrity_risk``
-    if it is in a manoeuvre nobody has noticed.
+    if it is in a manoeuvre nobody has noticed, which may take ``longest_s`` seconds
+    (``detection_delay_s``).
 
     The accepted groups are applied once more to the prediction, which allows for a manoeuvre in
-    the time it goes unnoticed: how far the two answers lie apart, and the level of the second
-    (solution separation, as receiver autonomous integrity monitoring has it). inf where there is
-    no gate, or a direction is open. ``predicted``: the rows as the prediction sees them.
+    that time: how far the two answers lie apart, and the level of the second (solution separation,
+    as receiver autonomous integrity monitoring has it). inf where the time is.
     """
     prior_mean, prior_cov, rows, mean = epoch.prior_mean, epoch.prior_cov, epoch.rows, epoch.mean
     n, height_m, speed = mean.size, options.height_m, options.manoeuvre_speed_sd
     x, wide, P = scratch[0][0, :n], scratch[1][0], scratch[1][1]
-    gate = options.gate_nis[2]
-    _, longest_s = detection_delay_s(rows, predicted, gate, speed)
     if math.isinf(longest_s):
         return math.inf
     for a in range(n):
@@ -241,51 +235,3 @@ def apply_about(
             for b in range(n):
                 P[a, b] = prior_cov[a, b]
         fuse(x, P, innovation, H[:m], variance, use, work)
-
-
-def level_of_epochs(
-    recent: Sequence[tuple[int, Array]],
-    stamp_ns: int,
-    prediction: tuple[Array, Array],
-    cov: Array,
-    options: FilterOptions,
-) -> float:
-    """Radius [m] as ``manoeuvre_level``, of the newest epochs together: as few as see every
-    direction, inf where all do not, or there is no gate. One range, or one angle, says nothing
-    across its line: a turn along it stays unnoticed for ever.
-
-    recent : stamps and rows (m, ROW_WIDTH), oldest first, the newest of ``stamp_ns``
-    prediction : mean (n,) and covariance (n, n) at ``stamp_ns``; cov : (n, n) after it
-
-    Each epoch has a gate of its own. Of k epochs the one that sees a direction best has at least
-    the k-th part of what they know of it together, and may be the oldest: a step of the velocity
-    goes unnoticed for at most sqrt(k) times as long as one epoch with all rows would let it, and
-    the age of the oldest. What it does to the position is added to ``cov``.
-    """
-    gate = float(options.gate_nis[2])
-    if math.isinf(gate):
-        return math.inf
-    mean, prior_cov = prediction
-    information = np.zeros((2, 2))
-    for k, (then_ns, rows) in enumerate(reversed(recent), start=1):
-        information += _information(mean, prior_cov, rows, options.height_m)
-        least, most = np.linalg.eigvalsh(information)
-        if least <= _BLIND * most:
-            continue
-        speed = options.manoeuvre_speed_sd
-        longest_s = math.sqrt(k * gate / least) / speed
-        within_s = longest_s + 1e-9 * (stamp_ns - then_ns)
-        moved2 = (speed * within_s) ** 2 / 3.0  # a step at any time in it
-        return float(
-            radius_of(cov[POSITION, POSITION] + moved2 * np.eye(2), options.integrity_risk)
-        )
-    return math.inf
-
-
-def _information(mean: Array, cov: Array, rows: Array, height_m: float) -> Array:
-    """Of rows (m, ROW_WIDTH) about the position of mean (n,) (2, 2)."""
-    predicted = predicted_rows(mean, cov, rows, height_m)
-    variance = rows[:, GATE_VARIANCE] + predicted.prior_var + predicted.second_order_var
-    slopes = predicted.H[:, POSITION] / np.sqrt(variance)[:, np.newaxis]
-    information: Array = slopes.T @ slopes
-    return information

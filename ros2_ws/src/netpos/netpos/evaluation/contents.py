@@ -18,7 +18,7 @@ from netpos.bags import LOST_METADATA, BagEntry, BagError, BagReader, codec
 from netpos.bags.recording import SKIPPED, TRUTH_ALIGNMENT
 from netpos.common.yaml_text import load_yaml
 from netpos.evaluation.metrics import Run
-from netpos.evaluation.pairing import Clock, Poses
+from netpos.evaluation.pairing import Clock, Poses, Stamps
 from netpos.evaluation.scene import buildings_of
 from netpos.messages import topics
 from netpos.messages.values import (
@@ -70,8 +70,16 @@ class _DeliveryCounter:
         beacon = (measurement.stamp_ns, measurement.sequence)
         self._rows.extend((*beacon, rsu, measurement.expected))
 
+    @property
+    def stamps_ns(self) -> Stamps:
+        """When something was measured, each instant once."""
+        return np.unique(self._table()[:, 0])
+
+    def _table(self) -> Stamps:
+        return np.array(self._rows, dtype=np.int64).reshape(-1, 4)
+
     def result(self, beacons: int | None) -> Delivery:
-        rows = np.array(self._rows, dtype=np.int64).reshape(-1, 4)
+        rows = self._table()
         stamps = rows[:, 0]
         epochs, of = np.unique(rows[:, :2], axis=0, return_inverse=True)
         expected = np.zeros(len(epochs), dtype=np.int64)
@@ -161,6 +169,7 @@ class Recording:
             truth=self.truth[vue].trajectory(),
             estimate=self.estimate[by].trajectory(),
             statuses=self.status[by].kept,
+            measured_ns=self.delivery[vue].stamps_ns,
             clock=self.clock[by].offsets(),
             clock_truth=self.clock_truth[vue].offsets(),
         )

@@ -125,10 +125,16 @@ def thinned(material: Material, share: float, seed: int) -> Material:
 def _scored(material: Material, vue: str, outputs: Sequence[TrackOutput]) -> Tracked:
     mine = [o for o in outputs if not o.network and o.status.vue_id == vue]
     statuses = [o.status for o in mine]
+    measured = [
+        item.stamp_ns
+        for item in material.items
+        if isinstance(item, RsuMeasurement) and item.vue_id == vue
+    ]
     run = Run(
         truth=Trajectory.of(material.truth[vue]),
         estimate=Trajectory.of(o.odometry for o in mine if o.odometry is not None),
         statuses=statuses,
+        measured_ns=np.unique(np.array(measured, dtype=np.int64)),
         clock=ClockOffsets.of(o.clock for o in mine if o.clock is not None),
         clock_truth=ClockOffsets.of(material.clock_truth.get(vue, ())),
     )

@@ -61,7 +61,8 @@ class Figures:
     where the recording has no track status. duration_s: from the first to the last scored.
     availability: share of the ground truth's span at which the newest ready estimate is at most
     0.2 s old (5 Hz, fokin2020's priority passage), convergence included; an estimate is ready in
-    state TRACKING. rmse_m, p50..max: horizontal position error; mean_error_m: mean horizontal
+    state TRACKING. measured: the same of measurements of RSUs, without steps and IMU. rmse_m,
+    p50..max: horizontal position error; mean_error_m: mean horizontal
     error, which fokin2020:eq.34 calls RMSE; rmse_3d_m with the vertical; north, east, down: by
     axis, as deng2022 does. vertical_rmse_m: of the height, and vertical_error_m its mean, positive
     above the truth; None where the truth has no height (``pairing.has_height``).
@@ -99,6 +100,7 @@ class Figures:
     rejected: int | None = None
     bound_ratio: float | None = None
     truth_share: float | None = None
+    measured: float | None = None
     lost_tracks: int | None = None
     unscored_s: float | None = None
     share_above_5m: float | None = None
@@ -143,11 +145,12 @@ class Figures:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
-    """Data of one device in a recording."""
+    """Data of one device in a recording. ``measured_ns``: when RSUs measured, None: not known."""
 
     truth: Trajectory
     estimate: Trajectory
     statuses: Sequence[TrackStatus] = ()
+    measured_ns: Stamps | None = None
     clock: ClockOffsets = NO_CLOCK
     clock_truth: ClockOffsets = NO_CLOCK
 
@@ -346,6 +349,9 @@ def score(
     figures = Figures(
         truth_share=len(pairs) / len(run.estimate) if len(run.estimate) else None,
         availability=availability(run.truth.stamp_ns, ready_ns),
+        measured=(
+            None if run.measured_ns is None else availability(run.truth.stamp_ns, run.measured_ns)
+        ),
         unscored_s=unscored_s(run.truth.stamp_ns, scored.estimate.stamp_ns, stamps),
         clock_offset_sd_ns=float(clock.std()) if clock.size else None,
         clock_offset_rmse_ns=rms(clock),

@@ -40,12 +40,14 @@ FACTS = frozenset(
 ACCURACY = ("n", "rmse_m", "p50_m", "p95_m", "max_m", "nees_mean", "nees_bounds", "share_above_5m")
 WHOLE = (
     "availability",
+    "measured",
     "nis_mean",
     "lost_tracks",
     "unscored_s",
     "rejected",
     "rejected_share",
     "protection_exceeded",
+    "protection_level_m",
 )
 
 

@@ -31,6 +31,7 @@ _ROWS = (
     ("duration", "s", "duration_s", ".1f"),
     ("estimates with ground truth", "%", "truth_share", ".1%"),
     ("available, of that time", "%", "availability", ".1%"),
+    ("measured, of that time", "%", "measured", ".1%"),
     ("tracks lost", "", "lost_tracks", "d"),
     ("time without a scored estimate", "s", "unscored_s", ".1f"),
     ("measurements refused", "%", "rejected_share", ".2%"),

@@ -82,7 +82,8 @@ class Estimate:
 
     def __init__(self, config: TrackerConfig, stamp_ns: int, mean: Array, cov: Array) -> None:
         """``mean``, ``cov``: as ``start_state`` takes them."""
-        self.stamp_ns = self._turn_ns = stamp_ns
+        self.stamp_ns = stamp_ns
+        self._open_s = 0.0  # of which no component says whether the device turned
         self._options = options_of(config)
         self._factored = not form_of(config.filter).carries_cov
         self._dynamics = dynamics_of(config, NO_BIAS)
@@ -223,6 +224,7 @@ class Estimate:
         """Move to ``stamp_ns``."""
         dt = (stamp_ns - self.stamp_ns) * 1e-9
         self.stamp_ns = stamp_ns
+        self._open_s += dt
         self._move_learned(dt, bias)
         if self._components is None:
             engine.predict(self.mean, self._cov_or_sqrt, dt, self.motion, bias, self._options)
@@ -245,15 +247,14 @@ class Estimate:
             self._cov_or_sqrt,
             self._components or self._one,
             epoch,
-            (stamp_ns - self._turn_ns) * 1e-9,
+            self._open_s + dt_s,
             self._with(bias),
             self._options,
             memory,
         )
         self.stamp_ns = stamp_ns
         self._learn(outcome.turned)
-        if outcome.begun:
-            self._turn_ns = stamp_ns
+        self._open_s = outcome.open_s
         several = outcome.components.log_weights.size > 1
         self._components = outcome.components if several else None
         self._modes = None if several else ()

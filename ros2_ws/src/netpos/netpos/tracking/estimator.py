@@ -45,12 +45,11 @@ Recent = tuple[tuple[int, EpochRows], ...]
 
 
 class Past(NamedTuple):
-    """What came before an epoch: seconds since the last accepted measurement, epochs in a row that
-    did not fit, and the newest that did."""
+    """What came before an epoch: seconds since the last accepted measurement, and epochs in a row
+    that did not fit."""
 
     unheard_s: float
     rejected_in_row: int
-    recent: Recent
 
 
 class FirstFix(NamedTuple):

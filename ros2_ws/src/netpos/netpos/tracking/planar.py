@@ -12,7 +12,6 @@ import numpy as np
 from netpos.estimation.fit import innovations_with_sd
 from netpos.estimation.measurement import VARIANCE
 from netpos.estimation.mixture.gaussians import Mixture, moments, one_component
-from netpos.estimation.protection import level_of_epochs
 from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import (
     Array,
@@ -43,7 +42,6 @@ from netpos.tracking.models import (
     heading_index,
     height_state,
     initial_extra_sd,
-    options_of,
     pose_state,
     slow_states,
 )
@@ -77,7 +75,7 @@ class PlanarEstimator(Estimator):
         self._height = height_state(config)
         super().__init__(vue_id, config, rsus, planar_form(self._heading, self._height))
         self._shared, self._lives = shared, count(1)
-        self._options, self._extra_sd = options_of(config), initial_extra_sd(config)
+        self._extra_sd = initial_extra_sd(config)
         self._use_imu, self._calibrates_steps = config.use_imu, config.calibrates_steps
         self._secondary = Secondary(vue_id, config) if config.network else None
         if config.fixed_lag_s > 0.0:
@@ -103,7 +101,6 @@ class PlanarEstimator(Estimator):
 
     def set_config(self, config: TrackerConfig) -> None:
         super().set_config(config)
-        self._options = options_of(config)
         self._phase_start.config = config
         self._process_noise.set_config(config)
         if self.estimate is not None:
@@ -218,14 +215,9 @@ class PlanarEstimator(Estimator):
         if self._secondary is not None:
             self._own = self._secondary.after(self._own, stamp_ns, estimate, rows, self.bias)
         self._keep_in_front(epoch_rows, result.accepted)
-        undetected_m = result.undetected_m
-        if math.isinf(undetected_m):  # one epoch does not bound it: the recent ones with it
-            epochs = [*((then_ns, e.rows) for then_ns, e in past.recent), (stamp_ns, rows)]
-            prior, cov = estimate.prior, estimate.cov
-            undetected_m = level_of_epochs(epochs, stamp_ns, prior, cov, self._options)
         # a smoother does not reach across: what it keeps is one Gaussian
         breaks = int(bool(estimate.modes) != was_ambiguous)
-        return result._replace(undetected_m=undetected_m, breaks=breaks)
+        return result._replace(breaks=breaks)
 
     def _keep_in_front(self, epoch_rows: EpochRows, accepted: Sequence[float]) -> None:
         """Take away what is behind an array that hears the device, where the mean is there."""

@@ -294,7 +294,7 @@ class Track:
     def _update(self, stamp_ns: int, epoch_rows: EpochRows) -> EpochResult:
         state = self._state
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
-        past = Past(unheard_s, state.rejected_in_row, state.recent)
+        past = Past(unheard_s, state.rejected_in_row)
         state.nlos_rate.expect(epoch_rows)
         result = state.estimator.update(stamp_ns, epoch_rows, past)
         state.nlos_rate.learn(epoch_rows)

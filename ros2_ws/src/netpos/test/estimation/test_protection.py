@@ -205,8 +205,11 @@ def fused(
 def level_of(epoch: FusedEpoch, said: FilterOptions) -> float:
     """``manoeuvre_level`` of an epoch."""
     predicted = predicted_rows(epoch.prior_mean, epoch.prior_cov, epoch.rows, said.height_m)
+    _, longest_s = detection_delay_s(
+        epoch.rows, predicted, said.gate_nis[2], said.manoeuvre_speed_sd
+    )
     memory = level_scratch(epoch.mean.size, len(epoch.rows))
-    return float(manoeuvre_level(epoch, predicted, said, memory))
+    return float(manoeuvre_level(epoch, longest_s, said, memory))
 
 
 @pytest.mark.parametrize("unheard_s", [0.1, 5.0])

@@ -153,6 +153,16 @@ def test_what_is_not_scored_is_counted_in_seconds() -> None:
     assert skipped.availability == figures.availability
 
 
+def test_the_share_in_which_an_rsu_measured_is_told_beside() -> None:
+    """One measurement a tenth of a second for 1 s, then none."""
+    truth = Trajectory.of([at(0.1 * k) for k in range(31)])
+    heard = truth.stamp_ns[:11]
+    figures = score(Run(truth=truth, estimate=truth, measured_ns=heard), skip=0).figures
+    assert figures.measured == pytest.approx(1.2 / 3.0)
+    unknown = score(Run(truth=truth, estimate=truth), skip=0).figures
+    assert unknown.measured is None
+
+
 def test_epochs_after_a_loss_count_against_availability_and_are_scored() -> None:
     """Ready for 1 s, lost for 0.5 s, 12 m off while INITIALISING for 0.4 s, ready for 1 s."""
     errors = dict.fromkeys(range(15, 19), 12.0)

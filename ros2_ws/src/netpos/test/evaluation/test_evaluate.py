@@ -52,6 +52,7 @@ def test_a_recorded_drive(drive_bag: Path, drive: Any) -> None:
     assert figures.clock_offset_sd_ns == pytest.approx(drive.clock_errors_ns[20:].std(), rel=1e-6)
     assert figures.rejected == 3
     assert figures.availability == pytest.approx(1 - 0.553 / 20.0, abs=1e-9)
+    assert figures.measured == pytest.approx(1 - 0.053 / 20.0, abs=1e-9)
     assert figures.output_rate_hz == pytest.approx(10.0)
 
 

@@ -29,6 +29,7 @@ from netpos.estimation.engine import (
 )
 from netpos.estimation.forms.choice import write_cov, write_cov_or_sqrt
 from netpos.estimation.fusion import predicted_in, workspace
+from netpos.estimation.manoeuvre import detection_delay_s
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.mixture import mixing
 from netpos.estimation.mixture.candidates import (
@@ -49,7 +50,13 @@ from netpos.estimation.mixture.sectors import (
     most_turns,
     reduced_by_sector,
 )
-from netpos.estimation.mixture.turns import add_explanations, may_turn, turn
+from netpos.estimation.mixture.turns import (
+    add_explanations,
+    leaves_turns_open,
+    may_have_turned,
+    may_turn,
+    turn,
+)
 from netpos.estimation.motion import Parameter
 from netpos.estimation.predicted import note_innovations, predict_rows
 from netpos.estimation.protection import (
@@ -158,7 +165,7 @@ def _at_once(
     epoch: EpochInput,
     at: int,
     options: FilterOptions,
-    since_turn_s: float,
+    open_s: float,
     accepted: Array,
 ) -> Update:
     """All measurements of the epoch, for every component of ``prior``, in every sector of an
@@ -174,11 +181,11 @@ def _at_once(
         end = _add_candidates(k, end, prior, epoch, at, options, found, work)
     best = int(np.argmax(found.log_weights[:count]))
     H = predicted_in(work, n, m).H  # velocities: of any component
-    turns = found.accepted[best, 0] == 1.0 and may_turn(H, groups, since_turn_s, options)
+    turns = found.accepted[best, 0] == 1.0 and may_turn(H, groups, open_s, options)
     if turns:
         weighed = Mixture(prior.means, prior.covs, found.log_weights[:count])
         for k in leaders(weighed):
-            turn(end, prior, k, max(since_turn_s, epoch.unheard_s), rows, options, found)
+            turn(end, prior, k, max(open_s, epoch.unheard_s), rows, options, found)
             end += 1
     if at >= 0:
         end = keep_sectors(prior, best, end, rows, at, options, found)
@@ -219,24 +226,24 @@ def apply_epoch(
     components: Mixture,
     epoch: EpochInput,
     options: FilterOptions,
-    since_turn_s: float,
+    open_s: float,
     accepted: Array,
 ) -> Update:
     """The components, moved to the epoch already, after it; ``accepted`` (groups,) is filled with
-    0 or 1. ``since_turn_s``: since the last component "it has turned" began."""
+    0 or 1. ``open_s``: the last seconds of which no component says whether the device turned."""
     rows, blocked = epoch.rows, options.robust.nlos_probability > 0.0
     at = ambiguous_phase(rows, options)
     one_model = options.models == 1 and at < 0
     splits = one_model and any_splits(components, rows, options)
     if one_model and blocked and not splits:
-        found: Update = along_paths(components, epoch, options, since_turn_s, accepted)
+        found: Update = along_paths(components, epoch, options, open_s, accepted)
         return found
     if blocked:
         reweight_by_best(components, rows, options.height_m, options.robust)
     if splits:
         found = one_by_one(components, rows, options, accepted)
     else:
-        found = _at_once(components, epoch, at, options, since_turn_s, accepted)
+        found = _at_once(components, epoch, at, options, open_s, accepted)
     return found
 
 
@@ -251,15 +258,15 @@ def note_turn(found: Update, motion: Array, options: FilterOptions) -> None:
 class Outcome(NamedTuple):
     """What came of an epoch of a track: its components; NIS of the rows accepted and their number;
     how far [m] a manoeuvre that this epoch does not show may have taken the device (not a number
-    where the posterior is not sound); the probability that the device has turned; whether a
-    component "it has turned" has begun."""
+    where the posterior is not sound); the probability that the device has turned; the last seconds
+    of which neither a component nor the epoch itself says whether it did."""
 
     components: Mixture
     nis: float
     used: int
     undetected_m: float
     turned: float
-    begun: bool
+    open_s: float
 
 
 class Memory(NamedTuple):
@@ -282,7 +289,7 @@ def _by_one(
     x: Array,
     S: Array,
     epoch: EpochInput,
-    since_turn_s: float,
+    open_s: float,
     dynamics: Dynamics,
     options: FilterOptions,
     memory: Scratch,
@@ -301,7 +308,7 @@ def _by_one(
     result = update_epoch(x, S, epoch, motion, options, memory)
     if options.manoeuvre_speed_sd > 0.0:
         refused = result.groups < groups
-        if refused or may_turn(predicted.H, groups, since_turn_s, options):
+        if refused or may_turn(predicted.H, groups, open_s, options):
             if blocked:
                 rows[:] = raw
             return False, 0.0, 0
@@ -310,22 +317,44 @@ def _by_one(
 
 @kernel
 def _finish(
-    x: Array, S: Array, epoch: EpochInput, options: FilterOptions, memory: Memory
-) -> float:
-    """Fill the innovations of an epoch that the estimate ``x`` (n,), ``S`` (n, n) has had, from
-    the rows as its prediction saw them; ``Outcome.undetected_m``. ``memory.step.met_cov`` becomes
-    the covariance of the estimate."""
-    step, rows = memory.step, epoch.rows
+    x: Array,
+    S: Array,
+    components: Mixture,
+    epoch: EpochInput,
+    open_s: float,
+    options: FilterOptions,
+    memory: Memory,
+) -> tuple[float, float]:
+    """Fill the innovations of an epoch that the estimate ``x`` (n,), ``S`` (n, n), of several
+    ``components`` or of one, has had, from the rows as its prediction saw them;
+    ``Outcome.undetected_m`` and ``Outcome.open_s``, which was ``open_s``. ``memory.step.met_cov``
+    becomes the covariance of the estimate.
+
+    An epoch that sees all directions shows a manoeuvre after some time. Of another, one range or
+    one angle, components say whether the device has turned, but for the last ``open_s`` seconds.
+    """
+    step, rows, speed = memory.step, epoch.rows, options.manoeuvre_speed_sd
     write_cov(options.filter, S, step.met_cov)
     if not is_sound(x, step.met_cov):
-        return math.nan
+        return math.nan, open_s
     predicted = predicted_in(step.work, x.size, rows.shape[0])
     note_innovations(rows, predicted, memory.innovations)
-    if options.manoeuvre_speed_sd <= 0.0:
-        return 0.0
-    unheard_s, accepted = epoch.unheard_s, step.accepted
-    fused = FusedEpoch(step.prior_mean, step.prior_cov, rows, accepted, unheard_s, x)
-    return float(manoeuvre_level(fused, predicted, options, memory.level))
+    if speed <= 0.0:
+        return 0.0, open_s
+    groups, accepted = int(rows[rows.shape[0] - 1, GROUP]) + 1, step.accepted
+    gate = options.gate_nis[2]
+    _, longest_s = detection_delay_s(rows, predicted, gate, speed)
+    is_open = leaves_turns_open(predicted.H, groups)
+    if math.isinf(longest_s) and (is_open or math.isfinite(gate)):
+        several = components.log_weights.size > 1
+        known = components if several else one_component(x, step.met_cov)
+        told = may_have_turned(known, open_s, speed)
+        return float(mixture_radius(told, x, options.integrity_risk)), open_s
+    prior_mean, prior_cov = step.prior_mean, step.prior_cov
+    fused = FusedEpoch(prior_mean, prior_cov, rows, accepted, epoch.unheard_s, x)
+    level = float(manoeuvre_level(fused, longest_s, options, memory.level))
+    shown = math.isfinite(level) and not is_open and accepted[:groups].sum() > 0.0
+    return level, longest_s if shown else open_s
 
 
 @kernel
@@ -334,7 +363,7 @@ def advance(
     S: Array,
     components: Mixture,
     epoch: EpochInput,
-    since_turn_s: float,
+    open_s: float,
     dynamics: Dynamics,
     options: FilterOptions,
     memory: Memory,
@@ -342,6 +371,7 @@ def advance(
     """One epoch of a track: of its one component ``x`` (n,), ``S`` (n, n), or of several
     ``components``, of which ``x`` and ``S`` are the moments; in place.
 
+    ``open_s``: the seconds up to this epoch of which no component says whether the device turned.
     ``memory.step`` keeps the prediction of the whole estimate, and 0 or 1 of each group in
     ``accepted``. ``dynamics.motions[0]`` keeps the velocity step that the epoch allowed for.
     """
@@ -355,11 +385,11 @@ def advance(
     if not several:
         if rows.shape[0] == 0:
             predict(x, S, epoch.dt_s, dynamics.motions[0], dynamics.bias, options)
-            return Outcome(components, 0.0, 0, 0.0, 0.0, False)
-        enough, nis, used = _by_one(x, S, epoch, since_turn_s, dynamics, options, step)
+            return Outcome(components, 0.0, 0, 0.0, 0.0, open_s)
+        enough, nis, used = _by_one(x, S, epoch, open_s, dynamics, options, step)
         if enough:
-            undetected_m = _finish(x, S, epoch, options, memory)
-            return Outcome(components, nis, used, undetected_m, 0.0, False)
+            undetected_m, open_s = _finish(x, S, components, epoch, open_s, options, memory)
+            return Outcome(components, nis, used, undetected_m, 0.0, open_s)
         components = one_component(step.prior_mean, step.prior_cov)
     else:
         components = moved_to_epoch(components, epoch, dynamics, options)
@@ -367,19 +397,20 @@ def advance(
         mean, cov = moments(components)
         x[:] = mean
         write_cov_or_sqrt(options.filter, cov, S)
-        return Outcome(components, 0.0, 0, 0.0, 0.0, False)
+        return Outcome(components, 0.0, 0, 0.0, 0.0, open_s)
     step.prior_mean[:], step.prior_cov[:] = moments(components)
     write_cov_or_sqrt(options.filter, step.prior_cov, step.prior_cov_or_sqrt)
-    found = apply_epoch(components, epoch, options, since_turn_s, step.accepted)
+    found = apply_epoch(components, epoch, options, open_s, step.accepted)
     predicted = predicted_in(step.work, x.size, rows.shape[0])
     predict_rows(step.prior_mean, step.prior_cov, rows, options.height_m, predicted)
     note_turn(found, dynamics.motions[0], options)
     mean, cov = moments(found.components)
     x[:] = mean
     write_cov_or_sqrt(options.filter, cov, S)
-    undetected_m = _finish(x, S, epoch, options, memory)
+    open_s = 0.0 if found.begun else open_s
+    undetected_m, open_s = _finish(x, S, found.components, epoch, open_s, options, memory)
     nis, used, turned = found.nis, found.used, found.turned
-    return Outcome(found.components, nis, used, undetected_m, turned, found.begun)
+    return Outcome(found.components, nis, used, undetected_m, turned, open_s)
 
 
 @kernel
@@ -402,23 +433,24 @@ def run_epochs(
     x, S = mean.copy(), cov_or_sqrt_of(cov, options)
     components, rejected_in_row = a_component_each(x, cov, dynamics), 0
     learned, motion = unknown_density(x.size), dynamics.motions[0]
-    last_ns = heard_ns = turn_ns = stamps_ns[0]
+    last_ns = heard_ns = stamps_ns[0]
+    open_s = 0.0
     for k in range(stamps_ns.size):
         now_ns = stamps_ns[k]
         rows = epochs.rows[row_start[k] : row_start[k + 1]].copy()
         dt, unheard_s = (now_ns - last_ns) * 1e-9, (now_ns - heard_ns) * 1e-9
         epoch = EpochInput(dt, unheard_s, rejected_in_row, rows)
-        since_turn_s, last_ns = (now_ns - turn_ns) * 1e-9, now_ns
+        open_s, last_ns = open_s + dt, now_ns
         if options.learns_density:
             motion[Parameter.ACCEL] = density_of(learned)
             move_density(learned, x, dt, motion, dynamics.bias)
         run.accel_density[k] = motion[Parameter.ACCEL]
-        found = advance(x, S, components, epoch, since_turn_s, dynamics, options, memory)
+        found = advance(x, S, components, epoch, open_s, dynamics, options, memory)
         components = found.components
         if options.learns_density and rows.shape[0] > 0:
             step = memory.step
             learn(learned, step.prior_mean, step.prior_cov, x, step.met_cov, found.turned)
-        turn_ns = now_ns if found.begun else turn_ns
+        open_s = found.open_s
         run.nis[k], run.dof[k], run.groups[k], run.radius[k] = found.nis, found.used, 0, 0.0
         run.undetected_m[k] = run.undetected_m[k - 1] if k > 0 else 0.0
         if rows.shape[0] > 0:

@@ -206,7 +206,7 @@ def along_paths(
     components: Mixture,
     epoch: EpochInput,
     options: FilterOptions,
-    since_turn_s: float,
+    open_s: float,
     accepted: Array,
 ) -> Update:
     """Measurement by measurement, where paths may be blocked. The rows of the epoch are
@@ -226,11 +226,11 @@ def along_paths(
         blocked = np.zeros(4 * count + 1)
         end = _add_paths(components, single, late, options, found, blocked)
         best = int(np.argmax(components.log_weights))
-        if stop - start == raw.shape[0]:
+        if stop == raw.shape[0]:
             _, H = linearise(raw, components.means[best], options.height_m)
-            turns = may_turn(H, 1, since_turn_s, options)
+            turns = may_turn(H, group + 1, open_s, options)
         if turns:
-            within_s = max(since_turn_s, epoch.unheard_s)
+            within_s = max(open_s, epoch.unheard_s)
             turn(end, components, best, within_s, alone, options, found)
             end += 1
         best = int(np.argmax(found.log_weights[:end]))

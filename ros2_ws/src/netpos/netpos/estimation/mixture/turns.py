@@ -9,7 +9,7 @@ import numpy as np
 from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.engine import EpochInput, FilterOptions, manoeuvre_s
 from netpos.estimation.fusion import predicted_in, workspace
-from netpos.estimation.manoeuvre import add_manoeuvre, measures_velocity
+from netpos.estimation.manoeuvre import add_manoeuvre, measures_position, measures_velocity
 from netpos.estimation.mixture.candidates import Candidates, apply, apply_predicted
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.messages.values import Array
@@ -67,10 +67,37 @@ def add_explanations(
 
 
 @leaf
-def may_turn(H: Array, groups: int, since_turn_s: float, options: FilterOptions) -> bool:
-    """Whether an epoch of ``groups`` measurements with the Jacobian H (m, n) begins a component
-    "it has turned", ``since_turn_s`` after the last one: several RSUs tell where the device is,
-    and a measured velocity whether it has turned."""
-    if options.manoeuvre_speed_sd <= 0.0 or since_turn_s < TURN_PERIOD_S or groups > 1:
+def leaves_turns_open(H: Array, groups: int) -> bool:
+    """Whether an epoch of ``groups`` measurements with the Jacobian H (m, n) does not show a turn
+    by itself: several RSUs in different directions tell where the device is, and a measured
+    velocity whether it has turned."""
+    if measures_velocity(H):
         return False
-    return not measures_velocity(H)
+    return groups == 1 or not measures_position(H)
+
+
+@leaf
+def may_turn(H: Array, groups: int, open_s: float, options: FilterOptions) -> bool:
+    """Whether an epoch of ``groups`` measurements with the Jacobian H (m, n) begins a component
+    "it has turned", where no component says so of the last ``open_s`` seconds."""
+    if options.manoeuvre_speed_sd <= 0.0 or open_s < TURN_PERIOD_S:
+        return False
+    return bool(leaves_turns_open(H, groups))
+
+
+@kernel
+def may_have_turned(components: Mixture, open_s: float, speed: float) -> Mixture:
+    """The components, and each again as if the device had turned in the last ``open_s`` seconds,
+    of which they know nothing: its position is as much less certain as that allows."""
+    means, covs, log_weights = components
+    share = min(TURNS_HZ * open_s, 0.5)
+    if share <= 0.0 or speed <= 0.0:
+        return components
+    turned = covs.copy()
+    for k in range(log_weights.size):
+        add_manoeuvre(speed, open_s, turned[k])
+    return Mixture(
+        np.concatenate((means, means)),
+        np.concatenate((covs, turned)),
+        np.concatenate((log_weights + math.log1p(-share), log_weights + math.log(share))),
+    )
