@@ -182,6 +182,15 @@ class Estimate:
         return self._components or one_component(self.mean, self.cov)
 
     @property
+    def likeliest(self) -> tuple[Array, Array]:
+        """Mean and covariance of the most probable component. The mean of several may lie where
+        the device cannot be: between two places, or inside an arc."""
+        if self._components is None:
+            return self.mean, self.cov
+        best = int(np.argmax(self._components.log_weights))
+        return self._components.means[best], self._components.covs[best]
+
+    @property
     def modes(self) -> tuple[TrackMode, ...]:
         """Where the device may be while that is not decided: modes that carry more than the
         integrity risk, the most probable first; none where it is only one."""

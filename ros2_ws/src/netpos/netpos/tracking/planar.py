@@ -238,10 +238,9 @@ class PlanarEstimator(Estimator):
         estimate, biases = self.estimate, self.biases
         if biases.learned is None or estimate is None or estimate.modes:
             return ()
-        posterior = (estimate.mean, estimate.cov)
         fitted = (rows, np.array(accepted))
         height_m = self._config.device_height_m
-        concluded, changes = biases.learn(stamp_ns, fitted, posterior, height_m)
+        concluded, changes = biases.learn(stamp_ns, fitted, estimate.likeliest, height_m)
         for change in changes:
             estimate.adjust(estimates.change_prior, *change)
         self.bias = biases.arrays()

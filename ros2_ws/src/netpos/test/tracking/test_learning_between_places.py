@@ -1,0 +1,64 @@
+"""Anchors in one line leave two places for minutes: what is learned meanwhile comes from the
+places, not from their mean."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement, TrackState
+from netpos.tracking import Tracker, TrackerConfig
+
+IN_LINE = np.array([[2.6, 0.9, 2.0], [2.6, -0.9, 2.0], [2.6, -0.9, 0.5]])
+RATE_HZ, SD_M, HEIGHT_M, DURATION_S = 20.0, 0.1, 1.1, 60.0
+CONFIG = TrackerConfig(
+    device_height_m=HEIGHT_M,
+    coverage_radius_m=60.0,
+    initial_speed_sd_mps=1.0,
+    accel_density_mps2_sqrthz=0.45,
+    learn_errors=True,
+)
+
+
+def place(at_s: float) -> Array:
+    """Away from the anchors and to and fro, on one side of their line."""
+    return np.array([6.0 + 0.5 * at_s, -4.0 + 3.0 * math.sin(at_s / 6.0)])
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_two_places_teach_no_errors_that_are_not_there(seed: int) -> None:
+    rng, tracker = np.random.default_rng(seed), Tracker(replace(CONFIG))
+    for i, anchor in enumerate(IN_LINE):
+        tracker.add_rsu(RsuInfo(rsu_id=f"a{i}", position=anchor))
+    scatters: list[float] = []
+    ambiguous = 0
+    for k in range(round(DURATION_S * RATE_HZ)):
+        i, at_s = k % len(IN_LINE), k / RATE_HZ
+        distance = math.dist((*place(at_s), HEIGHT_M), IN_LINE[i])
+        tracker.add(
+            RsuMeasurement(
+                stamp_ns=round(1e9 * (1.0 + at_s)),
+                rsu_id=f"a{i}",
+                vue_id="vue_1",
+                sequence=k,
+                expected=1,
+                fields=Field.RANGE,
+                range_m=distance + rng.normal(0.0, SD_M),
+                range_var=SD_M**2,
+            )
+        )
+        for output in tracker.process():
+            scatters += [value for one in output.errors for value in one.scatter]
+            if output.odometry is None:
+                continue
+            ambiguous += output.status.state is TrackState.AMBIGUOUS
+            error_m = math.dist(
+                output.odometry.position[:2], place(output.status.stamp_ns / 1e9 - 1.0)
+            )
+            if output.status.state is TrackState.TRACKING:
+                assert error_m < output.status.protection_level_m
+    assert ambiguous > 100
+    assert len(scatters) > 50
+    assert max(scatters) < 1.6
