@@ -44,6 +44,7 @@ from netpos.tracking.models import (
     start_state,
 )
 
+_LEAST_DENSITY = math.exp(-4.5)  # of a place within 3 sd of a Gaussian, over that of its mean
 _FARTHEST_BEHIND_SD = 5.0  # one Gaussian error in three million
 
 
@@ -198,6 +199,21 @@ class Estimate:
             assert self._components is not None
             self._modes = modes_of(self._components, self._options.integrity_risk)
         return self._modes
+
+    @property
+    def is_at_a_place(self) -> bool:
+        """Whether the device can be where the mean is: it is as probable there, over the most
+        probable component's place, as within 3 sd of a Gaussian. The mean of a ring, or of two
+        places that a row of components joins, is not such a place."""
+        if self._components is None:
+            return True
+        means, covs, log_weights = self._components
+        at, P = means[:, POSITION], covs[:, POSITION, POSITION]
+        peak = at[int(np.argmax(log_weights))]
+        away = np.stack([self.mean[POSITION], peak])[:, np.newaxis] - at
+        over = np.einsum("pki,kij,pkj->pk", away, np.linalg.inv(P), away)
+        density = np.exp(log_weights - 0.5 * np.linalg.slogdet(P)[1] - 0.5 * over).sum(axis=1)
+        return bool(density[0] > _LEAST_DENSITY * density[1])
 
     def radius(self, level_m: float) -> float:
         """Radius [m] round ``mean`` that holds ``level_m``, the level of the Gaussian, and all

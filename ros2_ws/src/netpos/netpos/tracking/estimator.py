@@ -221,6 +221,12 @@ class Estimator(ABC):
         return ()
 
     @property
+    def is_at_a_place(self) -> bool:
+        """Whether the device can be where the estimate is; not where that is the mean of a ring or
+        of two places."""
+        return True
+
+    @property
     def components(self) -> Mixture | None:
         """What the estimate is made of, over the states of ``estimation.state``; None where it is
         one Gaussian of errors (spatial)."""

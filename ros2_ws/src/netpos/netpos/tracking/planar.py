@@ -253,6 +253,10 @@ class PlanarEstimator(Estimator):
         return self._there().modes
 
     @property
+    def is_at_a_place(self) -> bool:
+        return self._there().is_at_a_place
+
+    @property
     def components(self) -> Mixture:
         return self._there().components
 

@@ -63,8 +63,8 @@ def total(refused: Mapping[str, int], rejected: Mapping[str, int]) -> dict[str, 
 class EstimateStatus:
     """What a status says of an estimate: heard_ns, stamp of the last accepted measurement, None
     before the first fix, and what is missing for one; sd along the worst axis and protection level
-    [m], -1: none; modes, where the device may be while that is not decided; calibration of step
-    velocities; epochs in a row that were refused."""
+    [m], -1: none; modes, where the device may be while that is not decided; whether it can be
+    where the estimate is; calibration of step velocities; epochs in a row that were refused."""
 
     heard_ns: int | None = None
     missing: str = ""
@@ -72,6 +72,7 @@ class EstimateStatus:
     position_sd_m: float = 0.0
     level_m: float = -1.0
     modes: tuple[TrackMode, ...] = ()
+    is_at_a_place: bool = True
     steps: StepCalibration | None = None
 
 
@@ -94,7 +95,7 @@ def track_status(
         estimate.heard_ns,
         estimate.position_sd_m,
         decided=not modes,
-        bounded=estimate.level_m < LEVEL_MAX_M,
+        bounded=estimate.level_m < LEVEL_MAX_M and estimate.is_at_a_place,
     )
     return TrackStatus(
         stamp_ns=epoch.stamp_ns,
@@ -138,6 +139,8 @@ def _reason(
         case TrackState.INITIALISING:
             if estimate.level_m >= LEVEL_MAX_M:
                 return "nothing bounds the error: a manoeuvre would not show in what is measured"
+            if not estimate.is_at_a_place:
+                return "somewhere on a ring, an arc or between places; the estimate is their mean"
             limit_m = config.initial_position_sd_max_m
             return f"position sd {estimate.position_sd_m:.1f} m, above {limit_m:g} m"
         case TrackState.COASTING:

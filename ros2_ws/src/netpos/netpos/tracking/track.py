@@ -388,6 +388,7 @@ class Track:
             position_sd_m=described.position_sd_m,
             level_m=estimator.radius(self._level(epoch.stamp_ns, described.radius_m)),
             modes=estimator.modes,
+            is_at_a_place=estimator.is_at_a_place,
             steps=estimator.step_calibration(),
             refused_in_row=state.rejected_in_row,
         )

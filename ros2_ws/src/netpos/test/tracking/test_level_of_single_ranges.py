@@ -8,7 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement, TrackState
+from netpos.messages.values import (
+    Array,
+    Field,
+    InitialPose,
+    RsuInfo,
+    RsuMeasurement,
+    TrackState,
+)
 from netpos.tracking import Tracker, TrackerConfig
 
 STEP_S, SD_M, DURATION_S, HEIGHT_M = 0.01, 0.2, 60.0, 1.0
@@ -100,3 +107,34 @@ def test_the_level_holds_errors_after_turns_and_is_of_their_size(name: str) -> N
     assert (errors > levels).sum() <= 1 + 2e-4 * errors.size
     assert np.median(levels) < 3.0 * errors.max()
     assert np.median(levels) < 6.0
+
+
+def test_the_mean_of_a_ring_is_no_place() -> None:
+    """One anchor, and a device that may be anywhere round it: the estimate is the mean of a ring,
+    where the device cannot be."""
+    tracker = Tracker(TrackerConfig())
+    tracker.add_rsu(RsuInfo(rsu_id="a0", position=np.zeros(3)))
+    pose = InitialPose(
+        stamp_ns=1_000_000_000, vue_id="vue_1", position=np.array([4.0, -3.0, 0.0]), cov=np.eye(3)
+    )
+    tracker.add(pose)
+    outputs = []
+    for k, at_s in enumerate((1.5, 2.5, 3.5, 5.0, 7.0, 9.0, 11.0, 31.0)):
+        tracker.add(
+            RsuMeasurement(
+                stamp_ns=round(1e9 * at_s),
+                rsu_id="a0",
+                vue_id="vue_1",
+                sequence=k,
+                expected=1,
+                fields=Field.RANGE,
+                range_m=5.0,
+                range_var=1.0,
+            )
+        )
+        outputs += tracker.process()
+    last = [*outputs, *tracker.flush()][-1]
+    assert last.odometry is not None
+    assert math.hypot(*last.odometry.position[:2]) < 3.0
+    assert last.status.state is TrackState.INITIALISING
+    assert "their mean" in last.status.reason
