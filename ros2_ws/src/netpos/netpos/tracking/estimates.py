@@ -44,6 +44,7 @@ from netpos.tracking.models import (
     start_state,
 )
 
+_LEAST_VARIANCE = 1e-12  # m^2, and of the variance: a component may be certain
 _LEAST_DENSITY = math.exp(-4.5)  # of a place within 3 sd of a Gaussian, over that of its mean
 _FARTHEST_BEHIND_SD = 5.0  # one Gaussian error in three million
 
@@ -209,6 +210,7 @@ class Estimate:
             return True
         means, covs, log_weights = self._components
         at, P = means[:, POSITION], covs[:, POSITION, POSITION]
+        P = P + _LEAST_VARIANCE * (1.0 + np.trace(P, axis1=1, axis2=2))[:, None, None] * np.eye(2)
         peak = at[int(np.argmax(log_weights))]
         away = np.stack([self.mean[POSITION], peak])[:, np.newaxis] - at
         over = np.einsum("pki,kij,pkj->pk", away, np.linalg.inv(P), away)

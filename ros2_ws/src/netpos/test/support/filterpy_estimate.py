@@ -38,6 +38,10 @@ class FilterpyEstimate:
     def modes(self) -> tuple[TrackMode, ...]:
         return ()
 
+    @property
+    def is_at_a_place(self) -> bool:
+        return True
+
     def radius(self, level_m: float) -> float:
         return level_m
 
