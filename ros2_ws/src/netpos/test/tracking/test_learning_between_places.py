@@ -4,12 +4,12 @@ places, not from their mean."""
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement, TrackState
-from netpos.tracking import Tracker, TrackerConfig
+from netpos.messages.values import Array, TrackState
+from netpos.tracking import TrackerConfig
+from single_ranges import single_range, tracker_of
 
 IN_LINE = np.array([[2.6, 0.9, 2.0], [2.6, -0.9, 2.0], [2.6, -0.9, 0.5]])
 RATE_HZ, SD_M, HEIGHT_M, DURATION_S = 20.0, 0.1, 1.1, 60.0
@@ -29,26 +29,13 @@ def place(at_s: float) -> Array:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_two_places_teach_no_errors_that_are_not_there(seed: int) -> None:
-    rng, tracker = np.random.default_rng(seed), Tracker(replace(CONFIG))
-    for i, anchor in enumerate(IN_LINE):
-        tracker.add_rsu(RsuInfo(rsu_id=f"a{i}", position=anchor))
+    rng, tracker = np.random.default_rng(seed), tracker_of(CONFIG, IN_LINE)
     scatters: list[float] = []
     ambiguous = 0
     for k in range(round(DURATION_S * RATE_HZ)):
         i, at_s = k % len(IN_LINE), k / RATE_HZ
         distance = math.dist((*place(at_s), HEIGHT_M), IN_LINE[i])
-        tracker.add(
-            RsuMeasurement(
-                stamp_ns=round(1e9 * (1.0 + at_s)),
-                rsu_id=f"a{i}",
-                vue_id="vue_1",
-                sequence=k,
-                expected=1,
-                fields=Field.RANGE,
-                range_m=distance + rng.normal(0.0, SD_M),
-                range_var=SD_M**2,
-            )
-        )
+        tracker.add(single_range(k, i, at_s, distance + rng.normal(0.0, SD_M), SD_M))
         for output in tracker.process():
             scatters += [value for one in output.errors for value in one.scatter]
             if output.odometry is None:
