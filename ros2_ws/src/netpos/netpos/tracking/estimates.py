@@ -44,8 +44,9 @@ from netpos.tracking.models import (
     start_state,
 )
 
-_LEAST_VARIANCE = 1e-12  # m^2, and of the variance: a component may be certain
-_LEAST_DENSITY = math.exp(-4.5)  # of a place within 3 sd of a Gaussian, over that of its mean
+# Added to each variance, m^2 and as a share of it: one that is nothing cannot be inverted.
+_LEAST_VARIANCE = 1e-12
+_LEAST_DENSITY = math.exp(-4.5)  # of a Gaussian at 3 sd, over that at its mean
 _FARTHEST_BEHIND_SD = 5.0  # one Gaussian error in three million
 
 
@@ -203,9 +204,9 @@ class Estimate:
 
     @property
     def is_at_a_place(self) -> bool:
-        """Whether the device can be where the mean is: it is as probable there, over the most
-        probable component's place, as within 3 sd of a Gaussian. The mean of a ring, or of two
-        places that a row of components joins, is not such a place."""
+        """Whether the device can be where the mean is. The density there, over that at the place
+        of the most probable component, is at least what a Gaussian has at 3 sd. The mean of a
+        ring, or of two places that a row of components joins, is no such place."""
         if self._components is None:
             return True
         means, covs, log_weights = self._components

@@ -210,17 +210,19 @@ def track_state(
     *,
     decided: bool = True,
     bounded: bool = True,
+    placed: bool = True,
 ) -> TrackState:
     """What a track is worth at ``stamp_ns``; last_accepted_ns : of its last accepted measurement,
     None before the first fix; position_sd_m : along its worst axis [m]; decided : whether it is
     known which of several places is the true one; bounded : whether there is a protection level,
-    none where a manoeuvre would go unnoticed."""
+    none where a manoeuvre would go unnoticed; placed : whether the device can be where the
+    estimate is."""
     if last_accepted_ns is None:
         return TrackState.WAITING
     if stamp_ns - last_accepted_ns > config.coast_after_s * 1e9:
         return TrackState.COASTING
     if not decided:
         return TrackState.AMBIGUOUS
-    if position_sd_m > config.initial_position_sd_max_m or not bounded:
+    if position_sd_m > config.initial_position_sd_max_m or not (bounded and placed):
         return TrackState.INITIALISING
     return TrackState.TRACKING

@@ -95,7 +95,8 @@ def track_status(
         estimate.heard_ns,
         estimate.position_sd_m,
         decided=not modes,
-        bounded=estimate.level_m < LEVEL_MAX_M and estimate.is_at_a_place,
+        bounded=estimate.level_m < LEVEL_MAX_M,
+        placed=estimate.is_at_a_place,
     )
     return TrackStatus(
         stamp_ns=epoch.stamp_ns,

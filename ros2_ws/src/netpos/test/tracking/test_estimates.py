@@ -10,12 +10,14 @@ import pytest
 from filterpy_estimate import FilterpyEstimate
 from netpos.estimation.engine import Epochs, Run
 from netpos.estimation.mixture.epoch import run_epochs
+from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.rows import linear_rows
 from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array, Field, GroundSpeed, ImuSample
 from netpos.tracking import TrackerConfig, TrackOutput, estimates
 from netpos.tracking.models import augmented, dynamics_of, initial_extra_sd, options_of
+from scipy import stats
 
 T0 = 1_000_000_000
 RUNNABLE = [
@@ -289,3 +291,30 @@ def test_interacting_models_in_one_kernel_are_the_same(name: str) -> None:
         np.testing.assert_array_equal(run.covs[k], estimate.cov)
         assert run.radius[k] == estimate.radius(0.0)
     assert run.dof.tolist() == [2, 2, 0, 2, 2, 2]
+
+
+def of_two(apart_m: float, weights: tuple[float, float] = (0.5, 0.5), sd_m: float = 1.0) -> Any:
+    """An estimate of two round components."""
+    means, covs = np.zeros((2, 6)), np.tile(np.diag([sd_m**2, sd_m**2, 1, 1, 1, 1]), (2, 1, 1))
+    means[1, X.PX] = apart_m
+    return estimates.start_from(TrackerConfig(), 0, Mixture(means, covs, np.log(weights)))
+
+
+@pytest.mark.parametrize("apart_m", [2.0, 5.0, 6.3, 6.6, 20.0])
+def test_the_mean_of_two_is_a_place_while_they_are_near(apart_m: float) -> None:
+    """Against the densities of SciPy: half the way from two components, and at one of them."""
+    places = np.array([[apart_m / 2.0, 0.0], [0.0, 0.0]])
+    density = sum(stats.multivariate_normal.pdf(places, mean=[x, 0.0]) for x in (0.0, apart_m))
+    expected = density[0] / density[1] > np.exp(-4.5)
+    assert of_two(apart_m).is_at_a_place == expected
+    assert expected == (apart_m < np.sqrt(8.0 * (4.5 + np.log(2.0))))
+
+
+def test_a_component_of_little_weight_moves_no_estimate_away() -> None:
+    estimate = of_two(20.0, (0.999, 0.001))
+    assert estimate.is_at_a_place
+    np.testing.assert_array_equal(estimate.likeliest[0], np.zeros(6))
+
+
+def test_components_that_are_certain_have_places() -> None:
+    assert not of_two(20.0, sd_m=0.0).is_at_a_place

@@ -136,6 +136,12 @@ def test_what_a_track_is_worth(
     assert state is expected
 
 
+@pytest.mark.parametrize("missing", ["bounded", "placed"])
+def test_a_fix_without_a_level_or_a_place_is_not_ready(missing: str) -> None:
+    state = output.track_state(TrackerConfig(), 0, 0, 0.1, **{missing: False})
+    assert state is TrackState.INITIALISING
+
+
 @pytest.mark.parametrize("velocity", [(5.0, -2.0), (1e-3, 0.0)])
 @pytest.mark.parametrize("heading", [-1, 6])
 def test_all_of_a_track_in_one_go(velocity: tuple[float, float], heading: int) -> None:
