@@ -40,6 +40,7 @@ from netpos.scenario.recorded_drive import import_car_drive
 Json = dict[str, Any]
 Source = tuple[str, Path, Callable[[Path, Path], object], dict[str, Any]]
 
+DATA = Path(os.environ.get("NETPOS_DATA", Path(__file__).parents[2] / "shared" / "data")).resolve()
 BLE_RUNS = ("uc1_run1", "uc1_run2", "uc2_run1", "uc3_run1")
 UWB_RUNS = ("LOS", "NLOS", "LOS_gap")
 AZIMUTHS = (Kind.AZIMUTH, Kind.AZIMUTH_CONE)
@@ -187,12 +188,10 @@ def table(rows: list[Json]) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Write the file and print the table of RMSE; 1 where no recording is there."""
-    root = Path(__file__).resolve().parents[1]
-    usual = Path(os.environ.get("NETPOS_DATA", root.parent / "shared" / "data"))
     parser = argparse.ArgumentParser(description="Score netpos and baselines on real recordings.")
     parser.add_argument("--json", type=Path, required=True, help="file of the figures")
     parser.add_argument("--out", type=Path, help="new folder for the bags; else none is kept")
-    parser.add_argument("--data", type=Path, default=usual, help="folder of the recordings")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the recordings")
     parser.add_argument("--only", nargs="+", default=[], help="names of recordings; else all")
     options = parser.parse_args(arguments)
     if options.out is not None and options.out.exists():

@@ -202,10 +202,10 @@ def _recorded(folder: Path, importer: Importer) -> Iterator[Material]:
     with tempfile.TemporaryDirectory() as temporary:
         bag = Path(temporary) / "bag"
         importer(folder, bag)
-        yield _material_of(bag)
+        yield material_of(bag)
 
 
-def _material_of(bag: Path) -> Material:
+def material_of(bag: Path) -> Material:
     """The material of an imported bag."""
     make, truth = codec(), defaultdict(list)
     items: list[Item | ImuSample] = []

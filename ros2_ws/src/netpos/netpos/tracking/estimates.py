@@ -23,8 +23,10 @@ from netpos.estimation.measurement import GROUP
 from netpos.estimation.mixture import epoch as mixtures
 from netpos.estimation.mixture.epoch import Dynamics, Memory, Outcome
 from netpos.estimation.mixture.gaussians import (
+    LEAST_DENSITY_LOG,
     Mixture,
     fuse_value,
+    log_densities,
     mode_of,
     moments,
     one_component,
@@ -44,9 +46,6 @@ from netpos.tracking.models import (
     start_state,
 )
 
-# Added to each variance, m^2 and as a share of it: one that is nothing cannot be inverted.
-_LEAST_VARIANCE = 1e-12
-_LEAST_DENSITY = math.exp(-4.5)  # of a Gaussian at 3 sd, over that at its mean
 _FARTHEST_BEHIND_SD = 5.0  # one Gaussian error in three million
 
 
@@ -209,14 +208,10 @@ class Estimate:
         ring, or of two places that a row of components joins, is no such place."""
         if self._components is None:
             return True
-        means, covs, log_weights = self._components
-        at, P = means[:, POSITION], covs[:, POSITION, POSITION]
-        P = P + _LEAST_VARIANCE * (1.0 + np.trace(P, axis1=1, axis2=2))[:, None, None] * np.eye(2)
-        peak = at[int(np.argmax(log_weights))]
-        away = np.stack([self.mean[POSITION], peak])[:, np.newaxis] - at
-        over = np.einsum("pki,kij,pkj->pk", away, np.linalg.inv(P), away)
-        density = np.exp(log_weights - 0.5 * np.linalg.slogdet(P)[1] - 0.5 * over).sum(axis=1)
-        return bool(density[0] > _LEAST_DENSITY * density[1])
+        means, _, log_weights = self._components
+        places = np.stack([self.mean, means[int(np.argmax(log_weights))]])[:, POSITION]
+        here, peak = log_densities(self._components, places).tolist()
+        return bool(here > peak + LEAST_DENSITY_LOG)
 
     def radius(self, level_m: float) -> float:
         """Radius [m] round ``mean`` that holds ``level_m``, the level of the Gaussian, and all

@@ -12,7 +12,14 @@ from netpos.estimation.engine import EpochInput
 from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import GROUP, VARIANCE, Kind
 from netpos.estimation.mixture import epoch as epochs
-from netpos.estimation.mixture.gaussians import Mixture, leaders, mode_of, moments, one_component
+from netpos.estimation.mixture.gaussians import (
+    Mixture,
+    leaders,
+    log_densities,
+    mode_of,
+    moments,
+    one_component,
+)
 from netpos.estimation.mixture.reduction import reduced
 from netpos.estimation.mixture.ring import RING_MERGE_COST, is_wide, split_along_ring
 from netpos.estimation.motion import NO_BIAS
@@ -225,11 +232,28 @@ def merged_step_by_step(parts: Mixture, cost: float) -> list[tuple[float, Array]
 
 def test_the_pair_that_costs_least_is_merged_first() -> None:
     parts = crowd(np.random.default_rng(8), 25)
+    parts.covs[:, :2, :2] *= 4.0
+    assert not mode_of(parts).any()
     expected = merged_step_by_step(parts, 0.05)
     means, _, logs = reduced(parts, 0.05)
     assert 3 < len(expected) == logs.size < 20
     np.testing.assert_allclose(np.exp(logs), [w for w, _ in expected], rtol=1e-9)
     np.testing.assert_allclose(means, [mean for _, mean in expected], rtol=1e-9)
+
+
+@pytest.mark.parametrize("count", [25, 80])
+def test_of_two_places_none_is_described_more_coarsely(count: int) -> None:
+    """The same components at two places 1 km apart, with weights of 0.99 and 0.01."""
+    one = crowd(np.random.default_rng(8), count)
+    other = one.means + np.array([1000.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    means, covs = np.concatenate([one.means, other]), np.concatenate([one.covs, one.covs])
+    logs = np.concatenate([one.log_weights + np.log(0.99), one.log_weights + np.log(0.01)])
+    found, _, log_weights = reduced(Mixture(means, covs, logs), 0.05)
+    here, weights = found[:, 0] < 500.0, np.exp(log_weights)
+    assert 3 < here.sum() == (~here).sum() <= 32
+    np.testing.assert_allclose(found[~here, 0] - found[here, 0], 1000.0, atol=1e-6)
+    np.testing.assert_allclose(found[~here, 1:], found[here, 1:], atol=1e-6)
+    np.testing.assert_allclose(weights[~here] * 99.0, weights[here], rtol=1e-9)
 
 
 def test_very_many_are_merged_in_parts_and_keep_their_moments() -> None:
@@ -279,13 +303,40 @@ def test_a_component_is_wide_where_the_tangent_costs_a_share_of_the_noise(
     assert not is_wide(row(Kind.AZIMUTH, 0.0, 0.04), x, P, options)
 
 
-def test_modes_are_chains_of_components() -> None:
+def test_modes_are_chains_of_components_without_a_valley() -> None:
     means = np.zeros((5, 6))
     means[:, 0] = 0.0, 3.0, 6.0, 9.0, 40.0
     covs = np.tile(np.eye(6), (5, 1, 1))
     parts = Mixture(means, covs, np.log([0.1, 0.05, 0.15, 0.1, 0.6]))
     assert mode_of(parts).tolist() == [1, 1, 1, 1, 0]
     assert leaders(parts).tolist() == [4, 2]
+
+
+@pytest.mark.parametrize(("weight", "modes"), [(1e-2, 1), (1e-3, 2)])
+def test_a_row_of_components_joins_two_places_where_it_is_probable(
+    weight: float, modes: int
+) -> None:
+    """Between two components of one half each: exp(-4.5) of that is 0.0056."""
+    means = np.zeros((7, 6))
+    means[:, 0] = 0.0, 3.0, 6.0, 9.0, 12.0, 15.0, 18.0
+    covs = np.tile(np.eye(6), (7, 1, 1))
+    weights = np.full(7, weight)
+    weights[[0, -1]] = 0.5
+    found = mode_of(Mixture(means, covs, np.log(weights / weights.sum())))
+    assert found.max() + 1 == modes
+    assert (found[0] == found[-1]) == (modes == 1)
+
+
+def test_densities_are_those_of_scipy() -> None:
+    rng = np.random.default_rng(11)
+    parts, at = crowd(rng, 30), rng.normal(0.0, 4.0, (20, 2))
+    weights = np.exp(parts.log_weights)
+    expected = sum(
+        w * multivariate_normal(m[:2], P[:2, :2]).pdf(at)
+        for w, m, P in zip(weights, parts.means, parts.covs, strict=True)
+    )
+    found = log_densities(parts, at) - np.log(2.0 * np.pi)
+    np.testing.assert_allclose(np.exp(found), expected, rtol=1e-9)
 
 
 # a measurement that the gate refuses

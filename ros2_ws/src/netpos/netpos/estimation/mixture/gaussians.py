@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from netpos.estimation.compile import kernel
+from netpos.estimation.compile import kernel, leaf
 from netpos.messages.values import Array
 
 Ints = npt.NDArray[np.int64]
@@ -21,7 +21,12 @@ CURVATURE_SHARE_BLOCKED = 0.25
 a blocked path, which loses more than a shorter arc gains."""
 SPACING_SD = 1.2
 """Of equal Gaussians side by side: their sum is flat to 1e-3."""
-_APART2 = 9.0  # squared Mahalanobis distance of means from which components are two modes
+LEAST_DENSITY_LOG = -4.5
+"""Log density of a Gaussian at 3 sd, over that at its mean."""
+_APART2 = -2.0 * LEAST_DENSITY_LOG  # squared Mahalanobis distance there
+# Added to each variance, m^2 and as a share of both: one that is nothing cannot be inverted.
+_LEAST_VARIANCE = 1e-12
+_NOTHING_LOG = 40.0  # what is smaller by that is nothing beside it
 
 
 class Mixture(NamedTuple):
@@ -70,33 +75,79 @@ def moments(components: Mixture) -> tuple[Array, Array]:
     return mean, cov
 
 
+@leaf
+def _add_log(total: float, term: float) -> float:
+    """Log of the sum of two values given by their logs."""
+    if term > total:
+        total, term = term, total
+    return total + math.log1p(math.exp(term - total)) if term > total - _NOTHING_LOG else total
+
+
+@kernel
+def log_densities(components: Mixture, at: Array) -> Array:
+    """Log density (P,) of the mixture at positions ``at`` (P, 2), but for a constant."""
+    means, covs, log_weights = components
+    found = np.full(at.shape[0], -np.inf)
+    for k in range(log_weights.size):
+        xx, xy, yy = covs[k, 0, 0], covs[k, 0, 1], covs[k, 1, 1]
+        least = _LEAST_VARIANCE * (1.0 + xx + yy)
+        xx, yy = xx + least, yy + least
+        det = xx * yy - xy * xy
+        top = log_weights[k] - 0.5 * math.log(det)
+        for i in range(at.shape[0]):
+            dx, dy = at[i, 0] - means[k, 0], at[i, 1] - means[k, 1]
+            away2 = (yy * dx * dx - 2.0 * xy * dx * dy + xx * dy * dy) / det
+            found[i] = _add_log(found[i], top - 0.5 * away2)
+    return found
+
+
+@leaf
+def _are_near(i: int, j: int, means: Array, covs: Array) -> bool:
+    """Whether two components lie within 3 sd, of both together, of one another."""
+    dx, dy = means[j, 0] - means[i, 0], means[j, 1] - means[i, 1]
+    xx, yy = covs[i, 0, 0] + covs[j, 0, 0], covs[i, 1, 1] + covs[j, 1, 1]
+    xy, least = covs[i, 0, 1] + covs[j, 0, 1], _LEAST_VARIANCE * (1.0 + xx + yy)
+    xx, yy = xx + least, yy + least
+    away2 = yy * dx * dx - 2.0 * xy * dx * dy + xx * dy * dy
+    return bool(away2 < _APART2 * (xx * yy - xy * xy))
+
+
+@kernel
+def _peak_of(components: Mixture) -> Ints:
+    """Component (K,) at which the mode that each belongs to has its peak."""
+    means, covs = components.means, components.covs
+    density = log_densities(components, means[:, :2])
+    peaks = np.full(density.size, -1)
+    for i in np.argsort(-density):
+        own = i
+        for j in range(density.size):
+            higher = peaks[j] >= 0 and (own == i or density[peaks[j]] > density[own])
+            if higher and _are_near(i, j, means, covs):
+                own = peaks[j]
+        peaks[i] = own
+        for j in range(density.size):
+            other = peaks[j]
+            if other < 0 or other == own or density[other] - density[i] > -LEAST_DENSITY_LOG:
+                continue
+            if _are_near(i, j, means, covs):
+                peaks[peaks == other] = own
+    return peaks
+
+
 @kernel
 def mode_of(components: Mixture) -> Ints:
     """Number of the mode (K,) each component belongs to, 0 the mode of the most probable one.
 
-    Components belong to one mode where a chain of them leads from one to the other, each within
-    3 sd (of both together) of the next.
+    Components within 3 sd (of both together) of one another belong to one mode, unless they join
+    two peaks over a valley: the density there, over that at the lower peak, is less than what a
+    Gaussian has at 3 sd (Chazal, Guibas, Oudot and Skraba 2013: clusters by their prominence).
     """
-    means, covs, log_weights = components
-    count = log_weights.size
-    order = np.argsort(-log_weights)
-    modes, found = np.full(count, -1), 0
-    waiting = np.empty(count, dtype=np.int64)
-    for first in order:
-        if modes[first] >= 0:
-            continue
-        modes[first], waiting[0], left = found, first, 1
-        while left > 0:
-            left -= 1
-            i = waiting[left]
-            for j in range(count):
-                if modes[j] >= 0:
-                    continue
-                away = means[j, :2] - means[i, :2]
-                cov = covs[i, :2, :2] + covs[j, :2, :2]
-                if float(away @ np.linalg.solve(cov, away)) < _APART2:
-                    modes[j], waiting[left], left = found, j, left + 1
-        found += 1
+    peaks = _peak_of(components)
+    modes, found = np.full(peaks.size, -1), 0
+    for first in np.argsort(-components.log_weights):
+        if modes[first] < 0:
+            modes[peaks == peaks[first]] = found
+            found += 1
     return modes
 
 

@@ -1,0 +1,155 @@
+"""Leave each RSU out of the recordings in turn, thin them, and begin them later: ``python
+scripts/fewer_rsus.py [RECORDING…] [--workers N] [--json FILE]``.
+
+Nothing is tuned for these networks; without one of four anchors on a car the three that are left
+may stand in one line, whose two sides nothing tells apart. Printed for each: the share of the
+estimates that are TRACKING, their RMSE and largest error [m], their median level [m], how many
+errors are above it, the largest error over its level, and the RMSE [m] of the plain Kalman filter
+at the same stamps from the same measurements. The misses come first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from netpos.evaluation.guarded_runs import Material, material_of, outputs_of, thinned
+from netpos.evaluation.pairing import Trajectory, pair
+from netpos.evaluation.recordings import Recording
+from netpos.evaluation.yardsticks import Observations, observations_of_bag, plain_ekf
+from netpos.messages.values import RsuMeasurement, TrackState
+from real_data import DATA, Source, sources
+
+SHARES, BEGINNINGS, SEED = (0.5, 0.8), (0.1, 0.25, 0.4, 0.55, 0.7), 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """How a part of a recording was tracked; None where nothing was TRACKING."""
+
+    recording: str
+    part: str
+    estimates: int
+    tracking: float
+    rmse_m: float | None = None
+    largest_m: float | None = None
+    level_m: float | None = None
+    exceeded: int = 0
+    worst_ratio: float | None = None
+    plain_m: float | None = None
+
+
+def parts(material: Material) -> Iterator[tuple[str, Material]]:
+    """The recording, and what is left of it."""
+    yield "whole", material
+    measured = [item for item in material.items if isinstance(item, RsuMeasurement)]
+    names = {item.rsu_id for item in measured} | {item.reference_rsu_id for item in measured}
+    for name in sorted(names - {""}):
+        left_out = {id(m) for m in measured if name in (m.rsu_id, m.reference_rsu_id)}
+        kept = [item for item in material.items if id(item) not in left_out]
+        yield f"without {name}", replace(material, items=kept)
+    for share in SHARES:
+        yield f"without {share:.0%} of all", thinned(material, share, SEED)
+    first, last = material.items[0].stamp_ns, material.items[-1].stamp_ns
+    for share in BEGINNINGS:
+        begin_ns = first + round(share * (last - first))
+        kept = [item for item in material.items if item.stamp_ns > begin_ns]
+        yield f"from {share:.0%} on", replace(material, items=kept)
+
+
+def seen_of(everything: Observations, material: Material) -> Observations:
+    """What the plain filter is given: the measurements of ``material``."""
+    at = {info.rsu_id: tuple(info.position) for info in material.rsus}
+    kept = {(m.stamp_ns, at[m.rsu_id]) for m in material.items if isinstance(m, RsuMeasurement)}
+    stamps, places = everything.stamp_ns.tolist(), map(tuple, everything.rsu.tolist())
+    return everything.take(np.array([key in kept for key in zip(stamps, places, strict=True)]))
+
+
+def row_of(recording: Recording, part: str, material: Material, seen: Observations) -> Row:
+    """Track a part, and score what is TRACKING."""
+    outputs = [o for o in outputs_of(material) if o.odometry is not None]
+    truth = Trajectory.of(next(iter(material.truth.values())))
+    row = Row(recording=recording.name, part=part, estimates=len(outputs), tracking=0.0)
+    tracked = [o for o in outputs if o.status.state is TrackState.TRACKING]
+    if not tracked:
+        return row
+    pairs = pair(Trajectory.of(o.odometry for o in tracked if o.odometry), truth)
+    levels = {o.status.stamp_ns: o.status.protection_level_m for o in tracked}
+    error = pairs.horizontal_error
+    level = np.array([levels[stamp] for stamp in pairs.estimate.stamp_ns.tolist()])
+    plain = plain_ekf(seen, recording.space).estimate
+    plain = plain.take(np.isin(plain.stamp_ns, pairs.estimate.stamp_ns))
+    plain_error = pair(plain, truth).horizontal_error
+    return replace(
+        row,
+        tracking=len(tracked) / len(outputs),
+        rmse_m=float(np.sqrt(np.mean(error**2))),
+        largest_m=float(error.max()),
+        level_m=float(np.median(level)),
+        exceeded=int((error > level).sum()),
+        worst_ratio=float((error / level).max()),
+        plain_m=float(np.sqrt(np.mean(plain_error**2))) if plain_error.size else None,
+    )
+
+
+def rows_of(source: Source) -> list[Row]:
+    """All parts of a recording."""
+    name, path, load, used = source
+    with tempfile.TemporaryDirectory() as folder:
+        bag = Path(folder) / "bag"
+        load(path, bag)
+        recording = Recording(name=name, bag=bag, **used)
+        material = material_of(bag)
+        everything = observations_of_bag(bag, range_sd_m=recording.range_sd_m)
+        found = [
+            row_of(recording, part, left, seen_of(everything, left))
+            for part, left in parts(material)
+        ]
+    sys.stderr.write(f"{name}: {len(found)} parts\n")
+    return found
+
+
+def text_of(row: Row) -> str:
+    """A line of the table."""
+    text = f"{row.recording:32} {row.part:20} {row.estimates:6d} TRACKING {row.tracking:6.1%}"
+    if row.rmse_m is None:
+        return text
+    text += (
+        f"  RMSE {row.rmse_m:6.3f} largest {row.largest_m:6.2f} level {row.level_m:6.2f}"
+        f"  above it {row.exceeded:5d}, at most {row.worst_ratio:.2f} times"
+    )
+    return text if row.plain_m is None else f"{text}  plain {row.plain_m:.3f}"
+
+
+def main() -> None:
+    """Print a line for each part, the misses first."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("recordings", nargs="*", metavar="RECORDING")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    # The stations of the car's drive are simulated.
+    real = [source for source in sources(DATA) if "simulated" not in source[0]]
+    chosen = [
+        s for s in real if s[1].exists() and (not args.recordings or s[0] in args.recordings)
+    ]
+    if not chosen:
+        raise SystemExit(f"none of these recordings lies in {DATA}; set NETPOS_DATA")
+    with ProcessPoolExecutor(args.workers) as pool:
+        rows = [row for found in pool.map(rows_of, chosen) for row in found]
+    rows.sort(key=lambda row: -row.exceeded)
+    for row in rows:
+        print(text_of(row))
+    if args.json is not None:
+        args.json.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
