@@ -76,28 +76,37 @@ def moments(components: Mixture) -> tuple[Array, Array]:
 
 
 @leaf
-def _add_log(total: float, term: float) -> float:
-    """Log of the sum of two values given by their logs."""
-    if term > total:
-        total, term = term, total
-    return total + math.log1p(math.exp(term - total)) if term > total - _NOTHING_LOG else total
+def _log_sum(terms: Array) -> float:
+    """Log of the sum of values given by their logs."""
+    top = terms.max()
+    total = 0.0
+    for term in terms:
+        if term > top - _NOTHING_LOG:
+            total += math.exp(term - top)
+    return float(top + math.log(total))
 
 
 @kernel
 def log_densities(components: Mixture, at: Array) -> Array:
     """Log density (P,) of the mixture at positions ``at`` (P, 2), but for a constant."""
     means, covs, log_weights = components
-    found = np.full(at.shape[0], -np.inf)
-    for k in range(log_weights.size):
+    count = log_weights.size
+    inverses, tops = np.empty((count, 3)), np.empty(count)
+    for k in range(count):
         xx, xy, yy = covs[k, 0, 0], covs[k, 0, 1], covs[k, 1, 1]
         least = _LEAST_VARIANCE * (1.0 + xx + yy)
         xx, yy = xx + least, yy + least
         det = xx * yy - xy * xy
-        top = log_weights[k] - 0.5 * math.log(det)
-        for i in range(at.shape[0]):
+        inverses[k, 0], inverses[k, 1], inverses[k, 2] = yy / det, -xy / det, xx / det
+        tops[k] = log_weights[k] - 0.5 * math.log(det)
+    found, terms = np.empty(at.shape[0]), np.empty(count)
+    for i in range(at.shape[0]):
+        for k in range(count):
             dx, dy = at[i, 0] - means[k, 0], at[i, 1] - means[k, 1]
-            away2 = (yy * dx * dx - 2.0 * xy * dx * dy + xx * dy * dy) / det
-            found[i] = _add_log(found[i], top - 0.5 * away2)
+            along, cross, across = inverses[k]
+            away2 = along * dx * dx + 2.0 * cross * dx * dy + across * dy * dy
+            terms[k] = tops[k] - 0.5 * away2
+        found[i] = _log_sum(terms)
     return found
 
 
