@@ -3,9 +3,10 @@ scripts/fewer_rsus.py [RECORDING…] [--workers N] [--json FILE]``.
 
 Nothing is tuned for these networks; without one of four anchors on a car the three that are left
 may stand in one line, whose two sides nothing tells apart. Printed for each: the share of the
-estimates that are TRACKING, their RMSE and largest error [m], their median level [m], how many
-errors are above it, the largest error over its level, and the RMSE [m] of the plain Kalman filter
-at the same stamps from the same measurements. The misses come first.
+estimates that are TRACKING, how often the state changes, their RMSE and largest error [m], their
+median level [m], how many errors are above it, the largest error over its level, and the RMSE [m]
+of the plain Kalman filter at the same stamps from the same measurements. The misses come first;
+at the end a table of the recordings.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +40,7 @@ class Row:
     part: str
     estimates: int
     tracking: float
+    changes: int = 0
     rmse_m: float | None = None
     largest_m: float | None = None
     level_m: float | None = None
@@ -76,7 +79,15 @@ def row_of(recording: Recording, part: str, material: Material, seen: Observatio
     """Track a part, and score what is TRACKING."""
     outputs = [o for o in outputs_of(material) if o.odometry is not None]
     truth = Trajectory.of(next(iter(material.truth.values())))
-    row = Row(recording=recording.name, part=part, estimates=len(outputs), tracking=0.0)
+    states = [o.status.state for o in outputs]
+    changes = sum(a is not b for a, b in pairwise(states))
+    row = Row(
+        recording=recording.name,
+        part=part,
+        estimates=len(outputs),
+        tracking=0.0,
+        changes=changes,
+    )
     tracked = [o for o in outputs if o.status.state is TrackState.TRACKING]
     if not tracked:
         return row
@@ -119,6 +130,7 @@ def rows_of(source: Source) -> list[Row]:
 def text_of(row: Row) -> str:
     """A line of the table."""
     text = f"{row.recording:32} {row.part:20} {row.estimates:6d} TRACKING {row.tracking:6.1%}"
+    text += f", {row.changes} changes"
     if row.rmse_m is None:
         return text
     text += (
@@ -126,6 +138,37 @@ def text_of(row: Row) -> str:
         f"  above it {row.exceeded:5d}, at most {row.worst_ratio:.2f} times"
     )
     return text if row.plain_m is None else f"{text}  plain {row.plain_m:.3f}"
+
+
+COLUMNS = (
+    "recording",
+    "networks",
+    "with errors above the level",
+    "such errors",
+    "largest, over the level",
+    "RMSE above the plain filter's",
+    "RMSE over it, median",
+)
+
+
+def summary_of(recording: str, rows: list[Row]) -> tuple[int, str]:
+    """How many errors of all parts of a recording are above their levels, and its line."""
+    scored = round(sum(row.tracking * row.estimates for row in rows))
+    missed, above = sum(row.exceeded > 0 for row in rows), sum(row.exceeded for row in rows)
+    worst = max(row.worst_ratio or 0.0 for row in rows)
+    ratios = [row.rmse_m / row.plain_m for row in rows if row.rmse_m and row.plain_m]
+    beaten = sum(ratio > 1.0 for ratio in ratios)
+    ratio = f"{np.median(ratios):.2f}" if ratios else "–"
+    cells = [recording, len(rows), missed, f"{above:,} of {scored:,}", f"{worst:.2f}"]
+    return above, f"| {' | '.join(map(str, [*cells, beaten, ratio]))} |"
+
+
+def table_of(rows: list[Row]) -> str:
+    """What came of the parts of each recording, in Markdown, the misses first."""
+    names = sorted({row.recording for row in rows})
+    found = [summary_of(name, [row for row in rows if row.recording == name]) for name in names]
+    lines = [text for _, text in sorted(found, key=lambda pair: -pair[0])]
+    return "\n".join([f"| {' | '.join(COLUMNS)} |", len(COLUMNS) * "| --- " + "|", *lines])
 
 
 def main() -> None:
@@ -147,6 +190,7 @@ def main() -> None:
     rows.sort(key=lambda row: -row.exceeded)
     for row in rows:
         print(text_of(row))
+    print(table_of(rows))
     if args.json is not None:
         args.json.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
 
