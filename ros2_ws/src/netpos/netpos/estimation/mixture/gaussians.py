@@ -88,7 +88,8 @@ def _log_sum(terms: Array) -> float:
 
 @kernel
 def log_densities(components: Mixture, at: Array) -> Array:
-    """Log density (P,) of the mixture at positions ``at`` (P, 2), but for a constant."""
+    """Log density (P,) [1/m^2] of the mixture at positions ``at`` (P, 2) [m], without the term
+    -log(2 pi)."""
     means, covs, log_weights = components
     count = log_weights.size
     inverses, tops = np.empty((count, 3)), np.empty(count)
