@@ -4,8 +4,8 @@
 
 Imports each recording an importer knows, replays it with the bag's parameters and with default
 ones, runs a snapshot least squares and a plain Kalman filter on the same bag
-(netpos.evaluation.yardsticks), and writes one row per recording. Recordings without an importer
-have rows with the baselines alone. --out keeps the bags in a new folder.
+(netpos.evaluation.yardsticks), and writes one row per recording. --out keeps the bags in a new
+folder.
 """
 
 from __future__ import annotations
@@ -78,6 +78,21 @@ def own_recordings(data: Path) -> Iterator[Source]:
     yield "range_beacons Plaza1", data / "range_beacons", readers.import_plaza, used
     used = {"space": Space(dimensions=3, height_m=1.0), "range_sd_m": readers.UWB_SD_M}
     yield "uwb_tdoa", data / "uwb_tdoa", readers.import_uwb_tdoa, used
+    yield from several_devices(data)
+
+
+def several_devices(data: Path) -> Iterator[Source]:
+    """Recordings of many devices, each of them short; every estimate of theirs counts."""
+    folder = data / "5g_raytraced"
+    for name, what in (("5x5_square", "square"), ("trajectory", "street")):
+        used: dict[str, Any] = {"space": Space(), "skip": 0}
+        file = folder / f"{name}_100MHz.csv.gz"
+        yield f"5g_raytraced {what}", file, readers.import_raytraced, used
+    level = Space(
+        height_m=float(readers.AIRCRAFT["device_height_m"]),
+        sd_max_m=float(readers.AIRCRAFT["initial_position_sd_max_m"]),
+    )
+    yield "adsb_mlat", data / "adsb_mlat", readers.import_adsb, {"space": level, "skip": 0}
 
 
 def _ble(folder: Path, run: str, _: Path, bag: Path) -> None:
@@ -112,32 +127,6 @@ def _azimuth_only(recording: Recording, replayed: Path) -> Json:
     return {f"{name}_rmse_m": figures["rmse_m"] for name, figures in found.items()}
 
 
-def unread(
-    data: Path,
-) -> Iterator[tuple[str, Path, Callable[[Path], readers.Series] | None, Space]]:
-    """Recordings without an importer: name, place, reader (None: no baseline) and space."""
-    yield "adsb_mlat", data / "adsb_mlat", None, Space(dimensions=3)
-    for name in ("5x5_square", "trajectory"):
-        file = data / "5g_raytraced" / f"{name}_100MHz.csv.gz"
-        yield f"5g_raytraced {name}", file, readers.raytraced, Space()
-
-
-def unread_row(
-    name: str, path: Path, read: Callable[[Path], readers.Series] | None, space: Space
-) -> Json:
-    """The row of a recording without an importer; points without time have no plain filter."""
-    row: Json = {"name": f"{name} (no importer)", "reference": None}
-    empty = {"snapshot": None, "plain_ekf": None, "ours": None}
-    empty |= {"defaults": None, "declared": None, "learned": None}
-    if read is None:
-        return row | empty
-    seen, truth = read(path)
-    found = baseline_figures(seen, space, truth)
-    if name.startswith("5g_raytraced"):
-        del found["plain_ekf"]
-    return row | empty | found
-
-
 def measure(data: Path, folder: Path, only: list[str]) -> Json:
     """All rows; ``absent`` names the recordings that ``data`` does not hold."""
     rows, absent = [], []
@@ -149,13 +138,6 @@ def measure(data: Path, folder: Path, only: list[str]) -> Json:
             rows.append(_timed(source[0], partial(measured, source, folder)))
         else:
             absent.append(source[0])
-    for name, path, read, space in unread(data):
-        if only and name not in only:
-            continue
-        if path.exists():
-            rows.append(_timed(name, partial(unread_row, name, path, read, space)))
-        else:
-            absent.append(name)
     for name in absent:
         sys.stderr.write(f"netpos: {name} is absent from {data}\n")
     wall_s = time.monotonic() - started

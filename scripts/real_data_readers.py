@@ -1,24 +1,25 @@
-"""Recordings without an importer of their own: read by their columns, or, where netpos has no such
-measurement, as measurements and truth for the baselines."""
+"""Recordings without an importer of their own: read by their columns, or written as a bag from
+Python, as docs/own_recording.md says."""
 
 from __future__ import annotations
 
 import csv
 import gzip
+import json
+import math
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.io
+from netpos import write_bag
 from netpos.bags.importers.own import Columns, Truth, import_csv, import_ros
+from netpos.bags.importers.own.columns import SPEED_OF_LIGHT_MPS
 from netpos.bags.importers.own.truth import TruthColumns
-from netpos.evaluation.pairing import Trajectory
-from netpos.evaluation.yardsticks import Observations, ranges
-from netpos.messages.values import RsuInfo
-
-NS = 1_000_000_000
-Series = tuple[Observations, Trajectory]
+from netpos.messages.values import Array, Field, Odometry, RsuInfo, RsuMeasurement
+from netpos.world.geodesy import Datum
 
 TDOA_ANCHORS_M = np.array(
     [
@@ -38,35 +39,20 @@ SHEET_SD_M = 0.1
 BEACON_SD_M = 0.5
 IASL_CORNERS_M = ((0.0, 0.0), (0.0, 8.0), (8.86, 8.0), (8.86, 0.0))
 IASL_HEIGHT_M = 1.4  # at which it flies most of the time
-POINT_SPACING_NS = 10 * NS  # points without time: each is an instant of its own
-
-
-def path_of(stamp_ns: np.ndarray, position: np.ndarray) -> Trajectory:
-    """A true path of stamps (n,) and positions (n, 3) m; of equal stamps the first counts."""
-    stamps, first = np.unique(stamp_ns.astype(np.int64), return_index=True)
-    n = len(stamps)
-    return Trajectory(
-        stamp_ns=stamps,
-        position=position[first],
-        velocity=np.zeros((n, 3)),
-        heading=np.zeros(n),
-        position_cov=np.zeros((n, 3, 3)),
-    )
-
-
-def in_order(
-    stamps: list[int],
-    rsus: list[Any],
-    values: list[float],
-    sd: float,
-    others: list[Any] | None = None,
-) -> Observations:
-    """``ranges`` of rows in any order."""
-    order = np.argsort(stamps, kind="stable")
-    other = None if others is None else np.array(others)[order]
-    return ranges(
-        np.array(stamps)[order], np.array(rsus)[order], np.array(values)[order], sd, other
-    )
+AIRCRAFT = {
+    "learn_errors": True,
+    "device_height_m": 8000.0,
+    "device_height_sd_m": 3000.0,
+    "initial_speed_sd_mps": 200.0,
+    "initial_position_sd_max_m": 2000.0,
+}
+"""Between the ground and 13 km, up to 250 m/s; where receivers are 100 km apart, a fix to a
+kilometre or two is one."""
+ADSB_SETS, ADSB_APART_NS = (1, 2, 5, 6), 7_200_000_000_000
+ARRIVAL_SD_M = 30.0  # a sample of 10 MHz
+FLAT_M = 4e5  # the map is a plane: 12 km above the ground at this distance
+STATION_SD_M = 1.0  # a third of the wavelength of 100 MHz
+AZIMUTH_SD_RAD = math.radians(2.0)
 
 
 def import_uwb_tdoa(folder: Path, bag: Path) -> object:
@@ -171,23 +157,120 @@ def import_plaza(folder: Path, bag: Path) -> object:
         )
 
 
-def raytraced(file: Path) -> Series:
-    """Time differences of 5G stations: every point and draw is an instant of its own."""
-    stamps, first, second, values, times, poses = [], [], [], [], [], []
-    reference, last = np.zeros(3), ""
-    with gzip.open(file, "rt", newline="") as stream:
-        for row in csv.DictReader(stream):
-            station = np.array([float(row[f"BS_{axis}"]) for axis in "xyz"])
-            if row["tdoa"] == "NaN":
-                reference, last = station, row["timestamp"]
-                times.append((len(times) + 1) * POINT_SPACING_NS)
-                poses.append([float(row[f"UE_{axis}"]) for axis in "xyz"])
-                continue
-            if row["timestamp"] != last:
-                raise ValueError(f"{file}: draw {row['timestamp']} has no reference station")
-            stamps.append(times[-1])
-            first.append(reference)
-            second.append(station)
-            values.append(float(row["tdoa"]))
-    seen = in_order(stamps, first, values, 1.0, second)
-    return seen, path_of(np.array(times), np.array(poses))
+def import_adsb(folder: Path, bag: Path) -> object:
+    """Arrivals of messages of aircraft at five receivers each, as differences from the one listed
+    first: when a message was sent nobody knows. Every aircraft is a device; the four hours follow
+    one another. Receivers far from the middle of the network, and what they heard, are left
+    out."""
+    on_earth = {
+        row["serial"]: [float(row[name]) for name in ("latitude", "longitude", "height")]
+        for row in table_of(folder / "sensors.csv")
+        if row["height"] not in ("", "NA")
+    }
+    messages = [
+        (number, row, {str(n): ns for n, ns, _ in json.loads(row["measurements"])})
+        for number in ADSB_SETS
+        for row in table_of(folder / f"set_{number}.csv")
+    ]
+    heard = [on_earth[name] for *_, found in messages for name in found if name in on_earth]
+    latitude, longitude, _ = np.median(heard, axis=0).tolist()
+    datum = Datum(latitude, longitude, 0.0)
+    places = dict(zip(on_earth, datum.to_map(np.array(list(on_earth.values()))), strict=True))
+    near = {name for name, place in places.items() if np.linalg.norm(place[:2]) < FLAT_M}
+    measured: list[RsuMeasurement] = []
+    truth: dict[tuple[int, str], Odometry] = {}
+    for number, row, found in messages:
+        stamp_ns = min(found.values()) + number * ADSB_APART_NS
+        vue = f"set_{number}_aircraft_{row['aircraft']}"
+        if not near.issuperset(found) or (stamp_ns, vue) in truth:
+            continue
+        first, *others = found
+        for name in others:
+            late = difference(first, 1e-9 * (found[name] - found[first]), ARRIVAL_SD_M)
+            measured.append(RsuMeasurement(stamp_ns=stamp_ns, rsu_id=name, vue_id=vue, **late))
+        report = [float(row[name]) for name in ("latitude", "longitude", "geoAltitude")]
+        truth[stamp_ns, vue] = pose(stamp_ns, vue, datum.to_map(np.array([report]))[0])
+    return write_bag(
+        bag,
+        rsus=rsus_at({name: places[name] for name in near}, measured),
+        measurements=measured,
+        truth=list(truth.values()),
+        tracker=AIRCRAFT,
+        metadata={
+            "source": "LocaRDS",
+            "left_out": f"{len(messages) - len(truth)} of {len(messages)} messages",
+        },
+    )
+
+
+def table_of(file: Path) -> list[dict[str, str]]:
+    """The rows of a text file with a header, packed or not."""
+    opened = gzip.open if file.suffix == ".gz" else open
+    with opened(file, "rt", encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def import_raytraced(file: Path, bag: Path) -> object:
+    """Time differences of 5G stations, and azimuths where the set has them. Every point is a
+    device that stands, its draws are a second apart. Azimuths are those of the stations as the
+    device sees them: turned round here."""
+    stations: dict[tuple[float, ...], str] = {}
+    points: dict[tuple[float, ...], str] = {}
+    measured: list[RsuMeasurement] = []
+    truth: list[Odometry] = []
+    reference = ""
+    for row in table_of(file):
+        station, point = (
+            tuple(float(row[f"{of}_{axis}"]) for axis in "xyz") for of in ("BS", "UE")
+        )
+        name = stations.setdefault(station, f"station_{len(stations)}")
+        vue = points.setdefault(point, f"point_{len(points)}")
+        stamp_ns, values = int(row["timestamp"]) * 1_000_000_000, {}
+        if row["tdoa"] == "NaN":
+            reference = name
+            truth.append(pose(stamp_ns, vue, np.array(point)))
+        else:
+            late_s = float(row["tdoa"]) / SPEED_OF_LIGHT_MPS
+            values |= difference(reference, late_s, STATION_SD_M)
+        if "aoa_az" in row:
+            back = math.remainder(float(row["aoa_az"]) + math.pi, 2.0 * math.pi)
+            fields = values.get("fields", Field(0)) | Field.AZIMUTH
+            values |= {"fields": fields, "azimuth_rad": back, "azimuth_var": AZIMUTH_SD_RAD**2}
+        if values:
+            measured.append(RsuMeasurement(stamp_ns=stamp_ns, rsu_id=name, vue_id=vue, **values))
+    return write_bag(
+        bag,
+        rsus=rsus_at({name: np.array(place) for place, name in stations.items()}, measured),
+        measurements=measured,
+        truth=truth,
+        tracker={"learn_errors": True},
+        metadata={"source": file.name},
+    )
+
+
+def rsus_at(places: Mapping[str, Array], measured: list[RsuMeasurement]) -> list[RsuInfo]:
+    """The RSUs of measurements, at ``places`` (3,) m."""
+    names = {name for m in measured for name in (m.rsu_id, m.reference_rsu_id)} - {""}
+    return [RsuInfo(rsu_id=name, position=places[name]) for name in sorted(names)]
+
+
+def difference(reference: str, late_s: float, sd_m: float) -> dict[str, Any]:
+    """The fields of a measurement of how much later than at ``reference`` something arrived;
+    ``sd_m``: of one arrival."""
+    return {
+        "fields": Field.TDOA,
+        "reference_rsu_id": reference,
+        "tdoa_s": late_s,
+        "tdoa_var": 2.0 * (sd_m / SPEED_OF_LIGHT_MPS) ** 2,
+    }
+
+
+def pose(stamp_ns: int, vue: str, place: Array) -> Odometry:
+    """Where a device truly was, (3,) m; how it moved is not known."""
+    return Odometry(
+        stamp_ns=stamp_ns,
+        vue_id=vue,
+        position=place,
+        quaternion=np.array([0.0, 0.0, 0.0, 1.0]),
+        linear_velocity=np.zeros(3),
+    )

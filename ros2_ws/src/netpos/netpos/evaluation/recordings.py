@@ -11,17 +11,19 @@ from typing import Any
 import numpy as np
 
 from netpos.bags import BagReader
-from netpos.evaluation.evaluate import VueEvaluation, evaluate_bag
-from netpos.evaluation.metrics import Figures, Run, score
+from netpos.evaluation.devices import Together, together
+from netpos.evaluation.evaluate import evaluate_bag
+from netpos.evaluation.metrics import SKIP_EPOCHS, Figures, Run, score
 from netpos.evaluation.pairing import Stamps, Trajectory
 from netpos.evaluation.yardsticks import (
     Kind,
     Observations,
     Space,
-    observations_of_bag,
+    observations_of_devices,
     plain_ekf,
     snapshots,
 )
+from netpos.messages import topics
 from netpos.messages.values import TrackStatus
 from netpos.scenario.replay import replay_bag
 from netpos.scenario.settings import bag_settings
@@ -55,7 +57,7 @@ WHOLE = (
 class Recording:
     """One row to measure. bag: as imported; space: what the yardsticks solve for; range_sd_m:
     their sd of a range, None for what the RSUs state; reference: the authors' RMSE [m]; kinds:
-    what the yardsticks use."""
+    what the yardsticks use; skip: estimates at the start of each device that do not count."""
 
     name: str
     bag: Path
@@ -63,44 +65,55 @@ class Recording:
     range_sd_m: float | None = None
     reference: float | None = None
     kinds: Collection[Kind] = tuple(Kind)
+    skip: int = SKIP_EPOCHS
 
 
 def recording_row(recording: Recording, folder: Path) -> Json:
     """Replay into ``folder`` with the bag's parameters, with default ones, with what is declared
-    alone and with learned errors; run the yardsticks, and score all alike.
+    alone and with learned errors; run the yardsticks, and score all alike. Several devices are
+    scored as one, one after another.
 
     ``rmse_m`` and the other figures of accuracy of a baseline are of the tracker's epochs that
-    count; ``own`` holds those of all its epochs but the first 20.
+    count; ``own`` holds those of all its epochs but the first ``recording.skip``.
 
     Raises
     ------
-    ValueError  the bag has no ground truth, no measurement, or several devices
+    ValueError  the bag has no ground truth or no measurement, or no estimate came of it
     FileExistsError  ``folder`` has a bag of this name
     """
-    ours = _replayed(recording.bag, folder / recording.name, {})
+    ours = _replayed(recording, folder / recording.name, {})
     defaults = _replayed(
-        recording.bag, folder / f"{recording.name}_defaults", default_parameters(recording.bag)
+        recording, folder / f"{recording.name}_defaults", default_parameters(recording.bag)
     )
     learning = _learning(recording.bag)
     other = None
     if learning is not None:
         name = "declared" if learning else "learned"
         changed = {"learn_errors": not learning}
-        other = _replayed(recording.bag, folder / f"{recording.name}_{name}", changed)
-    pair = [None if run is None else figures_of(run.scored.figures) for run in (other, ours)]
-    declared, learned = pair if learning else pair[::-1]
-    seen = observations_of_bag(
-        recording.bag, range_sd_m=recording.range_sd_m, kinds=recording.kinds
+        other = _replayed(recording, folder / f"{recording.name}_{name}", changed)
+    if ours is None:
+        raise ValueError(f"{recording.bag}: no estimate was made; netpos replay says why")
+    mine, plain, changed_so = (
+        None if run is None else figures_of(run.figures) for run in (ours, defaults, other)
     )
-    counted = ours.scored.counted.estimate.stamp_ns
+    seen = observations_of_devices(
+        recording.bag, ours.offset_ns, range_sd_m=recording.range_sd_m, kinds=recording.kinds
+    )
+    baselines = baseline_figures(
+        ours.observations(seen),
+        recording.space,
+        ours.run.truth,
+        ours.counted_ns,
+        recording.skip,
+    )
     return {
         "name": recording.name,
         "reference": recording.reference,
-        **baseline_figures(seen, recording.space, ours.run.truth, counted),
-        "ours": figures_of(ours.scored.figures),
-        "defaults": figures_of(defaults.scored.figures),
-        "declared": declared,
-        "learned": learned,
+        **baselines,
+        "ours": mine,
+        "defaults": plain,
+        "declared": changed_so if learning else mine,
+        "learned": mine if learning else changed_so,
     }
 
 
@@ -120,17 +133,22 @@ def default_parameters(bag: Path) -> Json:
     return {name: getattr(usual, name) for name in carried if name not in FACTS}
 
 
-def _replayed(bag: Path, out: Path, overrides: Json) -> VueEvaluation:
-    replay_bag(bag, out, overrides)
-    vues = evaluate_bag(out).vues
-    if len(vues) != 1:
-        raise ValueError(f"{bag} holds {len(vues)} devices with ground truth; one is needed")
-    (only,) = vues.values()
-    return only
+def _replayed(recording: Recording, out: Path, overrides: Json) -> Together | None:
+    """The devices of a replay; None where it made no estimate."""
+    replay_bag(recording.bag, out, overrides)
+    with BagReader(out) as bag:
+        filled = [topics.split(topic) for topic, info in bag.topics.items() if info.count]
+    if not any(name == topics.ODOMETRY for _, name in filled):
+        return None
+    return together(evaluate_bag(out, skip=recording.skip).vues)
 
 
 def baseline_figures(
-    seen: Observations, space: Space, truth: Trajectory, counted: Stamps | None = None
+    seen: Observations,
+    space: Space,
+    truth: Trajectory,
+    counted: Stamps | None = None,
+    skip: int = SKIP_EPOCHS,
 ) -> dict[str, Json]:
     """Figures of both yardsticks; accuracy at the stamps ``counted`` (None: at all of their own)
     and, as ``own``, at all of their own."""
@@ -141,7 +159,8 @@ def baseline_figures(
     ]
     rows: dict[str, Json] = {}
     for name, estimate, statuses in runs:
-        whole = score(Run(truth=truth, estimate=estimate, statuses=statuses)).figures
+        run = Run(truth=truth, estimate=estimate, statuses=statuses)
+        whole = score(run, skip=skip).figures
         rows[name] = figures_of(whole)
         if counted is not None:
             rows[name]["own"] = {key: rows[name][key] for key in ACCURACY}

@@ -152,7 +152,7 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
         0.0, -1e4, 1e4, "height of the device in map; where it is unknown, of its mean"
     )
     device_height_sd_m: float = real(
-        0.0, 0.0, 1e3, "sd of the device's height about its mean, estimated on the way; 0: known"
+        0.0, 0.0, 1e4, "sd of the device's height about its mean, estimated on the way; 0: known"
     )
     device_height_time_s: float = real(
         30.0, 0.1, 1e6, "correlation time of an unknown height (first-order Markov)"

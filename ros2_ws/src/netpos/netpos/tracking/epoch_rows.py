@@ -60,6 +60,15 @@ class EpochRows:
         variance: Array = np.square(H[:, biases.first :]) @ np.square(biases.sd)
         return variance
 
+    def shared_errors(self, biases: BiasStates) -> Array:
+        """(m, 2): the part of ``slow_variance`` that each row has in common with all rows of its
+        COMMON state, and 1 where that error is the same at the next epoch, else 0."""
+        shared = np.zeros((len(self.rows), 2))
+        for error, row in zip(shared, self.rows, strict=True):
+            if row[COMMON] >= 0 and int(row[KIND]) != Kind.STEP_VELOCITY:
+                error[:] = biases.common(int(row[COMMON]))
+        return shared
+
 
 class RowForm(NamedTuple):
     """How the rows of an epoch are written for an estimator.

@@ -184,6 +184,12 @@ class Estimator(ABC):
         the device is at ``pose`` than where they fit best: chi-square with 2 degrees of freedom
         for the true pose."""
 
+    def _collect(self, window: Initialiser, stamp_ns: int, epoch_rows: EpochRows) -> None:
+        """Give ``window`` the rows of an epoch, of planar form, and their slow errors."""
+        shared = epoch_rows.shared_errors(self.biases)
+        bias_var = np.maximum(epoch_rows.slow_variance(self.biases) - shared[:, 0], 0.0)
+        window.add(stamp_ns, epoch_rows.rows, bias_var, self.heard(epoch_rows), shared)
+
     def _excess_cost(self, window: Initialiser, stamp_ns: int, pose: InitialPose) -> float:
         """``Initialiser.excess_cost`` of a pose, however sure it is of itself."""
         mean, cov = pose_state(self._config, pose.position[:2], pose.cov[:2, :2])

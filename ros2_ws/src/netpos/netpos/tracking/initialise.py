@@ -33,6 +33,7 @@ from netpos.estimation.measurement import (
     KIND,
     LEVER,
     ORIGIN,
+    ROW_WIDTH,
     VALUE,
     VARIANCE,
     Kind,
@@ -42,7 +43,7 @@ from netpos.estimation.mixture.gaussians import Mixture, mode_of
 from netpos.estimation.mixture.reduction import reduced
 from netpos.estimation.mixture.ridge import Fit, components_of, inverse
 from netpos.estimation.mixture.ring import RING_MERGE_COST
-from netpos.estimation.mixture.window import normal_equations
+from netpos.estimation.mixture.window import Window, normal_equations
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.estimation.sensors.table import BY_KIND
 from netpos.estimation.state import N_CORE
@@ -60,12 +61,19 @@ _CONTRADICTS = 9.0  # mean squared residual over variance
 _NEAREST_M = 1.0
 _HEADINGS = 16
 _HEADING_SD_MAX = 0.5
+# Columns behind those of a row: what ``Initialiser.add`` is told of its slow errors.
+_BIAS_VAR, _SHARED_VAR, _LASTS, _COMMON_STATE = range(ROW_WIDTH, ROW_WIDTH + 4)
 _RAY_M = (2.0, 6.0, 15.0, 40.0, 100.0)
+_RAYS_REACH_M = 150.0  # where devices are farther from the RSUs, the rays are longer
 _CIRCLE = tuple(2.0 * math.pi * i / 12 for i in range(12))
 
 
-Problem = tuple[Array, Array, float, Array, Array]
-"""What ``normal_equations`` takes after the state."""
+class Problem(NamedTuple):
+    """What ``normal_equations`` takes after the state."""
+
+    window: Window
+    prior: Array
+    prior_var: Array
 
 
 class _Solution(NamedTuple):
@@ -124,13 +132,24 @@ class Initialiser:
         twin.missing = self.missing
         return twin
 
-    def add(self, stamp_ns: int, rows: Array, bias_var: Array, rsus: tuple[Rsu, ...]) -> None:
+    def add(
+        self,
+        stamp_ns: int,
+        rows: Array,
+        bias_var: Array,
+        rsus: tuple[Rsu, ...],
+        shared: Array | None = None,
+    ) -> None:
         """Take the rows (m, ROW_WIDTH) of one epoch; ``bias_var`` (m,) is the variance of the
-        biases in each."""
+        biases in each. ``shared`` (m, 2): variance of the error that each row has in common with
+        all of its COMMON state, and 1 where it is the same at the next epoch; None: of none."""
+        if shared is None:
+            shared = np.zeros((len(rows), 2))
+        slow = np.column_stack([bias_var, shared, rows[:, COMMON]])
         rows = rows.copy()
         rows[:, BIAS] = rows[:, COMMON] = rows[:, HEADING] = -1
         rows[rows[:, HEIGHT] > 0, HEIGHT] = N_CORE
-        self._window.append((stamp_ns, np.column_stack([rows, bias_var]), rsus))
+        self._window.append((stamp_ns, np.column_stack([rows, slow]), rsus))
         oldest = stamp_ns - int(self._config.initial_window_s * 1e9)
         while self._window[0][0] < oldest:
             self._window.popleft()
@@ -162,8 +181,8 @@ class Initialiser:
         limit_m = self._config.initial_position_sd_max_m
         if sd_m > limit_m and misfit < _CONTRADICTS:
             self.missing = (
-                f"{self._heard(rows)} leave a position sd of {sd_m:.1f} m (needed: below "
-                f"{limit_m:g}); another RSU or quantity is needed"
+                f"{self._heard(rows)} leave a position sd of {sd_m:.1f} m "
+                f"(initial_position_sd_max_m: {limit_m:g}); another RSU or quantity is needed"
             )
             return None
         if sd_m * math.sqrt(misfit) > limit_m:
@@ -194,11 +213,11 @@ class Initialiser:
             return 0.0
         var = var.copy()
         var[:2] += age_s**2 * var[2:4]
-        var = np.append(var, problem[4][len(var) :])
-        start = mean = np.append(mean, problem[3][len(mean) :])
+        var = np.append(var, problem.prior_var[len(var) :])
+        start = mean = np.append(mean, problem.prior[len(mean) :])
         start = start.copy()
         start[4] = _clock_at(start, rows, self._config.device_height_m)
-        cost = _solve(start, (*problem[:3], mean, var))[0]
+        cost = _solve(start, problem._replace(prior=mean, prior_var=var))[0]
         return max(0.0, cost - fits[0][0])
 
     def _stacked(self) -> tuple[Array, Array]:
@@ -245,6 +264,8 @@ class Initialiser:
         fixes = rows[rows[:, KIND] == Kind.LINEAR]
         centre = origins.mean(axis=0) if len(origins) else np.zeros(2)
         reach = cfg.coverage_radius_m if len(origins) or not len(fixes) else 1e6
+        if len(origins):
+            reach = max(reach, float(np.linalg.norm(origins - centre, axis=1).max()))
         prior = np.array([*centre, 0.0, 0.0, 0.0, c * cfg.clock_drift_mean])
         sd = np.array([reach, reach, *([cfg.initial_speed_sd_mps] * 2)])
         clock_sd = c * np.array([cfg.clock_offset_sd_s, max(cfg.clock_drift_sd, 1e-15)])
@@ -252,13 +273,15 @@ class Initialiser:
         if cfg.device_height_sd_m > 0.0:
             prior = np.append(prior, 0.0)
             prior_var = np.append(prior_var, cfg.device_height_sd_m**2)
-        return ages, _bias_inflated(rows), cfg.device_height_m, prior, prior_var
+        shared, shared_var = _shared_errors(rows, ages)
+        window = Window(ages, _bias_inflated(rows), shared, shared_var, cfg.device_height_m)
+        return Problem(window, prior, prior_var)
 
     def _fits(self, rows: Array, problem: Problem) -> list[Fit]:
         """Solutions from the most promising starts, best first."""
         scored: list[tuple[float, int, Array]] = []
-        for xy in _starts(rows, problem[3][:2]):
-            state = problem[3].copy()
+        for xy in _starts(rows, problem.prior[:2], math.sqrt(problem.prior_var[0])):
+            state = problem.prior.copy()
             state[:2] = xy
             state[4] = _clock_at(state, rows, self._config.device_height_m)
             scored.append((normal_equations(state, *problem)[0], len(scored), state))
@@ -330,17 +353,29 @@ def _bias_inflated(rows: Array) -> Array:
     A bias shared by k rows of the same sensor counts k times in each, so that their mean keeps the
     bias' variance.
     """
-    rows, bias_var = rows[:, :-1].copy(), rows[:, -1]
+    rows, bias_var = rows[:, :ROW_WIDTH].copy(), rows[:, _BIAS_VAR]
     sensors, sensor = np.unique(rows[:, [KIND, *range(ORIGIN, AXES)]], axis=0, return_inverse=True)
     count = np.bincount(sensor.reshape(-1), minlength=len(sensors))
     rows[:, VARIANCE] += count[sensor.reshape(-1)] * bias_var
     return rows
 
 
-def _starts(rows: Array, centre: Array) -> list[Array]:
+def _shared_errors(rows: Array, ages_s: Array) -> tuple[Array, Array]:
+    """``Window.shared`` and ``Window.shared_var`` of rows with their slow errors."""
+    shared = np.full(len(rows), -1)
+    has = rows[:, _SHARED_VAR] > 0.0
+    if not has.any():
+        return shared, np.zeros(0)
+    since_s = np.where(rows[has, _LASTS] > 0.0, 1.0, ages_s[has])  # of an age of its own, or all
+    names = np.column_stack([rows[has, _COMMON_STATE], since_s])
+    _, first, shared[has] = np.unique(names, axis=0, return_index=True, return_inverse=True)
+    return shared, rows[has, _SHARED_VAR][first]
+
+
+def _starts(rows: Array, centre: Array, reach_m: float) -> list[Array]:
     """Positions to start from: along measured bearings, around measured ranges, the centre of the
-    RSUs."""
-    starts = [centre]
+    RSUs, from which a device is about ``reach_m`` away."""
+    starts, rays_m = [centre], [r * max(1.0, reach_m / _RAYS_REACH_M) for r in _RAY_M]
     seen = set()
     for row in rows:
         kind = Kind(int(row[KIND]))
@@ -353,9 +388,9 @@ def _starts(rows: Array, centre: Array) -> list[Array]:
             A = row[AXES : AXES + 9].reshape(3, 3)
             angle = row[VALUE] if kind is Kind.AZIMUTH else math.asin(np.clip(row[VALUE], -1, 1))
             ray = A.T @ np.array([math.cos(angle), math.sin(angle), 0.0])
-            starts += [origin + r * ray[:2] for r in _RAY_M]
+            starts += [origin + r * ray[:2] for r in rays_m]
         elif kind is Kind.TDOA:
-            starts += _on_hyperbola(row)
+            starts += _on_hyperbola(row, rays_m[-1])
         elif BY_KIND[kind].is_range and not BY_KIND[kind].has_clock:
             starts += [origin + row[VALUE] * np.array([math.cos(a), math.sin(a)]) for a in _CIRCLE]
         elif BY_KIND[kind].is_range:
@@ -367,7 +402,7 @@ def _starts(rows: Array, centre: Array) -> list[Array]:
     return starts
 
 
-def _on_hyperbola(row: Array) -> list[Array]:
+def _on_hyperbola(row: Array, farthest_m: float) -> list[Array]:
     """Horizontal positions from which a time difference of arrival would read as it does: in polar
     coordinates around the RSU, r = (D^2 - v^2) / (2 (e b - v)) in the direction e, with the
     reference at b, D away, and the value v."""
@@ -377,7 +412,7 @@ def _on_hyperbola(row: Array) -> list[Array]:
     for angle in _CIRCLE:
         direction = np.array([math.cos(angle), math.sin(angle)])
         slope = 2.0 * (float(direction @ between) - value)
-        if abs(slope) > 1e-9 and 0.0 < excess / slope < _RAY_M[-1]:
+        if abs(slope) > 1e-9 and 0.0 < excess / slope < farthest_m:
             found.append(row[ORIGIN : ORIGIN + 2] + excess / slope * direction)
     return found
 

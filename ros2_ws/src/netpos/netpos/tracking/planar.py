@@ -134,7 +134,7 @@ class PlanarEstimator(Estimator):
     def pose_cost(self, stamp_ns: int, pose: InitialPose, recent: Recent | None) -> float:
         window = self._initialiser if recent is None else Initialiser(self._config)
         for then_ns, rows in recent or ():
-            window.add(then_ns, rows.rows, rows.slow_variance(self.biases), self.heard(rows))
+            self._collect(window, then_ns, rows)
         return self._excess_cost(window, stamp_ns, pose)
 
     def start_from_pose(self, stamp_ns: int, pose: InitialPose) -> bool:
@@ -152,8 +152,7 @@ class PlanarEstimator(Estimator):
             return FirstFix(self.estimate is not None)
         pose = self._pose_at(stamp_ns)
         if pose is None:
-            heard = self.heard(epoch_rows)
-            self._initialiser.add(stamp_ns, epoch_rows.rows, bias_var, heard)
+            self._collect(self._initialiser, stamp_ns, epoch_rows)
         fix = one_component(*pose) if pose is not None else self._initialiser.solve()
         if fix is None:
             return FirstFix(False)

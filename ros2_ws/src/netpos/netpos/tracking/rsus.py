@@ -144,6 +144,12 @@ class BiasStates:
         """(2, k): standard deviation and time constant of each."""
         return np.array([self.sd, self.tau_s]).reshape(2, -1)
 
+    def common(self, state: int) -> tuple[float, bool]:
+        """Variance of the error with the index ``state``, and whether it lasts from one epoch to
+        the next."""
+        k = state - self.first
+        return self.sd[k] ** 2, self.tau_s[k] > _RENEWED_S
+
     def coupling(self, rsu: Rsu, m: RsuMeasurement, shares: bool = False) -> Coupling:
         """Coupling of the rows of ``m`` as the RSU declares it; new biases are added to ``sd`` and
         ``tau_s``.

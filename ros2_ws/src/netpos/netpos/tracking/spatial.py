@@ -261,8 +261,7 @@ class SpatialEstimator(Estimator):
         window = Initialiser(replace(self._config, device_height_m=height_m))
         for then_ns, epoch_rows in self._heard if recent is None else recent:
             flat = replace(epoch_rows, rows=planar_rows(epoch_rows.rows, height_m))
-            bias_var = flat.slow_variance(self.biases)
-            window.add(then_ns, flat.rows, bias_var, self.heard(epoch_rows))
+            self._collect(window, then_ns, flat)
         return self._excess_cost(window, stamp_ns, pose)
 
     def start_from_pose(self, stamp_ns: int, pose: InitialPose) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import math
 import subprocess
@@ -20,6 +21,9 @@ from netpos.tracking.config import TrackerConfig
 ROOT = Path(__file__).resolve().parents[5]
 S = 1_000_000_000
 ANCHORS = {"A3": (-8, -8, 2), "A5": (8, -8, 0.5), "A9": (8, 8, 2), "A12": (-8, 8, 0.5)}
+STATIONS = np.array(
+    [[60.0, 60.0, 10.0], [-60.0, 50.0, 10.0], [-50.0, -60.0, 8.0], [70.0, -60.0, 8.0]]
+)
 SPEED_MPS, RADIUS_M, SD_M, SECONDS = 1.0, 6.0, 0.05, 20
 
 
@@ -29,10 +33,31 @@ def position_of(seconds: np.ndarray) -> np.ndarray:
     return RADIUS_M * np.column_stack([np.cos(turn), np.sin(turn)])
 
 
+def write_street(folder: Path) -> None:
+    """Two points among four stations, thirty draws of time differences and azimuths each, in the
+    form of the public set: the first station of a draw is the one to count from."""
+    folder.mkdir()
+    rng = np.random.default_rng(3)
+    header = "BS_x,BS_y,BS_z,tdoa,aoa_az,aoa_el,UE_x,UE_y,UE_z,timestamp"
+    lines = [header]
+    for point in np.array([[0.0, 0.0, 0.0], [15.0, 4.0, 0.0]]):
+        for draw in range(1, 31):
+            away = STATIONS - point
+            late = np.linalg.norm(away, axis=1) + rng.normal(0.0, 0.5, 4)
+            azimuth = np.arctan2(away[:, 1], away[:, 0]) + rng.normal(0.0, 0.02, 4)
+            tdoa = ["NaN", *(late[1:] - late[0])]
+            for site, difference, angle in zip(STATIONS, tdoa, azimuth, strict=True):
+                values = [*site, difference, angle, 0.0, *point, draw]
+                lines.append(",".join(map(str, values)))
+    with gzip.open(folder / "trajectory_100MHz.csv.gz", "wt") as stream:
+        stream.write("\n".join(lines) + "\n")
+
+
 @pytest.fixture(scope="module", name="data")
 def _data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a UWB recording named LOS, in the form of the public one."""
+    """A UWB recording named LOS and a street with 5G stations, in the form of the public ones."""
     folder = tmp_path_factory.mktemp("data")
+    write_street(folder / "5g_raytraced")
     los = folder / "uwb_car_anchors" / "LOS"
     los.mkdir(parents=True)
     rng = np.random.default_rng(17)
@@ -104,8 +129,14 @@ def test_the_script_writes_one_row_per_recording(data: Path, tmp_path: Path) -> 
     options = ["--data", str(data), "--json", str(file), "--out", str(out)]
     run = subprocess.run([*script, *options], capture_output=True, text=True, check=True)
     content = json.loads(file.read_text())
-    (row,) = content["rows"]
+    row, street = content["rows"]
     assert row["name"] == "uwb_LOS"
+    assert street["name"] == "5g_raytraced street"
+    for name in ("snapshot", "plain_ekf", "ours", "declared", "learned", "defaults"):
+        assert street[name]["n"] > 50, name  # of 60, two devices together
+        assert 0.0 < street[name]["rmse_m"] < 1.0, name
+    assert street["ours"]["rmse_m"] < street["snapshot"]["rmse_m"]
+    assert street["ours"]["lost_tracks"] == 0
     assert row["reference"] == 0.5
     figures = {"snapshot", "plain_ekf", "ours", "declared", "learned", "defaults"}
     assert set(row) == {"name", "reference", *figures, "wall_s"}

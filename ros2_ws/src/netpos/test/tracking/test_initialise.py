@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -86,6 +87,17 @@ def test_three_ranges() -> None:
     H /= np.linalg.norm(H, axis=1)[:, None]
     expected = np.linalg.inv(H.T @ H / 0.3**2 + np.eye(2) / 150.0**2)
     np.testing.assert_allclose(solution[1][:2, :2], expected, rtol=1e-3, atol=1e-6)
+
+
+def test_a_fix_that_is_too_wide_names_the_parameter() -> None:
+    initialiser = Initialiser(TrackerConfig(initial_position_sd_max_m=0.1))
+    stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40)]
+    rows = np.vstack(
+        [measure(s, at(12.0, 25.0), Field.RANGE, group=i) for i, s in enumerate(stations)]
+    )
+    initialiser.add(T0, rows, np.zeros(len(rows)), tuple(stations))
+    assert initialiser.solve() is None
+    assert re.search(r"sd of 0\.[34] m \(initial_position_sd_max_m: 0\.1\)", initialiser.missing)
 
 
 def test_two_ranges_wait_between_their_two_solutions() -> None:

@@ -10,12 +10,13 @@ from first_fix import at, fix_of, measure, rsu, solve
 from netpos.estimation.measurement import Kind, linearise
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.mixture.ridge import inverse as inverse_of
-from netpos.estimation.mixture.window import normal_equations
+from netpos.estimation.mixture.window import Window, normal_equations
 from netpos.estimation.rows import speed_row
 from netpos.messages.values import AngleConvention, Array, Field
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.initialise import (
     Initialiser,
+    Problem,
     _bias_inflated,
     _clock_at,
     _is_sound,
@@ -43,22 +44,46 @@ def mixed_rows() -> tuple[list[Rsu], Array, Array]:
     return stations, out, np.linspace(-1.5, 0.0, len(out))
 
 
-def cost_of(state: Array, problem: tuple[Array, Array, float, Array, Array]) -> float:
-    """Twice the negative log posterior, row by row, through the public model."""
-    ages, rows, height, prior, prior_var = problem
-    total = float(np.sum((state - prior) ** 2 / prior_var))
-    for age, row in zip(ages, rows, strict=True):
+def problem_of(rows: Array, prior: Array, prior_var: Array) -> Problem:
+    """Rows of one instant that share no errors."""
+    none = np.full(len(rows), -1)
+    return Problem(Window(np.zeros(len(rows)), rows, none, np.zeros(0), 0.0), prior, prior_var)
+
+
+def linearised(state: Array, window: Window) -> tuple[Array, Array, Array]:
+    """Innovations (m,), Jacobian (m, 6) and covariance (m, m) of the errors, row by row, through
+    the public model."""
+    R = np.diag(window.rows[:, 2])
+    for error, variance in enumerate(window.shared_var):
+        has = (window.shared == error).astype(float)
+        R += variance * np.outer(has, has)
+    left, J = [], []
+    for age, row in zip(window.ages_s, window.rows, strict=True):
         F = np.eye(6)
         F[0, 2] = F[1, 3] = F[4, 5] = age
-        innovation, _ = linearise(row[None], F @ state, height)
-        total += float(innovation[0] ** 2 / row[2])
-    return total
+        innovation, H = linearise(row[None], F @ state, window.height_m)
+        left.append(innovation[0])
+        J.append((H @ F)[0])
+    return np.array(left), np.array(J), R
 
 
-def test_cost_gradient_and_curvature_of_the_fit() -> None:
+def cost_of(state: Array, problem: Problem) -> float:
+    """Twice the negative log posterior."""
+    left, _, R = linearised(state, problem.window)
+    prior = np.sum((state - problem.prior) ** 2 / problem.prior_var)
+    return float(prior + left @ np.linalg.solve(R, left))
+
+
+@pytest.mark.parametrize("shares", [False, True])
+def test_cost_gradient_and_curvature_of_the_fit(shares: bool) -> None:
+    """Without and with errors that some rows share, one of them between epochs."""
     _, rows, ages = mixed_rows()
     prior = np.array([1.0, 2.0, 0.5, -0.5, 300.0, 20.0])
-    problem = (ages, rows, 0.7, prior, np.array([900.0, 900.0, 25.0, 25.0, 1e4, 400.0]))
+    shared = np.full(len(rows), -1)
+    if shares:
+        shared[[0, 3, 4]], shared[[6, 7]] = 0, 1
+    window = Window(ages, rows, shared, np.array([0.5, 2.0])[: 2 * shares], 0.7)
+    problem = Problem(window, prior, np.array([900.0, 900.0, 25.0, 25.0, 1e4, 400.0]))
     rng = np.random.default_rng(2)
     for _ in range(5):
         state = np.array([-12.0, 0.5, 3.0, -2.0, 500.0, 40.0]) + rng.normal(size=6)
@@ -68,14 +93,9 @@ def test_cost_gradient_and_curvature_of_the_fit() -> None:
         for i, e in enumerate(np.eye(6) * 1e-5):
             numeric[i] = (cost_of(state + e, problem) - cost_of(state - e, problem)) / 2e-5
         np.testing.assert_allclose(half_gradient, -numeric / 2, rtol=1e-5, atol=1e-3)
-        J = []
-        for age, row in zip(ages, rows, strict=True):
-            F = np.eye(6)
-            F[0, 2] = F[1, 3] = F[4, 5] = age
-            _, H = linearise(row[None], F @ state, 0.7)
-            J.append((H @ F)[0] / math.sqrt(row[2]))
-        expected = np.diag(1 / problem[4]) + np.array(J).T @ np.array(J)
-        np.testing.assert_allclose(hessian, expected, rtol=1e-9, atol=1e-9)
+        _, J, R = linearised(state, window)
+        expected = np.diag(1 / problem.prior_var) + J.T @ np.linalg.solve(R, J)
+        np.testing.assert_allclose(hessian, expected, rtol=1e-8, atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -86,7 +106,7 @@ def test_the_solver_ends_in_a_minimum_from_anywhere(seed: int) -> None:
     fields = Field.AZIMUTH | Field.RANGE
     rows = np.vstack([measure(s, at(25.0, 18.0), fields, rng) for s in stations])
     prior_var = np.array([150.0**2, 150.0**2, 25.0, 25.0, 1e4, 1e4])
-    problem = (np.zeros(len(rows)), rows, 0.0, np.array([13.0, 13.0, 0, 0, 0, 0]), prior_var)
+    problem = problem_of(rows, np.array([13.0, 13.0, 0, 0, 0, 0]), prior_var)
     start = np.array([*rng.uniform(-60, 60, 2), 0, 0, 0, 0])
     cost, state, cov = _solve(start, problem)
     assert cost <= cost_of(start, problem)
@@ -102,7 +122,7 @@ def test_a_step_uphill_is_tried_again_shorter(start: tuple[float, float]) -> Non
     stations = [rsu(0, 0), rsu(40, 0)]
     rows = np.vstack([measure(s, at(25.0, 18.0), Field.AZIMUTH) for s in stations])
     prior_var = np.array([150.0**2, 150.0**2, 25.0, 25.0, 1e4, 1e4])
-    problem = (np.zeros(2), rows, 0.0, np.array([13.0, 13.0, 0, 0, 0, 0]), prior_var)
+    problem = problem_of(rows, np.array([13.0, 13.0, 0, 0, 0, 0]), prior_var)
     cost, b, A = normal_equations(at(*start), *problem)
     first = at(*start) + np.linalg.solve(A + 1e-3 * np.diag(np.diag(A)), b)
     assert cost_of(first, problem) > cost
@@ -116,7 +136,7 @@ def test_starts_lie_where_the_measurements_point() -> None:
     turned = rsu(10, 20, 90)
     d = np.array([0.6, 0.8])
     azimuth = measure(turned, at(*(np.array([10, 20]) + 30 * d)), Field.AZIMUTH)
-    starts = _starts(np.vstack([azimuth, azimuth]), centre)
+    starts = _starts(np.vstack([azimuth, azimuth]), centre, 150.0)
     np.testing.assert_array_equal(starts[0], centre)
     along = np.array(starts[1:]) - [10, 20]
     assert len(along) == 5  # the second row of the same sensor adds none
@@ -124,21 +144,33 @@ def test_starts_lie_where_the_measurements_point() -> None:
     assert np.linalg.norm(along, axis=1)[-1] >= 100.0
     cone = rsu(10, 20, 90, angle_convention=AngleConvention.CONE)
     row = measure(cone, at(*(np.array([10, 20]) + 30 * d)), Field.AZIMUTH)
-    np.testing.assert_allclose(np.array(_starts(row, centre)[1:]) - [10, 20], along, atol=1e-9)
+    np.testing.assert_allclose(
+        np.array(_starts(row, centre, 150.0)[1:]) - [10, 20], along, atol=1e-9
+    )
     row[0, 1] = 1.2  # noise beyond the end-fire direction
-    assert np.isfinite(np.array(_starts(row, centre))).all()
+    assert np.isfinite(np.array(_starts(row, centre, 150.0))).all()
 
-    circle = np.array(_starts(measure(turned, at(10, 27), Field.RANGE), centre)[1:]) - [10, 20]
+    circle = np.array(_starts(measure(turned, at(10, 27), Field.RANGE), centre, 150.0)[1:]) - [
+        10,
+        20,
+    ]
     np.testing.assert_allclose(np.linalg.norm(circle, axis=1), 7.0)
     angles = np.sort(np.arctan2(circle[:, 1], circle[:, 0]))
     np.testing.assert_allclose(np.diff(angles), 2 * math.pi / 12, atol=1e-9)
-    toa = np.array(_starts(measure(turned, at(10, 27), Field.TOA), centre)[1:]) - [10, 20]
+    toa = np.array(_starts(measure(turned, at(10, 27), Field.TOA), centre, 150.0)[1:]) - [10, 20]
     np.testing.assert_allclose(np.linalg.norm(toa, axis=1), 30.0)
     assert len(toa) == 4
 
-    fix = _starts(measure(turned, at(7, -8), Field.POSITION), centre)
+    fix = _starts(measure(turned, at(7, -8), Field.POSITION), centre, 150.0)
     np.testing.assert_allclose(fix, [centre, [7.0, -8.0]], atol=1e-9)
-    assert len(_starts(speed_row(3.0, 1.0, 0), centre)) == 1
+    assert len(_starts(speed_row(3.0, 1.0, 0), centre, 150.0)) == 1
+
+
+def test_starts_reach_as_far_as_devices_may_be() -> None:
+    centre, far = np.array([1.0, 2.0]), measure(rsu(0, 0), at(3e4, 4e4), Field.AZIMUTH)
+    near, wide = (np.array(_starts(far, centre, reach)[1:]) for reach in (10.0, 6e4))
+    np.testing.assert_allclose(near, _starts(far, centre, 150.0)[1:])
+    np.testing.assert_allclose(wide, 400.0 * near, rtol=1e-12)
 
 
 def test_clock_start_is_the_weighted_mean_of_what_the_times_leave() -> None:
@@ -172,7 +204,7 @@ def test_bias_variance_counts_once_per_row_of_the_sensor() -> None:
     fields = Field.RANGE | Field.AZIMUTH
     rows = np.vstack([measure(s, at(9, 9), fields) for s in (a, a, a, b)])
     bias_var = np.array([0.1, 2.0] * 4)
-    given = np.column_stack([rows, bias_var])
+    given = np.column_stack([rows, bias_var, np.zeros((8, 3))])
     before = given.copy()
     out = _bias_inflated(given)
     np.testing.assert_array_equal(given, before)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from netpos.scenario.replay import replay_bag
 from netpos.tracking import Tracker, TrackerConfig
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.optimize import least_squares
+from scipy.stats import chi2
 
 C = 299_792_458.0
 SITES = {
@@ -95,10 +97,39 @@ def test_the_first_fix_is_that_of_least_squares(seed: int) -> None:
         return np.asarray(whiten @ (np.array(list(values.values())) - expected))
 
     found = least_squares(residuals, PLACE[:2])
-    cov = np.linalg.inv(found.jac.T @ found.jac)
-    apart = fix.position[:2] - found.x
-    # The first fix weighs the differences as if they were independent.
-    assert float(apart @ np.linalg.solve(cov, apart)) < 3.0
+    misfit = max(1.0, 2.0 * found.cost / len(values))  # enlarges the covariance of a fix
+    cov = misfit * np.linalg.inv(found.jac.T @ found.jac)
+    # The prior on the way from the middle of the RSUs, and a device that moves, make the rest.
+    np.testing.assert_allclose(fix.position[:2], found.x, atol=0.02 * math.sqrt(np.trace(cov)))
+    np.testing.assert_allclose(fix.pose_cov[:2, :2], cov, rtol=0.02)
+
+
+@pytest.mark.parametrize("place_km", [(40.0, 30.0), (-60.0, 20.0), (150.0, 120.0), (20.0, -90.0)])
+def test_receivers_a_hundred_kilometres_apart(place_km: tuple[float, float]) -> None:
+    """Nothing is said of how far a device may be: the RSUs themselves say it."""
+    sites = {name: np.array([2e3 * x, 2e3 * y, z]) for name, (x, y, z) in SITES.items()}
+    place, sd_m = np.array([1e3 * place_km[0], 1e3 * place_km[1], 8e3]), 20.0
+    config = TrackerConfig(device_height_m=8e3, initial_position_sd_max_m=2e3, hold_s=0.0)
+    made, rng = Tracker(config), np.random.default_rng(3)
+    for name, site in sites.items():
+        made.add_rsu(RsuInfo(rsu_id=name, position=site))
+    away = {n: np.linalg.norm(place - s) + rng.normal(0.0, sd_m) for n, s in sites.items()}
+    items = [tdoa(START_NS, n, "a", away[n] - away["a"], 1.5 * sd_m) for n in sites if n != "a"]
+    fix = fix_of(said(made, number_beacons(items)))
+    apart, cov = (fix.position - place)[:2], fix.pose_cov[:2, :2]
+    assert float(apart @ np.linalg.solve(cov, apart)) < 9.0
+    assert math.sqrt(np.trace(cov)) < 1e3
+
+
+def test_differences_of_one_emission_leave_a_first_fix_as_sure_as_it_is() -> None:
+    """Over many draws: the error of the RSU that all differences count from is one error."""
+    nees = []
+    for seed in range(200):
+        fix = fix_of(said(tracker(), star(START_NS, np.random.default_rng(seed))))
+        apart = (fix.position - PLACE)[:2]
+        nees.append(float(apart @ np.linalg.solve(fix.pose_cov[:2, :2], apart)))
+    assert 200 * np.mean(nees) < chi2.ppf(0.999, 400)
+    assert 200 * np.mean(nees) > chi2.ppf(0.001, 400)
 
 
 def test_too_few_differences_are_no_fix() -> None:

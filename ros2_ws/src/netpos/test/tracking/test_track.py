@@ -158,10 +158,31 @@ def test_clock_is_reported_from_the_first_toa_on(world: Any, feed: Any, fields: 
     assert output.clock is not None
 
 
+def posterior_sd_m(sites: Array, own_m: float, shared_m: float) -> float:
+    """Of the position where it is widest, given ranges from ``standing()`` without noise whose
+    errors have the sd ``own_m`` each and ``shared_m`` together: summed on a grid, under a prior of
+    150 m about the middle of the RSUs."""
+    axis = np.arange(-15.0, 15.0, 0.05)
+    xy = np.stack(np.meshgrid(axis + 40.0, axis + 2.0, indexing="ij"), axis=-1)
+    true_m = np.linalg.norm(sites - [40.0, 2.0], axis=1)
+    left = np.linalg.norm(xy[..., None, :] - sites, axis=-1) - true_m
+    weigh = np.linalg.inv(own_m**2 * np.eye(len(sites)) + shared_m**2)
+    cost = np.einsum("ijk,kl,ijl->ij", left, weigh, left)
+    cost += (np.square(xy - sites.mean(axis=0)) / 150.0**2).sum(axis=-1)
+    weight = (
+        np.exp(-0.5 * (cost - cost.min()))[..., None] / np.exp(-0.5 * (cost - cost.min())).sum()
+    )
+    away = xy - (weight * xy).sum(axis=(0, 1))
+    cov = np.einsum("ij,ijk,ijl->kl", weight[..., 0], away, away)
+    return math.sqrt(float(np.linalg.eigvalsh(cov)[-1]))
+
+
 def test_first_fix_knows_of_the_biases(world: Any, feed: Any) -> None:
-    """Own bias 0.4 m and common bias 1.2 m on 0.3 m of noise: ranges of 1.3 m in place of 0.3 m.
-    The sd of the posterior, summed on a grid, grows from 0.675 to 2.953 m."""
+    """Own bias 0.4 m and common bias 1.2 m on 0.3 m of noise: the common one moves all ranges
+    alike."""
+    sites = np.array([info.position[:2] for info in world.rsus.values()])
     (plain,) = feed(world.tracker(), world.measure(0.0, standing(), Field.RANGE))
+    assert plain.status.position_sd_m == pytest.approx(posterior_sd_m(sites, 0.3, 0.0), rel=0.01)
     with_errors(
         world,
         range_bias_sd_m=0.4,
@@ -170,8 +191,7 @@ def test_first_fix_knows_of_the_biases(world: Any, feed: Any) -> None:
         common_bias_correlation_time_s=9.0,
     )
     (biased,) = feed(world.tracker(), world.measure(0.0, standing(), Field.RANGE))
-    ratio = biased.status.position_sd_m / plain.status.position_sd_m
-    assert ratio == pytest.approx(2.953 / 0.675, rel=0.01)
+    assert biased.status.position_sd_m == pytest.approx(posterior_sd_m(sites, 0.5, 1.2), rel=0.02)
 
 
 def test_initial_pose_starts_the_track_as_the_paper_does(world: Any, feed: Any) -> None:

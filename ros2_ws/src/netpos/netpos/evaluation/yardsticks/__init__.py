@@ -5,7 +5,7 @@ by a score.
 """
 
 from netpos.evaluation.yardsticks.observations import Kind, Observations, ranges, residuals
-from netpos.evaluation.yardsticks.of_bag import observations_of_bag
+from netpos.evaluation.yardsticks.of_bag import observations_of_bag, observations_of_devices
 from netpos.evaluation.yardsticks.plain_ekf import PlainConfig, PlainRun, plain_ekf
 from netpos.evaluation.yardsticks.snapshot import Fix, Space, snapshot, snapshots
 
@@ -17,6 +17,7 @@ __all__ = [
     "PlainRun",
     "Space",
     "observations_of_bag",
+    "observations_of_devices",
     "plain_ekf",
     "ranges",
     "residuals",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,19 @@ def observations_of_bag(
     range_sd_m: float | None = None,
     kinds: Collection[Kind] = tuple(Kind),
 ) -> Observations:
-    """Azimuths, elevations, ranges and time differences of one device in stamp order.
+    """Azimuths, elevations, ranges and time differences of one device in stamp order; see
+    ``observations_of_devices``."""
+    return observations_of_devices(path, [vue_id], range_sd_m=range_sd_m, kinds=kinds)[vue_id]
+
+
+def observations_of_devices(
+    path: Path,
+    vue_ids: Iterable[str],
+    *,
+    range_sd_m: float | None = None,
+    kinds: Collection[Kind] = tuple(Kind),
+) -> dict[str, Observations]:
+    """Azimuths, elevations, ranges and time differences of each device in stamp order.
 
     The sd holds all that the RSU states, noise and biases, as if it were white noise;
     ``range_sd_m`` is used in its place for ranges. TOA, phases and position fixes are left out:
@@ -34,7 +46,7 @@ def observations_of_bag(
     Raises
     ------
     BagError  not a bag, or one without RSUs or measurements
-    ValueError  no measurement of the device that these kinds take
+    ValueError  no measurement of a device that these kinds take
     """
     with BagReader(path) as bag:
         infos = [codec().rsu_info_from_msg(e.message) for e in bag.messages([topics.RSU_INFO])]
@@ -44,17 +56,24 @@ def observations_of_bag(
         ]
     known = {info.rsu_id: info for info in infos}
     axes = {i.rsu_id: Rotation.from_quat(i.quaternion).as_matrix().T for i in infos}
-    rows = [
-        (m, row)
-        for m in sorted(heard, key=lambda m: (m.stamp_ns, m.rsu_id))
-        if m.vue_id == vue_id and m.rsu_id in known
-        for row in _rows(m, known[m.rsu_id], range_sd_m)
-        if row[0] in kinds
-    ]
-    if not rows:
-        raise ValueError(
-            f"{path} has no azimuth, elevation, range or time difference of {vue_id!r}"
-        )
+    rows: dict[str, list[tuple[RsuMeasurement, _Row]]] = {vue_id: [] for vue_id in vue_ids}
+    for m in sorted(heard, key=lambda m: (m.stamp_ns, m.rsu_id)):
+        if m.vue_id in rows and m.rsu_id in known:
+            found = _rows(m, known[m.rsu_id], range_sd_m)
+            rows[m.vue_id] += [(m, row) for row in found if row[0] in kinds]
+    for vue_id, of_it in rows.items():
+        if not of_it:
+            raise ValueError(
+                f"{path} has no azimuth, elevation, range or time difference of {vue_id!r}"
+            )
+    return {vue_id: _observations(of_it, known, axes) for vue_id, of_it in rows.items()}
+
+
+def _observations(
+    rows: list[tuple[RsuMeasurement, _Row]],
+    known: Mapping[str, RsuInfo],
+    axes: Mapping[str, Array],
+) -> Observations:
     return Observations(
         stamp_ns=np.array([m.stamp_ns for m, _ in rows], dtype=np.int64),
         kind=np.array([row[0] for _, row in rows], dtype=np.int64),

@@ -18,7 +18,6 @@ from netpos.evaluation.yardsticks.observations import NS, Kind, Observations, St
 from netpos.messages.values import Array
 
 WINDOW_S = 1.0
-MAX_SD_M = 5.0
 GATE_SD = 4.0
 START_AGE_S = 2.0
 EVERY_S = 0.1
@@ -34,10 +33,12 @@ class Space:
     """Which coordinates are unknown: x and y at a given height, or x, y and z.
 
     height_m : height of the device where ``dimensions`` is 2, else of the search's start
+    sd_max_m : a fix with a larger sd is none
     """
 
     dimensions: int = 2
     height_m: float = 0.0
+    sd_max_m: float = 5.0
 
     def __post_init__(self) -> None:
         if self.dimensions not in (2, 3):
@@ -62,7 +63,7 @@ class Fix:
 
 def snapshot(seen: Observations, space: Space, start: Array | None = None) -> Fix | None:
     """Least squares of all rows as one instant; None where they do not fix the position: fewer
-    rows than unknowns, a singular geometry, an sd above 5 m, or a second solution that fits as
+    rows than unknowns, a singular geometry, too large an sd, or a second solution that fits as
     well (9 more in the sum of squares, 3 sd).
 
     start : where the search begins; without it a grid of starts is searched, and only then a
@@ -131,7 +132,7 @@ def _fix(state: Array, J: Array, space: Space) -> Fix | None:
         return None
     cov = np.asarray(np.linalg.inv(information), dtype=np.float64)
     variances = cov.diagonal()[: space.dimensions]
-    if not ((variances > 0).all() and variances.max() < MAX_SD_M**2):
+    if not ((variances > 0).all() and variances.max() < space.sd_max_m**2):
         return None
     return Fix(state, cov)
 

@@ -12,6 +12,7 @@ from netpos.bags.recording import write_values
 from netpos.evaluation.yardsticks import (
     Kind,
     observations_of_bag,
+    observations_of_devices,
 )
 from netpos.messages.values import AngleConvention, Field, Odometry, RsuInfo, RsuMeasurement
 from scipy.spatial.transform import Rotation
@@ -80,3 +81,10 @@ def test_measurements_of_a_bag(tmp_path: Path) -> None:
         ValueError, match="no azimuth, elevation, range or time difference of 'vue_3'"
     ):
         observations_of_bag(bag, "vue_3")
+
+
+def test_measurements_of_several_devices(tmp_path: Path) -> None:
+    seen = observations_of_devices(bag_of(tmp_path / "bag"), ["vue_2", "vue_1"])
+    assert list(seen) == ["vue_2", "vue_1"]
+    assert seen["vue_2"].stamp_ns.tolist() == [2 * S]
+    assert len(seen["vue_1"]) == 3
