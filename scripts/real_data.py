@@ -47,7 +47,8 @@ AZIMUTHS = (Kind.AZIMUTH, Kind.AZIMUTH_CONE)
 
 
 def sources(data: Path) -> Iterator[Source]:
-    """Name, a file or folder that must exist, the import, and what the baselines use."""
+    """Of recordings of one device: name, a file or folder that must exist, the import, and what
+    the baselines use."""
     folder = data / "ble_aoa"
     level = Space(height_m=ble_aoa.TAG_HEIGHT_M)
     for run in BLE_RUNS:
@@ -78,7 +79,6 @@ def own_recordings(data: Path) -> Iterator[Source]:
     yield "range_beacons Plaza1", data / "range_beacons", readers.import_plaza, used
     used = {"space": Space(dimensions=3, height_m=1.0), "range_sd_m": readers.UWB_SD_M}
     yield "uwb_tdoa", data / "uwb_tdoa", readers.import_uwb_tdoa, used
-    yield from several_devices(data)
 
 
 def several_devices(data: Path) -> Iterator[Source]:
@@ -131,7 +131,7 @@ def measure(data: Path, folder: Path, only: list[str]) -> Json:
     """All rows; ``absent`` names the recordings that ``data`` does not hold."""
     rows, absent = [], []
     started = time.monotonic()
-    for source in sources(data):
+    for source in (*sources(data), *several_devices(data)):
         if only and source[0] not in only:
             continue
         if source[1].exists():

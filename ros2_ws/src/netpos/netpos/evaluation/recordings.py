@@ -51,6 +51,7 @@ WHOLE = (
     "protection_exceeded",
     "protection_level_m",
 )
+TIMES = ("availability", "unscored_s", "time_to_first_fix_s")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +75,8 @@ def recording_row(recording: Recording, folder: Path) -> Json:
     scored as one, one after another.
 
     ``rmse_m`` and the other figures of accuracy of a baseline are of the tracker's epochs that
-    count; ``own`` holds those of all its epochs but the first ``recording.skip``.
+    count; ``own`` holds those of all its epochs but the first ``recording.skip``. Figures of time
+    of a baseline are None for several devices.
 
     Raises
     ------
@@ -106,6 +108,8 @@ def recording_row(recording: Recording, folder: Path) -> Json:
         ours.counted_ns,
         recording.skip,
     )
+    if len(ours.offset_ns) > 1:  # the time between two devices is nobody's
+        baselines = {name: row | dict.fromkeys(TIMES) for name, row in baselines.items()}
     return {
         "name": recording.name,
         "reference": recording.reference,

@@ -137,6 +137,8 @@ def test_the_script_writes_one_row_per_recording(data: Path, tmp_path: Path) -> 
         assert 0.0 < street[name]["rmse_m"] < 1.0, name
     assert street["ours"]["rmse_m"] < street["snapshot"]["rmse_m"]
     assert street["ours"]["lost_tracks"] == 0
+    assert street["ours"]["unscored_s"] < 10.0
+    assert street["snapshot"]["unscored_s"] is None  # the time between the devices is nobody's
     assert row["reference"] == 0.5
     figures = {"snapshot", "plain_ekf", "ours", "declared", "learned", "defaults"}
     assert set(row) == {"name", "reference", *figures, "wall_s"}
