@@ -22,6 +22,7 @@ from netpos.estimation.measurement import (
     linearise,
 )
 from netpos.estimation.rows import ROWS_MAX, couple, linear_rows, put_measurement, speed_row
+from netpos.estimation.sensors.table import BY_KIND
 from netpos.estimation.state import KNOWN_HEIGHT, N_CORE, VELOCITY, HeightState, X
 from netpos.messages.values import Array, Field, GroundSpeed, RsuMeasurement, Velocity
 from netpos.tracking.rsus import REFERENCED, BiasStates, Rsu
@@ -65,7 +66,7 @@ class EpochRows:
         COMMON state, and 1 where that error is the same at the next epoch, else 0."""
         shared = np.zeros((len(self.rows), 2))
         for error, row in zip(shared, self.rows, strict=True):
-            if row[COMMON] >= 0 and int(row[KIND]) != Kind.STEP_VELOCITY:
+            if row[COMMON] >= 0 and BY_KIND[int(row[KIND])].adds_biases:
                 error[:] = biases.common(int(row[COMMON]))
         return shared
 
