@@ -51,6 +51,7 @@ WHOLE = (
     "protection_exceeded",
     "protection_level_m",
 )
+# Figures of the time that a run takes.
 TIMES = ("availability", "unscored_s", "time_to_first_fix_s")
 
 
@@ -84,6 +85,8 @@ def recording_row(recording: Recording, folder: Path) -> Json:
     FileExistsError  ``folder`` has a bag of this name
     """
     ours = _replayed(recording, folder / recording.name, {})
+    if ours is None:
+        raise ValueError(f"{recording.bag}: no estimate was made; netpos replay says why")
     defaults = _replayed(
         recording, folder / f"{recording.name}_defaults", default_parameters(recording.bag)
     )
@@ -93,8 +96,6 @@ def recording_row(recording: Recording, folder: Path) -> Json:
         name = "declared" if learning else "learned"
         changed = {"learn_errors": not learning}
         other = _replayed(recording, folder / f"{recording.name}_{name}", changed)
-    if ours is None:
-        raise ValueError(f"{recording.bag}: no estimate was made; netpos replay says why")
     mine, plain, changed_so = (
         None if run is None else figures_of(run.figures) for run in (ours, defaults, other)
     )
