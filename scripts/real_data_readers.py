@@ -51,8 +51,8 @@ kilometre or two is one."""
 ADSB_SETS, ADSB_APART_NS = (1, 2, 5, 6), 7_200_000_000_000
 ARRIVAL_SD_M = 30.0  # a sample of 10 MHz
 FLAT_M = 4e5  # the map is a plane: 12 km above the ground at this distance
-STATION_SD_M = 1.0  # a third of the wavelength of 100 MHz
-AZIMUTH_SD_RAD = math.radians(2.0)
+# The set names none: about what it shows itself where paths are direct.
+STATION_SD_M, AZIMUTH_SD_RAD = 1.0, math.radians(2.0)
 
 
 def import_uwb_tdoa(folder: Path, bag: Path) -> object:
