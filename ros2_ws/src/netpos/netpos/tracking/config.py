@@ -146,7 +146,10 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
     )
     initial_window_s: float = real(3.0, 0.01, 60.0, "measurements used for the first fix")
     coverage_radius_m: float = real(
-        150.0, 1.0, 1e5, "a device is about this far from an RSU that hears it"
+        150.0,
+        1.0,
+        1e5,
+        "a device is about this far from the RSUs that hear it, or as far as these stand apart",
     )
     device_height_m: float = real(
         0.0, -1e4, 1e4, "height of the device in map; where it is unknown, of its mean"

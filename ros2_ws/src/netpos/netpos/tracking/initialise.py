@@ -403,9 +403,9 @@ def _starts(rows: Array, centre: Array, reach_m: float) -> list[Array]:
 
 
 def _on_hyperbola(row: Array, farthest_m: float) -> list[Array]:
-    """Horizontal positions from which a time difference of arrival would read as it does: in polar
-    coordinates around the RSU, r = (D^2 - v^2) / (2 (e b - v)) in the direction e, with the
-    reference at b, D away, and the value v."""
+    """Horizontal positions, nearer than ``farthest_m`` to the RSU, from which a time difference of
+    arrival would read as it does: in polar coordinates around the RSU, in the direction e,
+    r = (D^2 - v^2) / (2 (e b - v)), with the reference at b, D away, and the value v."""
     between, value = row[AXES : AXES + 2], float(row[VALUE])
     excess = float(between @ between) - value * value
     found = []
