@@ -214,7 +214,9 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
         "learn scatter, bias and correlation of each RSU's errors; declared ones are a prior",
     )
     isolate_rsus: bool = described(
-        True, "refuse an RSU that at least two others contradict, and a sensor that is stuck"
+        True,
+        "refuse an RSU that at least two others contradict, and a sensor that is stuck; a first"
+        " fix allows for one RSU of three or more that errs grossly",
     )
     manoeuvre_speed_sd_mps: float = real(
         5.0,

@@ -41,13 +41,14 @@ from netpos.estimation.measurement import (
 )
 from netpos.estimation.mixture.gaussians import Mixture, mode_of
 from netpos.estimation.mixture.reduction import reduced
-from netpos.estimation.mixture.ridge import Fit, components_of, inverse
+from netpos.estimation.mixture.ridge import Fit, components_of, inverse, whole
 from netpos.estimation.mixture.ring import RING_MERGE_COST
 from netpos.estimation.mixture.window import Window, normal_equations
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.estimation.sensors.table import BY_KIND
 from netpos.estimation.state import N_CORE
 from netpos.messages.values import Array
+from netpos.tracking import wrong_rsu
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.models import carries_modes
 from netpos.tracking.rsus import Rsu
@@ -58,6 +59,7 @@ _ATTEMPT_NS = 100_000_000
 # cannot be told apart are waited for from the same share on, and carried along below it.
 _RIVAL_COST, _RIVAL_SHARE = 9.21, 0.01
 _CONTRADICTS = 9.0  # mean squared residual over variance
+_UNLIKELY_LOG = -15.0  # of a case that is not looked at
 _NEAREST_M = 1.0
 _HEADINGS = 16
 _HEADING_SD_MAX = 0.5
@@ -77,20 +79,28 @@ class Problem(NamedTuple):
 
 
 class _Solution(NamedTuple):
-    """A problem and its minima, best first."""
+    """A problem and its minima, best first. log_odds: of what it takes for granted, and the log
+    density of the states that it has more than others, where these are 0."""
 
     problem: Problem
     fits: list[Fit]
+    log_odds: float = 0.0
 
-    def mixture(self, misfit: float, is_possible: Callable[[Array], bool]) -> Mixture:
-        """The posterior; a ``misfit`` above 1 enlarges all variances."""
+    @property
+    def log_weight(self) -> float:
+        """Of the best minimum as one Gaussian."""
+        return self.log_odds + whole(self.fits[0]).log_weight
+
+    def mixture(self, misfit: float, n: int, is_possible: Callable[[Array], bool]) -> Mixture:
+        """The posterior of the first ``n`` states; a ``misfit`` above 1 enlarges all variances."""
 
         def equations(state: Array) -> tuple[float, Array, Array]:
             cost, b, A = normal_equations(state, *self.problem)
             return cost / misfit, b / misfit, A / misfit
 
         fits = [(cost / misfit, mean, cov * misfit) for cost, mean, cov in self.fits]
-        return components_of(equations, fits, is_possible)
+        means, covs, log_weights = components_of(equations, fits, is_possible)
+        return Mixture(means[:, :n], covs[:, :n, :n], log_weights + self.log_odds)
 
 
 def joined(mixtures: Sequence[Mixture]) -> Mixture:
@@ -123,6 +133,11 @@ class Initialiser:
         self._next_attempt_ns = 0
         self.missing = ""
         """What a first fix lacks, for people; empty before the first attempt."""
+
+    @property
+    def _states(self) -> int:
+        """Number of states of a first fix."""
+        return N_CORE + (self._config.device_height_sd_m > 0.0)
 
     def copy(self) -> Initialiser:
         """An independent copy."""
@@ -160,8 +175,9 @@ class Initialiser:
         places that cannot be told apart are modes. None while the position is open, or for most
         of the window while there are several modes.
 
-        Where the measurements contradict each other and leaving out one of three or more RSUs
-        makes them agree, the fix is that of the others.
+        Of three or more RSUs one may err grossly: what the others say is a part of the posterior.
+        Where the measurements contradict each other and leaving out one RSU makes them agree, the
+        fix is that of the others.
         """
         newest = self._window[-1][0]
         if newest < self._next_attempt_ns:
@@ -191,7 +207,10 @@ class Initialiser:
                 " they in m, rad and s, and the RSUs where RsuInfo says?"
             )
             return None
-        mixture = joined([s.mixture(misfit, self._plausible) for s in solutions])
+        if self._config.isolate_rsus and self._consistent(fits[0], len(rows)):
+            solutions += self._one_errs(rows, ages, solutions[0])
+        n = self._states
+        mixture = joined([s.mixture(misfit, n, self._plausible) for s in solutions])
         waited_s = (newest - self._window[0][0]) * 1e-9
         waits = waited_s < 0.8 * self._config.initial_window_s or not carries_modes(self._config)
         if waits and has_modes(mixture, _RIVAL_SHARE):
@@ -244,18 +263,29 @@ class Initialiser:
     def _without_one(self, rows: Array, ages: Array) -> list[_Solution]:
         """Solutions with a consistent fit without one of the RSUs, best first; none of fewer than
         three RSUs."""
-        placed = ~np.isin(rows[:, KIND], (Kind.LINEAR, Kind.SPEED))
+        placed = wrong_rsu.placed(rows)
         origins = np.unique(rows[placed, ORIGIN:AXES], axis=0)
         if len(origins) < 3:
             return []
         solutions = []
         for origin in origins:
             keep = ~placed | (rows[:, ORIGIN:AXES] != origin).any(axis=1)
-            problem, fits = self._solution(rows[keep], ages[keep])
-            fits = [fit for fit in fits if self._consistent(fit, int(keep.sum()))]
+            others = self._solution(rows[keep], ages[keep])
+            fits = [fit for fit in others.fits if self._consistent(fit, int(keep.sum()))]
             if fits:
-                solutions.append(_Solution(problem, fits))
+                solutions.append(others._replace(fits=fits))
         return sorted(solutions, key=lambda solution: solution.fits[0][0])
+
+    def _one_errs(self, rows: Array, ages: Array, agreed: _Solution) -> list[_Solution]:
+        """Solutions in which one of the RSUs errs grossly, of at least three, where that is not
+        too unlikely beside the one in which all of them agree."""
+        found = []
+        for case in wrong_rsu.cases(*agreed.problem):
+            problem = Problem(case.window, case.prior, case.prior_var)
+            one = _Solution(problem, self._fits(rows, problem), case.log_odds)
+            if one.fits and one.log_weight > agreed.log_weight + _UNLIKELY_LOG:
+                found.append(one)
+        return found
 
     def _problem(self, rows: Array, ages: Array) -> Problem:
         cfg = self._config
@@ -301,7 +331,8 @@ class Initialiser:
         }
         for rsu in heard.values():
             dx, dy = state[:2] - rsu.info.position[:2]
-            dz = self._config.device_height_m + state[N_CORE:].sum() - rsu.info.position[2]
+            up = state[N_CORE : self._states].sum()
+            dz = self._config.device_height_m + up - rsu.info.position[2]
             near = dx * dx + dy * dy + dz * dz < _NEAREST_M**2
             if not rsu.in_front(dx, dy) or (near and tuple(rsu.info.position) not in ranged):
                 return False

@@ -121,6 +121,7 @@ def _config(start: Start, motion: Motion, **values: Any) -> dict[str, Any]:
         "accel_density_mps2_sqrthz": motion.accel,
         "initial_speed_sd_mps": start.velocity_sd,
         "manoeuvre_speed_sd_mps": 0.0,
+        "isolate_rsus": False,  # no RSU errs grossly
     }
     return {**shared, **values}
 

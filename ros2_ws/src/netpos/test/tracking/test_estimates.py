@@ -101,6 +101,7 @@ def test_filterpy_says_the_same(
             motion_model=model,
             manoeuvre_speed_sd_mps=0.0,
             accel_density_mps2_sqrthz=0.5,
+            isolate_rsus=False,  # the first fix is one component
             clock_offset_sd_s=3e-8,
             clock_drift_sd=1e-8,
         )

@@ -180,8 +180,9 @@ def posterior_sd_m(sites: Array, own_m: float, shared_m: float) -> float:
 def test_first_fix_knows_of_the_biases(world: Any, feed: Any) -> None:
     """Own bias 0.4 m and common bias 1.2 m on 0.3 m of noise: the common one moves all ranges
     alike."""
+    all_right = {"isolate_rsus": False}
     sites = np.array([info.position[:2] for info in world.rsus.values()])
-    (plain,) = feed(world.tracker(), world.measure(0.0, standing(), Field.RANGE))
+    (plain,) = feed(world.tracker(**all_right), world.measure(0.0, standing(), Field.RANGE))
     assert plain.status.position_sd_m == pytest.approx(posterior_sd_m(sites, 0.3, 0.0), rel=0.01)
     with_errors(
         world,
@@ -190,7 +191,7 @@ def test_first_fix_knows_of_the_biases(world: Any, feed: Any) -> None:
         common_range_bias_sd_m=1.2,
         common_bias_correlation_time_s=9.0,
     )
-    (biased,) = feed(world.tracker(), world.measure(0.0, standing(), Field.RANGE))
+    (biased,) = feed(world.tracker(**all_right), world.measure(0.0, standing(), Field.RANGE))
     assert biased.status.position_sd_m == pytest.approx(posterior_sd_m(sites, 0.5, 1.2), rel=0.02)
 
 

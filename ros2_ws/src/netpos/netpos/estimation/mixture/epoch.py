@@ -142,16 +142,17 @@ def _add_candidates(
     other sector of a phase in the row ``at`` and each explanation of what is refused; the number
     of candidates then. ``work`` keeps the rows as the component sees them."""
     mean, cov, rows = prior.means[k], prior.covs[k], epoch.rows
+    opens = options.models > 1 or options.manoeuvre_speed_sd <= 0.0
     if at >= 0:
         end = add_turns_of_phase(k, end, prior, rows, at, options, found)
         predicted = predicted_in(work, mean.size, rows.shape[0])
         predict_rows(mean, cov, rows, options.height_m, predicted)
     else:
         found.means[k], found.covs[k] = mean, cov
-        if options.models > 1:
+        if opens:
             mixing.open_velocity(k, epoch, options, found)
         apply(k, prior.log_weights[k], rows, options, found, work)
-    if options.models > 1 and found.used[k] == 0:
+    if opens and found.used[k] == 0:
         found.covs[k] = cov
     refuses = found.accepted[k].sum() < found.accepted.shape[1]
     if refuses and options.manoeuvre_speed_sd > 0.0:

@@ -78,7 +78,7 @@ def keep_alive(weights: Array) -> None:
 @kernel
 def open_velocity(k: int, epoch: EpochInput, options: FilterOptions, found: Candidates) -> None:
     """Open the velocity of the candidate ``k`` after ``inflate_after`` epochs rejected in a row:
-    no other component has it for interacting models."""
+    no other component has it where models interact or no manoeuvre is declared."""
     if epoch.rejected_in_row >= options.inflate_after:
         add_velocity_step(options.initial_speed_sd, epoch.unheard_s, 0.0, found.covs[k])
 

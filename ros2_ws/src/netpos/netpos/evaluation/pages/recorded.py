@@ -266,5 +266,6 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any]], tuple[list[Entry], str]]] =
     "speed": _read_speed,
     "real_data": _read_recordings,
     "scenarios": _read_table("netpos run SCENARIO --offline, netpos evaluate"),
+    "learned": _read_table("python scripts/learned_papers.py"),
     "walking": _read_table("python scripts/pdr_results.py"),
 }
