@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import log_ndtr
 
 from netpos.estimation import engine
 from netpos.estimation.accel_density import (
@@ -243,6 +244,18 @@ class Estimate:
             change(self.mean, cov, *arguments)
             self._cov_or_sqrt = engine.to_cov_or_sqrt(cov, self._options)
 
+    def keep_in_front(self, origin: Array, front: Array) -> None:
+        """Where the mean is behind the line through ``origin`` (2,) m with ``front`` (2,), of unit
+        length, across it, take away what is behind it, from each component that has its mean
+        there."""
+        if float(front @ (self.mean[POSITION] - origin)) >= 0.0:
+            return
+        means, covs, log_weights = (array.copy() for array in self.components)
+        for k in np.flatnonzero((means[:, POSITION] - origin) @ front < 0.0).tolist():
+            log_weights[k] += cut_off_behind(means[k], covs[k], origin, front)
+        log_weights -= np.logaddexp.reduce(log_weights)
+        self._set(Mixture(means, covs, log_weights))
+
     def predict(self, stamp_ns: int, bias: Array) -> None:
         """Move to ``stamp_ns``."""
         dt = (stamp_ns - self.stamp_ns) * 1e-9
@@ -321,19 +334,22 @@ def change_prior(mean: Array, cov: Array, index: int, before: float, after: floa
     fuse_value(mean, cov, h, -mean[index], after * after * before * before / -gained)
 
 
-def cut_off_behind(mean: Array, cov: Array, origin: Array, front: Array) -> None:
+def cut_off_behind(mean: Array, cov: Array, origin: Array, front: Array) -> float:
     """Moments of a Gaussian without what is behind a line, in place: mean (n,), covariance (n, n);
     the line through ``origin`` (2,) m, with ``front`` (2,), of unit length, across it (Simon and
-    Simon 2010, eq. 13 to 20 for one constraint). Nothing happens where the mean is more than
-    ``_FARTHEST_BEHIND_SD`` behind it: that contradicts the estimate, it does not cut it."""
+    Simon 2010, eq. 13 to 20 for one constraint). The log of the share in front of it. Nothing
+    else happens where the mean is more than ``_FARTHEST_BEHIND_SD`` behind it: that contradicts
+    the estimate, it does not cut it."""
     Ph = cov[:, POSITION] @ front
     sd = math.sqrt(float(front @ Ph[POSITION]))
     z = float(front @ (mean[POSITION] - origin)) / sd
+    share = float(log_ndtr(z))
     if z < -_FARTHEST_BEHIND_SD:
-        return
+        return share
     left, variance = positive_normal(z)
     mean += Ph * ((left - z) / sd)
     cov -= np.outer(Ph, Ph) * ((1.0 - variance) / sd**2)
+    return share
 
 
 def modes_of(mixture: Mixture, risk: float) -> tuple[TrackMode, ...]:

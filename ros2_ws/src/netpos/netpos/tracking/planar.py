@@ -219,17 +219,15 @@ class PlanarEstimator(Estimator):
         return result._replace(breaks=breaks)
 
     def _keep_in_front(self, epoch_rows: EpochRows, accepted: Sequence[float]) -> None:
-        """Take away what is behind an array that hears the device, where the mean is there."""
+        """Take away what is behind an array that hears the device."""
         estimate = self._there()
         for item, taken in zip(epoch_rows.items, accepted, strict=True):
             if not taken or not isinstance(item, RsuMeasurement):
                 continue
             rsu = self._rsus[item.rsu_id]
-            dx, dy = (estimate.mean[POSITION] - rsu.info.position[:2]).tolist()
-            if rsu.cone and not rsu.in_front(dx, dy):
+            if rsu.cone:
                 across = math.hypot(rsu.axes[0], rsu.axes[1])
-                origin, front = rsu.info.position[:2], rsu.axes[:2] / across
-                estimate.adjust(estimates.cut_off_behind, origin, front)
+                estimate.keep_in_front(rsu.info.position[:2], rsu.axes[:2] / across)
 
     def learn(
         self, stamp_ns: int, rows: Array, accepted: Sequence[float]

@@ -6,11 +6,13 @@ import math
 
 import numpy as np
 import pytest
+from netpos.estimation.mixture.gaussians import Mixture
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.estimates import cut_off_behind
+from netpos.tracking.estimates import cut_off_behind, start_from
 from netpos.tracking.rsus import Rsu
 from netpos.tracking.tracker import Tracker
+from scipy.stats import norm, truncnorm
 
 WALLS = {"west": (0.0, 0.0, 0.0), "north": (3.0, 3.0, -90.0), "south": (3.0, -3.0, 90.0)}
 SD = 0.05
@@ -29,6 +31,28 @@ def test_the_moments_are_those_of_the_samples_in_front(ahead_m: float) -> None:
     error_sd = np.sqrt(np.diag(np.cov(kept.T)) / len(kept))
     assert (np.abs(mean - kept.mean(axis=0)) < 5.0 * error_sd).all()
     np.testing.assert_allclose(cov, np.cov(kept.T), atol=0.05 * np.abs(cov).max())
+
+
+def test_each_component_is_cut_and_counts_by_what_is_in_front() -> None:
+    """One component is behind, one in front, and a third so far behind that it is out; then the
+    mean is in front, and nothing more happens."""
+    ahead, sd = np.array([-0.5, 1.0, -9.0]), 0.8
+    means = np.zeros((3, 6))
+    means[:, 0] = ahead
+    covs = np.stack([sd**2 * np.eye(6)] * 3)
+    estimate = start_from(TrackerConfig(), 0, Mixture(means, covs, np.log(np.full(3, 1.0 / 3.0))))
+    estimate.keep_in_front(np.zeros(2), np.array([1.0, 0.0]))
+    found = estimate.components
+    share = norm.cdf(ahead[0] / sd)
+    weights = np.exp(found.log_weights)
+    np.testing.assert_allclose(weights[:2], np.array([share, 1.0]) / (share + 1.0), rtol=1e-9)
+    assert weights[2] < 1e-20
+    left = truncnorm(-ahead[0] / sd, np.inf, ahead[0], sd)
+    np.testing.assert_allclose(found.means[:2, 0], [left.mean(), 1.0])
+    np.testing.assert_allclose(found.covs[:2, 0, 0], [left.var(), sd**2])
+    np.testing.assert_allclose(estimate.mean[0], weights @ found.means[:, 0])
+    estimate.keep_in_front(np.zeros(2), np.array([1.0, 0.0]))
+    np.testing.assert_array_equal(estimate.components.log_weights, found.log_weights)
 
 
 @pytest.mark.parametrize(("ahead_sd", "cut"), [(-4.9, True), (-5.1, False), (-40.0, False)])
