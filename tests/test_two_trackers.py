@@ -52,16 +52,16 @@ def test_two_trackers_of_one_name_of_a_device(graph: Graph, tmp_path: Path) -> N
               "-p", "subscribers:=1"),
     ]  # fmt: skip
     told = graph.collect("/diagnostics", DiagnosticArray)
-    measured = {}
+    infos, measured = {}, {}
     for site, topic in (("site_a", "rsu/measurements"), ("site_b", "uwb/ranges")):
-        infos = graph.publisher(f"/{site}/rsu/info", RsuInfoMessage, LATCHED)
+        infos[site] = graph.publisher(f"/{site}/rsu/info", RsuInfoMessage, LATCHED)
         for name, (x, y) in PLACES.items():
             place = np.array([x + (SHIFT_M if site == "site_b" else 0.0), y, 0.0])
-            infos.publish(CODEC.rsu_info_to_msg(RsuInfo(rsu_id=name, position=place)))
+            infos[site].publish(CODEC.rsu_info_to_msg(RsuInfo(rsu_id=name, position=place)))
         measured[site] = graph.publisher(f"/{site}/{topic}", RsuMeasurement)
     for site, heard_by in (("site_a", 2), ("site_b", 1)):  # the recorder hears site_a, too
-        publisher = measured[site]
-        wait_until(lambda p=publisher, n=heard_by: p.get_subscription_count() >= n, site, 60.0)
+        for publisher in (infos[site], measured[site]):
+            wait_until(lambda p=publisher, n=heard_by: p.get_subscription_count() >= n, site, 60.0)
     for k in range(EPOCHS):
         for name in PLACES:
             for publisher in measured.values():
