@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import log_ndtr
@@ -236,13 +236,21 @@ class Estimate:
             self._learned = resized(self._learned, self.mean.size)
         self._make_room(self._rows)
 
-    def adjust(self, change: Callable[..., None], *arguments: Any) -> None:
-        """Have ``change(mean, cov, *arguments)`` change both in place; nothing happens to several
-        components."""
-        if self._components is None:
-            cov = self.cov.copy()
-            change(self.mean, cov, *arguments)
-            self._cov_or_sqrt = engine.to_cov_or_sqrt(cov, self._options)
+    def change_prior(self, index: int, before: float, after: float) -> None:
+        """Take the state ``index``, whose prior had mean 0 and sd ``before``, for one of sd
+        ``after``: a measurement of 0 with the information gained, or noise of the variance gained.
+        Nothing happens to several components."""
+        if self._components is not None:
+            return
+        cov, gained = self.cov.copy(), after * after - before * before
+        if gained >= 0.0:
+            cov[index, index] += gained
+        else:
+            h = np.zeros(self.mean.size)
+            h[index] = 1.0
+            variance = after * after * before * before / -gained
+            fuse_value(self.mean, cov, h, -self.mean[index], variance)
+        self._cov_or_sqrt = engine.to_cov_or_sqrt(cov, self._options)
 
     def keep_in_front(self, origin: Array, front: Array) -> None:
         """Where the mean is behind the line through ``origin`` (2,) m with ``front`` (2,), of unit
@@ -322,24 +330,13 @@ def _augmented(mixture: Mixture, sd: Array) -> Mixture:
     return Mixture(means, covs, mixture.log_weights)
 
 
-def change_prior(mean: Array, cov: Array, index: int, before: float, after: float) -> None:
-    """Take a state whose prior had mean 0 and sd ``before`` for one of sd ``after``, in place: a
-    measurement of 0 with the information gained, or noise of the variance gained."""
-    gained = after * after - before * before
-    if gained >= 0.0:
-        cov[index, index] += gained
-        return
-    h = np.zeros(mean.size)
-    h[index] = 1.0
-    fuse_value(mean, cov, h, -mean[index], after * after * before * before / -gained)
-
-
 def cut_off_behind(mean: Array, cov: Array, origin: Array, front: Array) -> float:
     """Moments of a Gaussian without what is behind a line, in place: mean (n,), covariance (n, n);
     the line through ``origin`` (2,) m, with ``front`` (2,), of unit length, across it (Simon and
-    Simon 2010, eq. 13 to 20 for one constraint). The log of the share in front of it. Nothing
-    else happens where the mean is more than ``_FARTHEST_BEHIND_SD`` behind it: that contradicts
-    the estimate, it does not cut it."""
+    Simon 2010, eq. 13 to 20 for one constraint). Nothing changes where the mean is more than
+    ``_FARTHEST_BEHIND_SD`` behind it: that contradicts the estimate, it does not cut it.
+
+    Returns the log of the share of the Gaussian in front of the line."""
     Ph = cov[:, POSITION] @ front
     sd = math.sqrt(float(front @ Ph[POSITION]))
     z = float(front @ (mean[POSITION] - origin)) / sd

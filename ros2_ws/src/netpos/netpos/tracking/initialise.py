@@ -41,7 +41,7 @@ from netpos.estimation.measurement import (
 )
 from netpos.estimation.mixture.gaussians import Mixture, mode_of
 from netpos.estimation.mixture.reduction import reduced
-from netpos.estimation.mixture.ridge import Fit, components_of, inverse, whole
+from netpos.estimation.mixture.ridge import Fit, components_of, inverse
 from netpos.estimation.mixture.ring import RING_MERGE_COST
 from netpos.estimation.mixture.window import Window, normal_equations
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
@@ -59,7 +59,6 @@ _ATTEMPT_NS = 100_000_000
 # cannot be told apart are waited for from the same share on, and carried along below it.
 _RIVAL_COST, _RIVAL_SHARE = 9.21, 0.01
 _CONTRADICTS = 9.0  # mean squared residual over variance
-_UNLIKELY_LOG = -15.0  # of a case that is not looked at
 _NEAREST_M = 1.0
 _HEADINGS = 16
 _HEADING_SD_MAX = 0.5
@@ -85,11 +84,6 @@ class _Solution(NamedTuple):
     problem: Problem
     fits: list[Fit]
     log_odds: float = 0.0
-
-    @property
-    def log_weight(self) -> float:
-        """Of the best minimum as one Gaussian."""
-        return self.log_odds + whole(self.fits[0]).log_weight
 
     def mixture(self, misfit: float, n: int, is_possible: Callable[[Array], bool]) -> Mixture:
         """The posterior of the first ``n`` states; a ``misfit`` above 1 enlarges all variances."""
@@ -184,31 +178,21 @@ class Initialiser:
             return None
         self._next_attempt_ns = newest + _ATTEMPT_NS
         rows, ages = self._stacked()
-        solutions = [self._solution(rows, ages)]
-        fits = solutions[0].fits
-        if fits and not self._consistent(fits[0], len(rows)):
-            solutions = self._without_one(rows, ages) or solutions
-        if not fits:
+        agreed = self._solution(rows, ages)
+        if not agreed.fits:
             self.missing = f"no place in front of the RSUs fits {self._heard(rows)}"
             return None
+        solutions, agrees = [agreed], self._consistent(agreed.fits[0], len(rows))
+        if not agrees:
+            solutions = self._without_one(rows, ages) or solutions
         cost, _, cov = solutions[0].fits[0]
-        misfit = max(1.0, cost / max(len(rows), 1))
-        sd_m = math.sqrt(float(np.linalg.eigvalsh(cov[:2, :2])[-1]))
-        limit_m = self._config.initial_position_sd_max_m
-        if sd_m > limit_m and misfit < _CONTRADICTS:
-            self.missing = (
-                f"{self._heard(rows)} leave a position sd of {sd_m:.1f} m "
-                f"(initial_position_sd_max_m: {limit_m:g}); another RSU or quantity is needed"
-            )
+        misfit = max(1.0, cost / len(rows))
+        lacks = self._lacks(rows, cov, misfit)
+        if lacks:
+            self.missing = lacks
             return None
-        if sd_m * math.sqrt(misfit) > limit_m:
-            self.missing = (
-                f"{self._heard(rows)} contradict each other by {math.sqrt(misfit):.3g} sd; are"
-                " they in m, rad and s, and the RSUs where RsuInfo says?"
-            )
-            return None
-        if self._config.isolate_rsus and self._consistent(fits[0], len(rows)):
-            solutions += self._one_errs(rows, ages, solutions[0])
+        if agrees and self._config.isolate_rsus:
+            solutions += self._one_errs(rows, agreed.problem)
         n = self._states
         mixture = joined([s.mixture(misfit, n, self._plausible) for s in solutions])
         waited_s = (newest - self._window[0][0]) * 1e-9
@@ -217,6 +201,22 @@ class Initialiser:
             self.missing = f"more than one place fits {self._heard(rows)}; waiting for more"
             return None
         return mixture
+
+    def _lacks(self, rows: Array, cov: Array, misfit: float) -> str:
+        """What a fit of the covariance ``cov`` lacks, for people; empty where it lacks nothing."""
+        sd_m = math.sqrt(float(np.linalg.eigvalsh(cov[:2, :2])[-1]))
+        limit_m = self._config.initial_position_sd_max_m
+        if sd_m > limit_m and misfit < _CONTRADICTS:
+            return (
+                f"{self._heard(rows)} leave a position sd of {sd_m:.1f} m "
+                f"(initial_position_sd_max_m: {limit_m:g}); another RSU or quantity is needed"
+            )
+        if sd_m * math.sqrt(misfit) > limit_m:
+            return (
+                f"{self._heard(rows)} contradict each other by {math.sqrt(misfit):.3g} sd; are"
+                " they in m, rad and s, and the RSUs where RsuInfo says?"
+            )
+        return ""
 
     def excess_cost(self, stamp_ns: int, mean: Array, var: Array) -> float:
         """How much worse the window fits where the device is at ``mean`` (6,), with variances
@@ -265,7 +265,7 @@ class Initialiser:
         three RSUs."""
         placed = wrong_rsu.placed(rows)
         origins = np.unique(rows[placed, ORIGIN:AXES], axis=0)
-        if len(origins) < 3:
+        if len(origins) < wrong_rsu.FEWEST:
             return []
         solutions = []
         for origin in origins:
@@ -276,16 +276,13 @@ class Initialiser:
                 solutions.append(others._replace(fits=fits))
         return sorted(solutions, key=lambda solution: solution.fits[0][0])
 
-    def _one_errs(self, rows: Array, ages: Array, agreed: _Solution) -> list[_Solution]:
-        """Solutions in which one of the RSUs errs grossly, of at least three, where that is not
-        too unlikely beside the one in which all of them agree."""
+    def _one_errs(self, rows: Array, problem: Problem) -> list[_Solution]:
+        """Solutions in which one of the RSUs errs grossly, of at least three."""
         found = []
-        for case in wrong_rsu.cases(*agreed.problem):
-            problem = Problem(case.window, case.prior, case.prior_var)
-            one = _Solution(problem, self._fits(rows, problem), case.log_odds)
-            if one.fits and one.log_weight > agreed.log_weight + _UNLIKELY_LOG:
-                found.append(one)
-        return found
+        for case in wrong_rsu.cases(*problem):
+            changed = Problem(case.window, case.prior, case.prior_var)
+            found.append(_Solution(changed, self._fits(rows, changed), case.log_odds))
+        return [solution for solution in found if solution.fits]
 
     def _problem(self, rows: Array, ages: Array) -> Problem:
         cfg = self._config

@@ -239,7 +239,7 @@ class PlanarEstimator(Estimator):
         height_m = self._config.device_height_m
         concluded, changes = biases.learn(stamp_ns, fitted, estimate.likeliest, height_m)
         for change in changes:
-            estimate.adjust(estimates.change_prior, *change)
+            estimate.change_prior(*change)
         self.bias = biases.arrays()
         if not concluded:
             return ()

@@ -19,9 +19,11 @@ from netpos.messages.values import Array
 
 Flags = npt.NDArray[np.bool_]
 
+FEWEST = 3
+"""RSUs of which one may be wrong: of two nobody can tell."""
+
 _WRONG = 0.01  # probability
 _GROSS_SD = 30.0
-_FEWEST = 3  # RSUs: of two nobody can tell
 _SAME_M = 1e-3  # RSUs nearer to each other are one
 
 
@@ -49,7 +51,7 @@ def cases(window: Window, prior: Array, prior_var: Array) -> Iterator[Case]:
     origins = window.rows[:, ORIGIN : ORIGIN + 2]
     every = np.vstack([origins[own], references[np.isfinite(references[:, 0])]])
     places = np.unique(np.round(every / _SAME_M), axis=0) * _SAME_M
-    if len(places) < _FEWEST:
+    if len(places) < FEWEST:
         return
     for place in places:
         rows, states, variances = window.rows.copy(), prior, prior_var

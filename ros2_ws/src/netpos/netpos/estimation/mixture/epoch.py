@@ -57,7 +57,7 @@ from netpos.estimation.mixture.turns import (
     may_turn,
     turn,
 )
-from netpos.estimation.motion import Parameter
+from netpos.estimation.motion import Parameter, add_velocity_step
 from netpos.estimation.predicted import note_innovations, predict_rows
 from netpos.estimation.protection import (
     FusedEpoch,
@@ -142,15 +142,16 @@ def _add_candidates(
     other sector of a phase in the row ``at`` and each explanation of what is refused; the number
     of candidates then. ``work`` keeps the rows as the component sees them."""
     mean, cov, rows = prior.means[k], prior.covs[k], epoch.rows
-    opens = options.models > 1 or options.manoeuvre_speed_sd <= 0.0
+    refused = epoch.rejected_in_row >= options.inflate_after
+    opens = refused and (options.models > 1 or options.manoeuvre_speed_sd <= 0.0)
     if at >= 0:
         end = add_turns_of_phase(k, end, prior, rows, at, options, found)
         predicted = predicted_in(work, mean.size, rows.shape[0])
         predict_rows(mean, cov, rows, options.height_m, predicted)
     else:
         found.means[k], found.covs[k] = mean, cov
-        if opens:
-            mixing.open_velocity(k, epoch, options, found)
+        if opens:  # no other component allows for a turn
+            add_velocity_step(options.initial_speed_sd, epoch.unheard_s, 0.0, found.covs[k])
         apply(k, prior.log_weights[k], rows, options, found, work)
     if opens and found.used[k] == 0:
         found.covs[k] = cov

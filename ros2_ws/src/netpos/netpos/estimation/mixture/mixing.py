@@ -2,7 +2,7 @@
 and Bar-Shalom 1988; Bar-Shalom, Li and Kirubarajan 2001, section 11.6). Everything works in place.
 
 What a component does at a measurement, and what its likelihood makes of its weight, is the same as
-for all other components (``epoch``). No other component has its velocity opened, none is merged.
+for all other components (``epoch``). None is merged.
 """
 
 from __future__ import annotations
@@ -12,10 +12,7 @@ import math
 import numpy as np
 
 from netpos.estimation.compile import kernel
-from netpos.estimation.engine import EpochInput, FilterOptions
-from netpos.estimation.mixture.candidates import Candidates
 from netpos.estimation.mixture.gaussians import Mixture, combine
-from netpos.estimation.motion import add_velocity_step
 from netpos.messages.values import Array
 
 # No model is ever ruled out: its way back would take this many e-folds less.
@@ -73,14 +70,6 @@ def keep_alive(weights: Array) -> None:
     for k in range(weights.size):
         weights[k] = max(weights[k] / total, _LEAST_WEIGHT)
     weights /= weights.sum()
-
-
-@kernel
-def open_velocity(k: int, epoch: EpochInput, options: FilterOptions, found: Candidates) -> None:
-    """Open the velocity of the candidate ``k`` after ``inflate_after`` epochs rejected in a row:
-    no other component has it where models interact or no manoeuvre is declared."""
-    if epoch.rejected_in_row >= options.inflate_after:
-        add_velocity_step(options.initial_speed_sd, epoch.unheard_s, 0.0, found.covs[k])
 
 
 @kernel

@@ -37,9 +37,7 @@ _SAME2 = 9.0  # squared Mahalanobis distance within which a minimum belongs to a
 _PLACE = slice(POSITION.start, VELOCITY.stop)
 
 
-class Piece(NamedTuple):
-    """A component; its log weight is not normalised."""
-
+class _Piece(NamedTuple):
     log_weight: float
     mean: Array
     cov: Array
@@ -61,13 +59,13 @@ def components_of(
 
     is_possible : whether the device may be in a state; components that are not are left out
     """
-    pieces: list[Piece] = []
+    pieces: list[_Piece] = []
     for fit in fits:
         if fit[0] <= fits[0][0] + _COST_MAX and not _is_known(fit[1], pieces):
             limit = fits[0][0] + _COST_MAX
             pieces += [p for p in _along(equations, fit, limit) if is_possible(p.mean)]
     if not pieces:
-        pieces = [whole(fits[0])]
+        pieces = [_whole(fits[0])]
     return Mixture(
         np.array([p.mean for p in pieces]),
         np.array([p.cov for p in pieces]),
@@ -89,13 +87,13 @@ def _log_det(cov: Array) -> float:
     return float(2.0 * np.log(sd).sum() + np.linalg.slogdet(cov / np.outer(sd, sd))[1])
 
 
-def whole(fit: Fit) -> Piece:
+def _whole(fit: Fit) -> _Piece:
     """A minimum as one Gaussian."""
     cost, mean, cov = fit
-    return Piece(-0.5 * cost + 0.5 * _log_det(2.0 * math.pi * cov), mean, cov)
+    return _Piece(-0.5 * cost + 0.5 * _log_det(2.0 * math.pi * cov), mean, cov)
 
 
-def _is_known(state: Array, pieces: list[Piece]) -> bool:
+def _is_known(state: Array, pieces: list[_Piece]) -> bool:
     """Whether a minimum lies within a component there is."""
     for piece in pieces:
         away = state[_PLACE] - piece.mean[_PLACE]
@@ -129,7 +127,7 @@ def _axis(cov: Array) -> tuple[float, Array, Array, float]:
     return math.sqrt(values[1]), u, follows, math.sqrt(max(values[0], 0.0))
 
 
-def _along(equations: Equations, fit: Fit, cost_max: float) -> list[Piece]:
+def _along(equations: Equations, fit: Fit, cost_max: float) -> list[_Piece]:
     """Components of the arc through a minimum; one where it is straight."""
     sd, u, follows, across = _axis(fit[2])
     bend, differs = 0.0, False
@@ -141,7 +139,7 @@ def _along(equations: Equations, fit: Fit, cost_max: float) -> list[Piece]:
         differs |= abs(cost - fit[0] - 1.0) > _UNEVEN
     is_bent = 0.5 * bend**2 * sd**4 > CURVATURE_SHARE * across**2
     if not is_bent and not differs:
-        return [whole(fit)]
+        return [_whole(fit)]
     short = min(
         math.sqrt(math.sqrt(2.0 * CURVATURE_SHARE) * across / max(abs(bend), 1e-9)), 0.5 * sd
     )
@@ -153,9 +151,9 @@ def _along(equations: Equations, fit: Fit, cost_max: float) -> list[Piece]:
 
 def _one_way(
     equations: Equations, fit: Fit, towards: Array, short: float, cost_max: float
-) -> list[Piece]:
+) -> list[_Piece]:
     """Components of the sd ``short`` along the arc that leaves a minimum ``towards`` (2,)."""
-    pieces: list[Piece] = []
+    pieces: list[_Piece] = []
     state, cov = fit[1], fit[2]
     for _ in range(_PIECES_MAX):
         _, u, follows, _ = _axis(cov)
@@ -172,9 +170,9 @@ def _one_way(
     return pieces
 
 
-def _piece(equations: Equations, line: _Line, start: Array) -> Piece:
+def _piece(equations: Equations, line: _Line, start: Array) -> _Piece:
     """The product of the posterior and of a Gaussian along the arc, times their spacing."""
-    product = whole(_minimum(equations, line, start))
-    return product._replace(
-        log_weight=product.log_weight + math.log(SPACING_SD / math.sqrt(2.0 * math.pi))
+    whole = _whole(_minimum(equations, line, start))
+    return whole._replace(
+        log_weight=whole.log_weight + math.log(SPACING_SD / math.sqrt(2.0 * math.pi))
     )

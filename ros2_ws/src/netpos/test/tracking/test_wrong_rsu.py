@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from first_fix import at, fix_of, measure, rsu
+from netpos.estimation.measurement import VALUE
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.initialise import Initialiser
@@ -50,10 +51,10 @@ def test_ranges_of_which_one_may_be_wrong(sites: int, late_sd: float) -> None:
     rows = np.vstack(
         [measure(s, at(*PLACE), Field.RANGE, group=i) for i, s in enumerate(stations)]
     )
-    rows[1, 1] += late_sd * SD_M
+    rows[1, VALUE] += late_sd * SD_M
     seen = distances(PLACE[None], sites)[0]
     seen[1] += late_sd * SD_M
-    np.testing.assert_allclose(rows[:, 1], seen)
+    np.testing.assert_allclose(rows[:, VALUE], seen)
     initialiser = Initialiser(config)
     initialiser.add(T0, rows, np.zeros(len(rows)), tuple(stations))
     fix = fix_of(initialiser)
