@@ -43,21 +43,22 @@ PAPERS: dict[str, tuple[Experiment, ...]] = {
 
 
 def figures(runs: pd.DataFrame) -> dict[str, float]:
-    """Of all runs of one experiment and estimator together."""
-    weights = runs["n"].to_numpy(dtype=float)
+    """Of all runs of one experiment and estimator together; a run without a scored estimate counts
+    in availability, lost tracks and unscored time only."""
+    scored = runs[runs["n"] > 0]
+    weights = scored["n"].to_numpy(dtype=float)
 
-    def mean(name: str) -> float:
-        values = runs[name].to_numpy(dtype=float)
-        there = np.isfinite(values) & (weights > 0.0)
-        return float(np.average(values[there], weights=weights[there]))
+    def mean(values: pd.Series) -> float:
+        return float(np.average(values.to_numpy(dtype=float), weights=weights))
 
     return {
-        "rmse_m": float(np.sqrt(np.average(np.square(runs["rmse_m"]), weights=weights))),
-        "max_m": float(runs["max_m"].max()),
-        "nees_mean": mean("nees_mean"),
+        "rmse_m": mean(scored["rmse_m"] ** 2) ** 0.5,
+        "max_m": float(scored["max_m"].max()),
+        "nees_mean": mean(scored["nees_mean"]),
         "availability": float(runs["availability"].mean()),
+        "unscored_s": float(runs["unscored_s"].sum()),
         "lost_tracks": float(runs["lost_tracks"].sum()),
-        "protection_exceeded": mean("protection_exceeded"),
+        "protection_exceeded": mean(scored["protection_exceeded"]),
     }
 
 
