@@ -4,10 +4,11 @@
     python scripts/oracle_metis.py [--runs 30] [--first-seed 1] [--particles 1000]
         [--estimator scenario|defaults] [--experiment one_rsu|strong|turn] [--json FILE]
 
-Both get the same measurements, start and parameters of the model: white acceleration, and velocity
-steps as often as the tracker's manoeuvres. The vehicle itself drives along streets and turns by 90
-degrees: so the particle filter says what this model can reach, not what is possible. ``turn`` is
-Fig. 6 without an IMU. Exit 0 done, 1 a file could not be written, 2 bad usage.
+Both get the same measurements, start and parameters of the model: white acceleration, and turns
+and other velocity steps as often as the tracker's manoeuvres. The vehicle itself drives along
+streets and turns by 90 degrees: so the particle filter says what this model can reach, not what is
+possible. ``turn`` is Fig. 6 without an IMU.
+Exit 0 done, 1 a file could not be written, 2 bad usage.
 """
 
 from __future__ import annotations
@@ -26,6 +27,11 @@ from scipy.constants import speed_of_light
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "ros2_ws/src/netpos/test/support"))
 
+from netpos.estimation.manoeuvre import (  # noqa: E402
+    TURN_ANGLE_SD,
+    TURN_SIZES,
+    TURN_SPEED_SD,
+)
 from netpos.estimation.measurement import (  # noqa: E402
     AXES,
     KIND,
@@ -98,6 +104,9 @@ def motion_of(config: TrackerConfig) -> StepMotion:
         accel=config.accel_density_mps2_sqrthz,
         steps_hz=TURNS_HZ,
         step_sd=config.manoeuvre_sd_mps,
+        to_sides=TURN_SIZES,
+        turn_speed_sd=TURN_SPEED_SD,
+        turn_angle_sd=TURN_ANGLE_SD,
         clock=(c * config.clock_white_density, c * config.clock_walk_density),
     )
 

@@ -4,22 +4,30 @@ A device that turns leaves its prediction slowly at first. Until a measurement f
 filter follows in part, in the directions that are measured, and goes on straight in the others.
 The step of the velocity lies anywhere in the time in which it stays unnoticed, not in the last
 interval.
+
+Most devices that turn keep their speed and turn to a side, where a street or a corridor crosses
+theirs. What is declared says how large steps are; those as large as such a turn are turns.
 """
 
 from __future__ import annotations
 
 import math
 
-from netpos.estimation.compile import leaf
+import numpy as np
+
+from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.factor import eigenvalues
 from netpos.estimation.measurement import GATE_VARIANCE
 from netpos.estimation.motion import add_velocity_step
 from netpos.estimation.predicted import PredictedRows
-from netpos.estimation.state import X
+from netpos.estimation.state import POSITION, VELOCITY, X
 from netpos.messages.values import Array
 
 # The filter follows a manoeuvre as long as its gate passes it, so that it is noticed later.
 _FOLLOWED = 2.0
+TURN_SIZES = 0.7  # width of the steps that turns are, over their mean
+TURN_ANGLE_SD = math.radians(25.0)
+TURN_SPEED_SD = 0.25  # of the speed
 
 
 @leaf
@@ -95,3 +103,35 @@ def add_manoeuvre(speed: float, within_s: float, cov: Array) -> None:
     ``within_s`` seconds, and the position it led to."""
     time_s, position_sd = manoeuvre_moments(speed, within_s)
     add_velocity_step(speed, time_s, position_sd, cov)
+
+
+@leaf
+def side_turns(mean: Array, speed_sd: float) -> float:
+    """Probability that a manoeuvre of a device with the state mean (n,) is such a turn: as many
+    steps of sd ``speed_sd`` [m/s] per axis are about as large (Rayleigh's density)."""
+    speed2 = mean[X.VX] * mean[X.VX] + mean[X.VY] * mean[X.VY]
+    ratio2 = 2.0 * speed2 / (speed_sd * speed_sd)
+    return float(TURN_SIZES * ratio2 * math.exp(-0.5 * ratio2))
+
+
+@kernel
+def turn_to_side(side: float, within_s: float, mean: Array, cov: Array) -> None:
+    """Turn the state mean (n,), cov (n, n), in place, by about 90 degrees to the left (``side`` 1)
+    or right (-1) at any time of the last ``within_s`` seconds: by its moments."""
+    age_s, n = within_s / 2.0, mean.size
+    turned = np.array([[0.0, -side], [side, 0.0]])
+    change = turned - np.eye(2)
+    F = np.eye(n)
+    F[VELOCITY, VELOCITY] = turned
+    F[POSITION, VELOCITY] = age_s * change
+    step = change @ mean[VELOCITY]
+    step2 = np.outer(step, step) + change @ cov[VELOCITY, VELOCITY].copy() @ change.T
+    mean[:] = F @ mean
+    along, across = mean[VELOCITY], turned @ mean[VELOCITY]
+    spread = TURN_SPEED_SD**2 * np.outer(along, along)
+    spread += TURN_ANGLE_SD**2 * np.outer(across, across)
+    cov[:] = F @ cov @ F.T
+    cov[VELOCITY, VELOCITY] += spread
+    cov[POSITION, VELOCITY] += age_s * spread
+    cov[VELOCITY, POSITION] += age_s * spread
+    cov[POSITION, POSITION] += within_s**2 * (spread / 3.0 + step2 / 12.0)

@@ -71,7 +71,7 @@ def _log_odds(prior: float) -> float:
 
 
 @leaf
-def _mixed(probability: float, mean: float, variance: float) -> tuple[float, float, float]:
+def mixed(probability: float, mean: float, variance: float) -> tuple[float, float, float]:
     """Mean and variance of an excess that is 0 with probability 1 - ``probability``."""
     spread = probability * (1.0 - probability) * mean * mean
     return probability, probability * mean, probability * variance + spread
@@ -117,7 +117,7 @@ def exponential_excess(
     z = innovation / sd - sd / mean_m
     probability = _probability(_log_odds(prior) + math.log(sd / mean_m) + _log_mills(z))
     mean, variance = positive_normal(z)
-    return _mixed(  # type: ignore[no-any-return]
+    return mixed(  # type: ignore[no-any-return]
         probability, sd * mean, innovation_var * variance
     )
 
@@ -186,7 +186,7 @@ def matching_cost(
     K' P^-1 K = A / (S R) with A = S - R.
     """
     known = (innovation_var - measurement_var) / (innovation_var * measurement_var)
-    _, _, together = _mixed(blocked, mean, variance)
+    _, _, together = mixed(blocked, mean, variance)
     return 0.5 * (math.log1p(known * together) - blocked * math.log1p(known * variance))
 
 

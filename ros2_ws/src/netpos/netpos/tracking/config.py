@@ -222,8 +222,9 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
         5.0,
         0.0,
         1e3,
-        "velocity step that a measurement which fails the gate may reveal; 0: none. Not with an"
-        " IMU, interacting models or filter kf",
+        "velocity step that a measurement which fails the gate may reveal; 0: none. A device about"
+        " as fast is expected to turn to a side at its speed. Not with an IMU, interacting models"
+        " or filter kf",
     )
     inflate_after_epochs: int = count(
         2, "epochs rejected in a row before the velocity opens to its initial sd"

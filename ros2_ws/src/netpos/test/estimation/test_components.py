@@ -14,6 +14,7 @@ from netpos.estimation.measurement import GROUP, VARIANCE, Kind
 from netpos.estimation.mixture import epoch as epochs
 from netpos.estimation.mixture.gaussians import (
     Mixture,
+    fuse_value,
     leaders,
     log_densities,
     mode_of,
@@ -21,7 +22,7 @@ from netpos.estimation.mixture.gaussians import (
     one_component,
 )
 from netpos.estimation.mixture.reduction import reduced
-from netpos.estimation.mixture.ring import RING_MERGE_COST, is_wide, split_along_ring
+from netpos.estimation.mixture.ring import RING_MERGE_COST, cut_along_ring, is_wide
 from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.rows import linear_rows
 from netpos.messages.values import Array
@@ -52,6 +53,15 @@ def after(parts: Mixture, *rows: Array) -> tuple[Mixture, int]:
     return found.components, found.used
 
 
+def along_ring(x: Array, P: Array, measured: Array) -> Mixture:
+    """The prior, cut along the ring of the row ``measured``, with that fused."""
+    pieces = cut_along_ring(x, P, measured, 0.0)
+    means, covs, logs = (part.copy() for part in pieces.components)
+    for k, (h, innovation) in enumerate(zip(pieces.H, pieces.innovation, strict=True)):
+        logs[k] += fuse_value(means[k], covs[k], h, innovation, measured[VARIANCE])
+    return Mixture(means, covs, logs)
+
+
 def on_grid(
     x: Array, P: Array, rows: list[Array], reach_m: float, step_m: float
 ) -> tuple[float, Array, Array]:
@@ -79,7 +89,7 @@ def test_a_ring_is_the_product_of_prior_and_range(
     """Evidence and moments of the position, also where the prior lies on the RSU."""
     x, P = prior(centre, sd)
     measured = row(Kind.RANGE, 15.0, 0.3**2)
-    parts = split_along_ring(x, P, measured, 0.0)
+    parts = along_ring(x, P, measured)
     evidence, mean, cov = on_grid(x, P, [measured], 30.0, 0.1)
     assert np.exp(parts[2]).sum() == pytest.approx(evidence, rel=0.03)
     parts = Mixture(parts[0], parts[1], parts[2] - np.log(np.exp(parts[2]).sum()))
@@ -93,14 +103,14 @@ def test_a_ring_is_the_product_of_prior_and_range(
 def test_a_ring_without_a_radius_is_finite(measured_m: float) -> None:
     """A range of nothing, and one that biases would have to make longer."""
     x, P = prior((5.0, 0.0), (8.0, 8.0))
-    for part in split_along_ring(x, P, row(Kind.RANGE, measured_m, 0.2**2), 0.0):
+    for part in along_ring(x, P, row(Kind.RANGE, measured_m, 0.2**2)):
         assert np.isfinite(part).all()
 
 
 def test_the_other_states_follow_the_position() -> None:
     """A velocity that hangs together with the position is told by it, component by component."""
     x, P = prior((14.0, 0.0), (6.0, 6.0), rho=0.8)
-    means, covs, logs = split_along_ring(x, P, row(Kind.RANGE, 15.0, 0.3**2), 0.0)
+    means, covs, logs = along_ring(x, P, row(Kind.RANGE, 15.0, 0.3**2))
     gain = P[2:4, :2] @ np.linalg.inv(P[:2, :2])
     np.testing.assert_allclose(means[:, 2:4] - x[2:4], (means[:, :2] - x[:2]) @ gain.T, atol=1e-9)
     rest = P[2:4, 2:4] - gain @ P[:2, 2:4]
@@ -282,18 +292,16 @@ def test_an_outlier_leaves_the_wide_prior_as_it_was_with_its_weight() -> None:
 
 
 @pytest.mark.parametrize(
-    ("blocked", "distance", "sd", "wide"),
+    ("distance", "sd", "wide"),
     [
-        # range sd 0.2 m at 30 m: 0.5 (sd^2 / 30)^2 = 0.04 / 20 at sd = 1.377 m,
-        (0.0, 30.0, 1.37, False),
-        (0.0, 30.0, 1.38, True),
-        # and 0.04 / 4 at 2.06 m
-        (0.1, 30.0, 2.05, False),
-        (0.1, 30.0, 2.07, True),
-        (0.0, 30.0, 0.5, False),
-        (0.0, 1.0, 0.7, False),  # narrow, however it bends
+        # range sd 0.2 m at 30 m: 0.5 (sd^2 / 30)^2 = 0.04 / 20 at sd = 1.377 m
+        (30.0, 1.37, False),
+        (30.0, 1.38, True),
+        (30.0, 0.5, False),
+        (1.0, 0.7, False),  # narrow, however it bends
     ],
 )
+@pytest.mark.parametrize("blocked", [0.0, 0.1])
 def test_a_component_is_wide_where_the_tangent_costs_a_share_of_the_noise(
     blocked: float, distance: float, sd: float, wide: bool
 ) -> None:
@@ -365,10 +373,46 @@ def with_turn(cov: Array, within_s: float) -> Array:
     return total
 
 
+def passes(z: Array, mean: Array, cov: Array) -> bool:
+    off = z - H @ mean
+    return bool(off @ np.linalg.solve(H @ cov @ H.T + R, off) <= TURNING.gate_nis[2])
+
+
+def with_side_turn(mean: Array, cov: Array, side: float, within_s: float) -> tuple[Array, Array]:
+    """The velocity turned to a side at any time of the last ``within_s`` seconds, with a quarter
+    of the speed and 25 degrees more or less."""
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    left = np.array([[0.0, -side], [side, 0.0]])
+    way = left @ mean[2:4]
+    parts = []
+    for s in within_s * (nodes + 1.0) / 2.0:
+        F, G = np.eye(6), np.zeros((6, 2))
+        F[2:4, 2:4], F[:2, 2:4] = left, s * (left - np.eye(2))
+        for k, d in enumerate((0.25 * way, np.radians(25.0) * (left @ way))):
+            G[:2, k], G[2:4, k] = s * d, d
+        parts.append((F @ mean, F @ cov @ F.T + G @ G.T))
+    return moments(Mixture(*map(np.array, zip(*parts, strict=True)), np.log(weights / 2.0)))
+
+
+def turned_priors(x: Array, P: Array, within_s: float) -> list[tuple[float, Array, Array]]:
+    """Probability, mean and covariance: any step, and to either side."""
+    ratio2 = 2.0 * (x[2:4] @ x[2:4]) / 5.0**2
+    to_side = 0.35 * ratio2 * np.exp(-0.5 * ratio2)
+    if to_side < 0.005:
+        return [(1.0, x, with_turn(P, within_s))]
+    sides = [(to_side, *with_side_turn(x, P, side, within_s)) for side in (1.0, -1.0)]
+    return [(1.0 - 2.0 * to_side, x, with_turn(P, within_s)), *sides]
+
+
+@pytest.mark.parametrize("velocity", [(0.3, -0.2), (0.0, 4.0)])
 @pytest.mark.parametrize(("off_m", "unheard_s"), [(1.8, 0.4), (2.5, 0.4), (6.0, 3.0)])
-def test_a_refused_fix_is_an_outlier_a_tail_or_a_turn(off_m: float, unheard_s: float) -> None:
-    """Weights and moments of the three explanations, by the Kalman filter's own formulas."""
+def test_a_refused_fix_is_an_outlier_a_tail_or_a_turn(
+    off_m: float, unheard_s: float, velocity: tuple[float, float]
+) -> None:
+    """Weights and moments of the explanations, by the Kalman filter's own formulas; a fast device
+    may have turned to the side where the fix is."""
     x, P = prior((1.0, 2.0), (0.2, 0.3), rho=0.5)
+    x[2:4] = velocity
     P[2:4, 2:4] *= 0.25
     P[0:2, 2:4] *= 0.5
     P[2:4, 0:2] *= 0.5
@@ -381,16 +425,21 @@ def test_a_refused_fix_is_an_outlier_a_tail_or_a_turn(off_m: float, unheard_s: f
     within_s = max(unheard_s, delay_s)
     whitened = np.linalg.slogdet(np.linalg.cholesky(R))[1]  # rows are decorrelated fixes
     outlier = np.log(1e-2) - 2.0 * np.log(2.0 * np.pi)
-    tail, turn = updated(z, x, P), updated(z, x, with_turn(P, within_s))
-    logs = np.array([outlier, tail[0] + whitened, turn[0] + whitened + np.log(within_s / 30.0)])
-    weights = np.exp(logs - logs.max())
+    priors = turned_priors(x, P, within_s)
+    turns = [(share, *updated(z, m, C)) for share, m, C in priors if passes(z, m, C)]
+    assert (len(turns) > 1) is (velocity[0] == 0.0)
+    tail = updated(z, x, P)
+    logs = [outlier, tail[0] + whitened]
+    logs += [t[1] + whitened + np.log(t[0] * within_s / 30.0) for t in turns]
+    weights = np.exp(np.array(logs) - max(logs))
     weights /= weights.sum()
-    means, covs = np.array([x, tail[1], turn[1]]), np.array([P, tail[2], turn[2]])
+    means = np.array([x, tail[1], *(t[2] for t in turns)])
+    covs = np.array([P, tail[2], *(t[3] for t in turns)])
     mean, cov = moments(Mixture(means, covs, np.log(weights)))
     ours, our_cov = moments(found.components)
     np.testing.assert_allclose(ours, mean, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(our_cov, cov, rtol=1e-5, atol=1e-6)
-    assert found.turned == pytest.approx(weights[2], abs=1e-6)
+    assert found.turned == pytest.approx(weights[2:].sum(), abs=1e-6)
     assert found.within_s == pytest.approx(within_s)
     assert accepted[0] == (0.0 if np.argmax(weights) == 0 else 1.0)
 
@@ -415,9 +464,11 @@ def test_one_rsu_lets_a_turn_begin_every_quarter_of_a_second(since_s: float, beg
     assert found.begun is begins
     assert (found.components.log_weights.size > 1) is begins
     if begins:
-        wide = with_turn(P, since_s)
-        turn = updated(x[:2], x, wide)[0] - updated(x[:2], x, P)[0] + np.log(since_s / 30.0)
-        assert found.turned == pytest.approx(1.0 / (1.0 + np.exp(-turn)), rel=1e-6)
+        priors = turned_priors(x, P, since_s)
+        turned = sum(share * np.exp(updated(x[:2], m, C)[0]) for share, m, C in priors)
+        turned *= since_s / 30.0
+        straight = np.exp(updated(x[:2], x, P)[0])
+        assert found.turned == pytest.approx(turned / (turned + straight), rel=1e-6)
 
 
 @pytest.mark.parametrize("name", ["ekf", "iekf", "ukf", "srukf"])
@@ -483,9 +534,17 @@ def blocked_on_grid(
     return mean, (away * weight[:, None]).T @ away
 
 
+FAR = ((60.0, 0.0), (0.0, 60.0), (-40.0, -40.0))
+NEAR = ((6.0, 0.0), (0.0, 5.0), (-4.0, -5.0))  # a range is a ring to the prior
+
+
+@pytest.mark.parametrize(("sites", "apart_sd"), [(FAR, 0.15), (NEAR, 0.2)])
 @pytest.mark.parametrize("late_m", [(0.0, 0.0, 0.0), (2.5, 0.0, 0.0), (1.2, 0.0, 3.0)])
-def test_blocked_paths_against_the_grid(late_m: tuple[float, float, float]) -> None:
-    """A device known to 2 m, ranges of three anchors far away, the first of them late."""
+def test_blocked_paths_against_the_grid(
+    late_m: tuple[float, float, float], sites: tuple[tuple[float, float], ...], apart_sd: float
+) -> None:
+    """A device known to 2 m, ranges of three anchors, the first of them late. What is left near
+    the anchors: a piece of a ring is as wide at one end as at the other."""
     share, excess_m = 0.3, 2.0
     options = options_of(
         TrackerConfig(
@@ -498,7 +557,7 @@ def test_blocked_paths_against_the_grid(late_m: tuple[float, float, float]) -> N
     x, P = prior((1.0, -2.0), (2.0, 2.0))
     x[2:4] = 0.0
     truth, parts, rows = x[:2] + np.array([0.7, -0.5]), one_component(x, P), []
-    for origin, late in zip([(60.0, 0.0), (0.0, 60.0), (-40.0, -40.0)], late_m, strict=True):
+    for origin, late in zip(sites, late_m, strict=True):
         value = float(np.hypot(*(truth - origin))) + late
         rows.append(row(Kind.RANGE, value, 0.2**2, origin=np.array([*origin, 0.0])))
         epoch = EpochInput(0.0, 0.0, 0, np.array(rows[-1:]))
@@ -506,6 +565,6 @@ def test_blocked_paths_against_the_grid(late_m: tuple[float, float, float]) -> N
     found, found_cov = moments(parts)
     mean, cov = blocked_on_grid(x, P, rows, share, excess_m)
     off = found[:2] - mean
-    assert np.sqrt(off @ np.linalg.solve(cov, off) / 2.0) < 0.15
+    assert np.sqrt(off @ np.linalg.solve(cov, off) / 2.0) < apart_sd
     # The excess of a blocked path is exponential; a component takes its moments.
     assert np.trace(found_cov[:2, :2]) == pytest.approx(np.trace(cov), rel=0.4)

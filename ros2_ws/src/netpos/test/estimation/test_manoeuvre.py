@@ -7,7 +7,13 @@ import math
 import filter_rows
 import numpy as np
 import pytest
-from netpos.estimation.manoeuvre import add_manoeuvre, detection_delay_s, measures_velocity
+from netpos.estimation.manoeuvre import (
+    add_manoeuvre,
+    detection_delay_s,
+    measures_velocity,
+    side_turns,
+    turn_to_side,
+)
 from netpos.estimation.measurement import GATE_VARIANCE, Kind, curvature_variance, linearise
 from netpos.estimation.predicted import predicted_rows
 from netpos.estimation.rows import linear_rows
@@ -102,3 +108,44 @@ def test_a_velocity_too_uncertain_to_show_a_step_leaves_it_to_the_positions() ->
     both = delay_s(cov, with_both)
     np.testing.assert_allclose(both, alone, rtol=1e-6)
     assert delay_s(cov, velocities(1e6)) == (math.inf, math.inf)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_turn_to_a_side_has_the_moments_of_draws(side: float) -> None:
+    """Of states that turn by 90 degrees at any time, then 25 degrees and a quarter of the speed
+    more or less."""
+    rng, within_s, count = np.random.default_rng(7), 1.5, 400_000
+    cov = filter_rows.make_cov(rng, 6, 0.5)
+    mean, turned_cov = MEAN.copy(), cov.copy()
+    turn_to_side(side, within_s, mean, turned_cov)
+
+    draws = rng.multivariate_normal(MEAN, cov, count)
+    left = np.array([[0.0, -side], [side, 0.0]])
+    way = left @ MEAN[2:4]
+    velocity = draws[:, 2:4] @ left.T
+    velocity += np.outer(rng.normal(0.0, 0.25, count), way)
+    velocity += np.outer(rng.normal(0.0, math.radians(25.0), count), left @ way)
+    age = rng.uniform(0.0, within_s, (count, 1))
+    draws[:, :2] += age * (velocity - draws[:, 2:4])
+    draws[:, 2:4] = velocity
+    sd = np.sqrt(np.diag(turned_cov))
+    np.testing.assert_allclose(mean, draws.mean(axis=0), atol=0.01 * sd.max())
+    np.testing.assert_allclose(
+        turned_cov / np.outer(sd, sd), np.cov(draws.T) / np.outer(sd, sd), atol=0.015
+    )
+
+
+def test_turns_to_a_side_are_as_many_as_steps_of_their_size() -> None:
+    """Of steps drawn from what is declared, those within a third of the size of the turn, for a
+    device that is as fast as declared; hardly any for one that stands, or that is much faster: an
+    IMU shows such turns."""
+    steps = np.hypot(*np.random.default_rng(1).normal(0.0, SPEED, (2, 400_000)))
+    along = MEAN.copy()
+    for speed in (0.2 * SPEED, SPEED / math.sqrt(2.0), SPEED):
+        along[2:4] = speed, 0.0
+        size = math.sqrt(2.0) * speed
+        share = (np.abs(steps - size) < 0.35 * size).mean()
+        assert side_turns(along, SPEED) == pytest.approx(share, rel=0.06)
+    for speed in (0.0, 3.0 * SPEED):
+        along[2:4] = speed, 0.0
+        assert side_turns(along, SPEED) < 2e-3

@@ -34,10 +34,15 @@ _DRAWS = 4  # positions of a particle in the cloud
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepMotion(Motion):
-    """steps_hz: rate of velocity steps, of sd step_sd [m/s] per axis."""
+    """steps_hz: rate of velocity steps, of sd step_sd [m/s] per axis. to_sides: those
+    about as large as a turn, within this share of its size, turn the device by 90 degrees to
+    either side, but for a share turn_speed_sd of its speed and turn_angle_sd [rad]."""
 
     steps_hz: float = 0.0
     step_sd: float = 0.0
+    to_sides: float = 0.0
+    turn_speed_sd: float = 0.0
+    turn_angle_sd: float = 0.0
 
 
 class GaussianParticles:
@@ -130,18 +135,41 @@ class GaussianParticles:
             np.searchsorted(np.cumsum(p), (np.arange(count) + self._rng.random()) / count),
             p.size - 1,
         )
-        cov, variance = self.cov[parent].copy(), self._motion.step_sd**2
         after = duration * self._rng.random(count)
-        for axis in range(2):
-            cov[:, axis, axis] += variance * after**2
-            cov[:, axis, 2 + axis] -= variance * after
-            cov[:, 2 + axis, axis] -= variance * after
-            cov[:, 2 + axis, 2 + axis] += variance
-        self.mean = np.concatenate([self.mean, self.mean[parent]])
+        mean, cov = self.mean[parent], self.cov[parent]
+        ratio2 = 2.0 * np.square(mean[:, 2:4]).sum(axis=1) / self._motion.step_sd**2
+        sides = self._motion.to_sides * ratio2 * np.exp(-0.5 * ratio2)
+        side = np.where(self._rng.random(count) < 0.5, 1.0, -1.0)
+        side[self._rng.random(count) >= sides] = 0.0
+        mean, cov = self._stepped(mean, cov, after, side)
+        self.mean = np.concatenate([self.mean, mean])
         self.cov = np.concatenate([self.cov, cov])
         kept = np.log(p) + math.log1p(-share)
         self.log_weights = np.append(kept, np.full(count, math.log(share / count)))
         self._stepped_s = np.append(self._stepped_s, np.zeros(count))
+
+    def _stepped(self, mean: Array, cov: Array, after: Array, side: Array) -> tuple[Array, Array]:
+        """Means (K, 6) and covariances (K, 6, 6) that step ``after`` (K,) seconds, seen from
+        before: by any step, or to a ``side`` (K,)."""
+        motion, turned = self._motion, np.tile(np.eye(2), (side.size, 1, 1))
+        turned[side != 0.0] = 0.0
+        turned[:, 0, 1], turned[:, 1, 0] = -side, side
+        change = turned - np.eye(2)
+        F = np.tile(np.eye(6), (side.size, 1, 1))
+        F[:, 2:4, 2:4] = turned
+        F[:, :2, 2:4] = -after[:, None, None] * change
+        moved = np.einsum("kij,kj->ki", F, mean)
+        along = moved[:, 2:4]
+        across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+        spread = motion.turn_speed_sd**2 * np.einsum("ki,kj->kij", along, along)
+        spread += motion.turn_angle_sd**2 * np.einsum("ki,kj->kij", across, across)
+        spread[side == 0.0] = motion.step_sd**2 * np.eye(2)
+        wide = F @ cov @ F.transpose(0, 2, 1)
+        wide[:, :2, :2] += after[:, None, None] ** 2 * spread
+        wide[:, :2, 2:4] -= after[:, None, None] * spread
+        wide[:, 2:4, :2] -= after[:, None, None] * spread
+        wide[:, 2:4, 2:4] += spread
+        return moved, wide
 
     def _shorten(self, origin: Array) -> None:
         """Draw particles that are too long beside their distance from the RSU."""

@@ -94,6 +94,37 @@ def test_a_velocity_step_agrees_with_a_sum_over_its_time() -> None:
     np.testing.assert_allclose(np.diag(cov), [weight @ prior, variance], rtol=0.02)
 
 
+def test_a_turn_to_a_side_agrees_with_a_sum_over_its_time() -> None:
+    """As above; all devices that turn do so to a side, with 5 degrees and a twentieth of the speed
+    more or less."""
+    sd, far, dt, rate, speed, noise, value = 0.3, 1e4, 2.0, 0.1, 5.0, 0.5, 3.0
+    start = Start(mean=np.array([0, 0, speed, 0]), position_sd=sd, velocity_sd=sd, **KNOWN_CLOCK)
+    motion = StepMotion(
+        accel=1e-6,
+        steps_hz=rate,
+        step_sd=speed,
+        to_sides=0.5 * math.e,  # all
+        turn_speed_sd=0.05,
+        turn_angle_sd=math.radians(5.0),
+    )
+    oracle = GaussianParticles(start, motion, 20_000, seed=2)
+    oracle.advance(np.array([dt]), bearing(value / far, noise / far, -far)[None])
+    after = (np.arange(2000) + 0.5) / 2000 * dt
+    means = np.concatenate([[0.0], speed * after, -speed * after])
+    own = sd**2 * (1.0 + (dt - after) ** 2 + after**2) + (0.05 * speed * after) ** 2
+    prior = np.concatenate([[sd**2 * (1.0 + dt**2)], own, own])
+    stepped = -math.expm1(-rate * dt)
+    weight = np.append(1.0 - stepped, np.full(4000, stepped / 4000))
+    weight *= norm.pdf(value, means, np.sqrt(prior + noise**2))
+    weight /= weight.sum()
+    each = means + prior / (prior + noise**2) * (value - means)
+    y = weight @ each
+    variance = weight @ (prior * noise**2 / (prior + noise**2) + (each - y) ** 2)
+    mean, cov = oracle.moments()
+    assert mean[1] == pytest.approx(y, abs=0.02)
+    assert cov[1, 1] == pytest.approx(variance, rel=0.03)
+
+
 def test_what_is_drawn_from_weights_keeps_their_mean() -> None:
     rng = np.random.default_rng(1)
     p = rng.dirichlet(np.full(50, 0.3))

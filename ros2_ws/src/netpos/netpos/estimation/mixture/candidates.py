@@ -44,8 +44,8 @@ class Update(NamedTuple):
 
 class Candidates(NamedTuple):
     """Components before they are reduced: states, log weights, which groups (K, groups) each
-    accepted, NIS of the accepted rows and their number, and for how long the device may have been
-    turning (K,), 0 for components without a turn."""
+    accepted, NIS of the accepted rows and their number, for how long the device may have been
+    turning (K,), 0 for components without a turn, and the probability of a blocked path (K,)."""
 
     means: Array
     covs: Array
@@ -54,6 +54,7 @@ class Candidates(NamedTuple):
     nis: Array
     used: Array
     within_s: Array
+    blocked: Array
 
 
 @kernel
@@ -66,12 +67,29 @@ def candidates(size: int, n: int, groups: int) -> Candidates:
         np.zeros(size),
         np.zeros(size),
         np.zeros(size),
+        np.zeros(size),
     )
 
 
 @kernel
-def first_of(found: Candidates, end: int) -> Mixture:
-    return Mixture(found.means[:end], found.covs[:end], found.log_weights[:end])
+def first_of(found: Candidates, end: int) -> Candidates:
+    """The first ``end`` candidates."""
+    return Candidates(
+        found.means[:end],
+        found.covs[:end],
+        found.log_weights[:end],
+        found.accepted[:end],
+        found.nis[:end],
+        found.used[:end],
+        found.within_s[:end],
+        found.blocked[:end],
+    )
+
+
+@kernel
+def mixture_of(found: Candidates) -> Mixture:
+    """The candidates as components."""
+    return Mixture(found.means, found.covs, found.log_weights)
 
 
 @kernel

@@ -38,11 +38,13 @@ from netpos.estimation.mixture.candidates import (
     apply,
     candidates,
     first_of,
+    mixture_of,
 )
 from netpos.estimation.mixture.gaussians import Mixture, leaders, moments, one_component
-from netpos.estimation.mixture.paths import along_paths, paths_are_open, reweight_by_best
+from netpos.estimation.mixture.in_turn import in_turn
+from netpos.estimation.mixture.paths import paths_are_open, reweight_by_best
 from netpos.estimation.mixture.reduction import reduced
-from netpos.estimation.mixture.ring import any_splits, one_by_one
+from netpos.estimation.mixture.ring import any_splits
 from netpos.estimation.mixture.sectors import (
     add_turns_of_phase,
     ambiguous_phase,
@@ -51,11 +53,12 @@ from netpos.estimation.mixture.sectors import (
     reduced_by_sector,
 )
 from netpos.estimation.mixture.turns import (
+    TURNS_MAX,
     add_explanations,
+    add_turns,
     leaves_turns_open,
     may_have_turned,
     may_turn,
-    turn,
 )
 from netpos.estimation.motion import Parameter, add_velocity_step
 from netpos.estimation.predicted import note_innovations, predict_rows
@@ -175,7 +178,7 @@ def _at_once(
     rows = epoch.rows
     count, groups = prior.log_weights.size, int(rows[rows.shape[0] - 1, GROUP]) + 1
     sectors = 2 * most_turns(rows[at]) + 1 if at >= 0 else 0
-    size = 3 * count + 1 + (sectors + 1) * (count + 1)
+    size = 2 * (1 + TURNS_MAX) * count + (sectors + 1) * (count + 1)
     m, n = rows.shape[0], prior.means.shape[1]
     found, work = candidates(size, n, groups), workspace(n, m)
     end = np.int64(count)
@@ -187,27 +190,28 @@ def _at_once(
     if turns:
         weighed = Mixture(prior.means, prior.covs, found.log_weights[:count])
         for k in leaders(weighed):
-            turn(end, prior, k, max(open_s, epoch.unheard_s), rows, options, found)
-            end += 1
+            within_s = max(open_s, epoch.unheard_s)
+            end = add_turns(k, end, prior, within_s, rows, options, found, -1.0)
     if at >= 0:
         end = keep_sectors(prior, best, end, rows, at, options, found)
-    best = int(np.argmax(found.log_weights[:end]))
+    found = first_of(found, end)
+    best = int(np.argmax(found.log_weights))
     top = found.log_weights[best]
     if not math.isfinite(top):
         accepted[:groups] = 0.0
         return Update(prior, 0.0, 0, 0.0, 0.0, turns)
     accepted[:groups] = found.accepted[best]
-    weights = np.exp(found.log_weights[:end] - top)
-    turned = weights[found.within_s[:end] > 0.0].sum() / weights.sum()
-    merge_cost = _MERGE_SHARE * options.integrity_risk
+    weights = np.exp(found.log_weights - top)
+    turned = weights[found.within_s > 0.0].sum() / weights.sum()
+    parts, merge_cost = mixture_of(found), _MERGE_SHARE * options.integrity_risk
     if options.models > 1:
-        components = mixing.one_of_each(first_of(found, end))
+        components = mixing.one_of_each(parts)
     elif at >= 0:
-        components = reduced_by_sector(first_of(found, end), rows, at, merge_cost, options)
+        components = reduced_by_sector(parts, rows, at, merge_cost, options)
     else:
-        components = reduced(first_of(found, end), merge_cost)
+        components = reduced(parts, merge_cost)
     nis, used = found.nis[best], int(found.used[best])
-    return Update(components, nis, used, turned, found.within_s[:end].max(), turns)
+    return Update(components, nis, used, turned, found.within_s.max(), turns)
 
 
 @kernel
@@ -235,18 +239,13 @@ def apply_epoch(
     0 or 1. ``open_s``: the last seconds of which no component says whether the device turned."""
     rows, blocked = epoch.rows, options.robust.nlos_probability > 0.0
     at = ambiguous_phase(rows, options)
-    one_model = options.models == 1 and at < 0
-    splits = one_model and any_splits(components, rows, options)
-    if one_model and blocked and not splits:
-        found: Update = along_paths(components, epoch, options, open_s, accepted)
+    if options.models == 1 and at < 0 and (blocked or any_splits(components, rows, options)):
+        found: Update = in_turn(components, epoch, options, open_s, accepted)
         return found
     if blocked:
         reweight_by_best(components, rows, options.height_m, options.robust)
-    if splits:
-        found = one_by_one(components, rows, options, accepted)
-    else:
-        found = _at_once(components, epoch, at, options, open_s, accepted)
-    return found
+    at_once: Update = _at_once(components, epoch, at, options, open_s, accepted)
+    return at_once
 
 
 @kernel

@@ -16,9 +16,6 @@ Ints = npt.NDArray[np.int64]
 CURVATURE_SHARE = 0.05
 """A component is too long where its second-order variance is more than this share of the variance
 across it."""
-CURVATURE_SHARE_BLOCKED = 0.25
-"""The same where a path may be blocked: components along a ring take one Gaussian for a direct and
-a blocked path, which loses more than a shorter arc gains."""
 SPACING_SD = 1.2
 """Of equal Gaussians side by side: their sum is flat to 1e-3."""
 LEAST_DENSITY_LOG = -4.5

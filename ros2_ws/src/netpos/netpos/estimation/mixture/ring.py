@@ -5,38 +5,21 @@ direction of greatest curvature, Tuggle and Zanetti 2018)."""
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.engine import FilterOptions
-from netpos.estimation.fusion import workspace
 from netpos.estimation.measurement import (
-    GROUP,
     ORIGIN,
     VARIANCE,
     curvature_variance,
     innovation_row,
-    innovation_variance,
     is_range,
     offset_up,
 )
-from netpos.estimation.mixture.candidates import (
-    Candidates,
-    Update,
-    apply,
-    candidates,
-    first_of,
-    outlier_log,
-)
-from netpos.estimation.mixture.gaussians import (
-    CURVATURE_SHARE,
-    CURVATURE_SHARE_BLOCKED,
-    SPACING_SD,
-    Mixture,
-    fuse_value,
-)
-from netpos.estimation.mixture.reduction import reduced
+from netpos.estimation.mixture.gaussians import CURVATURE_SHARE, SPACING_SD, Mixture, fuse_value
 from netpos.estimation.sensors.row import group_end
 from netpos.messages.values import Array
 
@@ -71,8 +54,7 @@ def is_wide(row: Array, mean: Array, cov: Array, options: FilterOptions) -> bool
     own = _own_variance(row, cov, h)
     if own > width2:
         return False
-    share = CURVATURE_SHARE_BLOCKED if options.robust.nlos_probability > 0.0 else CURVATURE_SHARE
-    if curvature_variance(row, mean, cov, options.height_m) > share * own:
+    if curvature_variance(row, mean, cov, options.height_m) > CURVATURE_SHARE * own:
         return True
     dx, dy = mean[0] - row[ORIGIN], mean[1] - row[ORIGIN + 1]
     return bool(_REACH_SD * _REACH_SD * width2 > dx * dx + dy * dy)
@@ -93,11 +75,20 @@ def _half_angle(distance_m: float, cov: Array) -> float:
     return math.asin(reach / distance_m) if reach < distance_m else math.pi
 
 
+class Pieces(NamedTuple):
+    """A component cut along the ring of a range: what it says of each piece before the range is
+    fused, the log weights not normalised; Jacobian (K, n) and innovation (K,) of the range at the
+    piece, linearised on the ring."""
+
+    components: Mixture
+    H: Array
+    innovation: Array
+
+
 @kernel
-def split_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Mixture:
-    """The product of the Gaussian ``mean`` (n,), ``cov`` (n, n) and the likelihood of a range or
-    time of arrival: components along the ring as far as the Gaussian reaches, their log weights
-    not normalised."""
+def cut_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Pieces:
+    """The Gaussian ``mean`` (n,), ``cov`` (n, n) times Gaussians along the ring of a range or time
+    of arrival, side by side as far as it reaches."""
     n = mean.size
     h, at, along = np.empty(n), mean.copy(), np.zeros(n)
     residual = innovation_row(row, mean, height_m, h)
@@ -114,19 +105,19 @@ def split_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Mi
     sd = arc / SPACING_SD
     bend = 0.5 * sd * sd / math.hypot(radius, dz)
     means, covs, logs = np.empty((count, n)), np.empty((count, n, n)), np.empty(count)
+    H, innovation = np.empty((count, n)), np.empty(count)
     for k in range(count):
         angle = towards + half * ((2.0 * k + 1.0) / count - 1.0)
         c, s = math.cos(angle), math.sin(angle)
         at[0], at[1] = row[ORIGIN] + radius * c, row[ORIGIN + 1] + radius * s
         means[k], covs[k] = mean, cov
-        residual = innovation_row(row, at, height_m, h)
-        residual -= h[0] * (mean[0] - at[0]) + h[1] * (mean[1] - at[1])
-        residual -= bend  # a Gaussian along the tangent is outside of the ring
-        logs[k] = math.log(arc) + fuse_value(means[k], covs[k], h, residual, row[VARIANCE])
         along[0], along[1] = -s, c
-        residual = c * (at[1] - means[k, 1]) - s * (at[0] - means[k, 0])
-        logs[k] += fuse_value(means[k], covs[k], along, residual, sd * sd)
-    return Mixture(means, covs, logs)
+        residual = c * (at[1] - mean[1]) - s * (at[0] - mean[0])
+        logs[k] = math.log(arc) + fuse_value(means[k], covs[k], along, residual, sd * sd)
+        # A Gaussian along the tangent is outside of the ring.
+        innovation[k] = innovation_row(row, at, height_m, H[k]) - bend
+        innovation[k] -= H[k] @ (means[k] - at)
+    return Pieces(Mixture(means, covs, logs), H, innovation)
 
 
 @kernel
@@ -141,58 +132,3 @@ def any_splits(components: Mixture, rows: Array, options: FilterOptions) -> bool
                 return True
         start = stop
     return False
-
-
-@kernel
-def ring(k: int, prior: Mixture, rows: Array, end: int, height_m: float, found: Candidates) -> int:
-    """Add the candidates of the component ``k`` along the ring of a range, and the component
-    itself, to which the range is an outlier; the number of candidates then."""
-    mean, cov, h = prior.means[k], prior.covs[k], np.empty(prior.means.shape[1])
-    residual = innovation_row(rows[0], mean, height_m, h)
-    variance = innovation_variance(rows[0], mean, cov, height_m, rows[0, VARIANCE], h)
-    ring = split_along_ring(mean, cov, rows[0], height_m)
-    stop = end + ring.log_weights.size
-    found.means[end:stop], found.covs[end:stop] = ring.means, ring.covs
-    found.log_weights[end:stop] = prior.log_weights[k] + ring.log_weights
-    found.accepted[end:stop], found.used[end:stop] = 1.0, 1.0
-    found.nis[end:stop] = residual * residual / variance
-    found.means[stop], found.covs[stop] = mean, cov
-    found.log_weights[stop] = prior.log_weights[k] + outlier_log(rows)
-    found.accepted[stop], found.used[stop] = 0.0, 0.0
-    return int(stop + 1)
-
-
-@kernel
-def one_by_one(
-    components: Mixture, rows: Array, options: FilterOptions, accepted: Array
-) -> Update:
-    """Measurement by measurement, where ranges split components; ``accepted`` where most of the
-    mixture does."""
-    nis, used, start = 0.0, 0, 0
-    while start < rows.shape[0]:
-        group, stop = int(rows[start, GROUP]), group_end(rows, start)
-        alone = rows[start:stop].copy()
-        alone[:, GROUP] = 0.0
-        count, n = components.means.shape
-        found = candidates(count * (RING_MAX + 1), n, 1)
-        end = np.int64(0)  # no literal: it would make another version of each kernel below
-        work = workspace(n, alone.shape[0])
-        for k in range(count):
-            mean, cov = components.means[k], components.covs[k]
-            if splits(alone, mean, cov, options):
-                end = ring(k, components, alone, end, options.height_m, found)
-            else:
-                found.means[end], found.covs[end] = mean, cov
-                apply(end, components.log_weights[k], alone, options, found, work)
-                end += 1
-        best = int(np.argmax(found.log_weights[:end]))
-        weights = np.exp(found.log_weights[:end] - found.log_weights[best])
-        taken = weights[found.accepted[:end, 0] == 1.0].sum()
-        accepted[group] = 1.0 if 2.0 * taken > weights.sum() else 0.0
-        if accepted[group] == 1.0:
-            likely = np.where(found.accepted[:end, 0] == 1.0, weights, -1.0)
-            best = int(np.argmax(likely))
-            nis, used = nis + found.nis[best], used + stop - start
-        components = reduced(first_of(found, end), RING_MERGE_COST)
-        start = stop
-    return Update(components, nis, used, 0.0, 0.0, False)

@@ -9,33 +9,68 @@ import numpy as np
 from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.engine import EpochInput, FilterOptions, manoeuvre_s
 from netpos.estimation.fusion import predicted_in, workspace
-from netpos.estimation.manoeuvre import add_manoeuvre, measures_position, measures_velocity
+from netpos.estimation.manoeuvre import (
+    add_manoeuvre,
+    measures_position,
+    measures_velocity,
+    side_turns,
+    turn_to_side,
+)
 from netpos.estimation.mixture.candidates import Candidates, apply, apply_predicted
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.messages.values import Array
 
 TURN_PERIOD_S = 0.25  # a component "it has turned" begins so long after the last, with one RSU
 TURNS_HZ = 1.0 / 30.0  # how often a device turns
+TURNS_MAX = 3  # components of ``turned``
+_LEAST_SHARE = 1e-2  # of turns to a side that are looked at
 
 
 @kernel
-def turn(
-    k: int,
-    prior: Mixture,
+def turned(prior: Mixture, parent: int, within_s: float, options: FilterOptions) -> Mixture:
+    """What a component ``parent`` of ``prior`` is if the device, in the last ``within_s`` seconds,
+    turned to a side at its speed, or its velocity changed by any step."""
+    speed_sd, mean, cov = options.manoeuvre_speed_sd, prior.means[parent], prior.covs[parent]
+    n, end, share = mean.size, 0, side_turns(mean, speed_sd)
+    means, covs = np.empty((TURNS_MAX, n)), np.empty((TURNS_MAX, n, n))
+    logs = np.full(TURNS_MAX, prior.log_weights[parent] + math.log(TURNS_HZ * within_s))
+    share = share if share > _LEAST_SHARE else 0.0
+    for side in (0.0, 1.0, -1.0):
+        chance = 1.0 - share if side == 0.0 else 0.5 * share
+        if chance == 0.0:
+            continue
+        means[end], covs[end] = mean, cov
+        if side == 0.0:
+            add_manoeuvre(speed_sd, within_s, covs[end])
+        else:
+            turn_to_side(side, within_s, means[end], covs[end])
+        logs[end] += math.log(chance)
+        end += 1
+    return Mixture(means[:end], covs[:end], logs[:end])
+
+
+@kernel
+def add_turns(
     parent: int,
+    end: int,
+    prior: Mixture,
     within_s: float,
     rows: Array,
     options: FilterOptions,
     found: Candidates,
-) -> None:
-    """Make the candidate ``k`` from the component ``parent`` of ``prior``: the device turned in
-    the last ``within_s`` seconds."""
-    found.means[k], found.covs[k] = prior.means[parent], prior.covs[parent]
-    add_manoeuvre(options.manoeuvre_speed_sd, within_s, found.covs[k])
-    turns = math.log(TURNS_HZ * within_s)
-    own = workspace(prior.means.shape[1], rows.shape[0])
-    apply(k, prior.log_weights[parent] + turns, rows, options, found, own)
-    found.within_s[k] = within_s
+    more_than: float,
+) -> int:
+    """Add the component ``parent`` of ``prior``, ``turned``, as candidates that have had the
+    ``rows``, if they accept ``more_than`` so many groups; the number of candidates then."""
+    parts: Mixture = turned(prior, parent, within_s, options)
+    own = workspace(found.means.shape[1], rows.shape[0])
+    for k in range(parts.log_weights.size):
+        found.means[end], found.covs[end] = parts.means[k], parts.covs[k]
+        apply(end, parts.log_weights[k], rows, options, found, own)
+        found.within_s[end] = within_s
+        if found.accepted[end].sum() > more_than:
+            end += 1
+    return int(end)
 
 
 @kernel
@@ -57,13 +92,14 @@ def add_explanations(
     within_s = manoeuvre_s(cov, rows, predicted, epoch.unheard_s, options)
     if within_s <= 0.0:
         return end
-    turn(end, prior, parent, within_s, rows, options, found)
-    if found.accepted[end].sum() <= found.accepted[refused_by].sum():
+    first, refused = end, found.accepted[refused_by].sum()
+    end = add_turns(parent, first, prior, within_s, rows, options, found, refused)
+    if end == first:
         return end
-    found.means[end + 1], found.covs[end + 1] = mean, cov
+    found.means[end], found.covs[end] = mean, cov
     no_gate = np.full_like(options.gate_nis, np.inf)
-    apply_predicted(end + 1, prior.log_weights[parent], rows, options, no_gate, found, work)
-    return end + 2
+    apply_predicted(end, prior.log_weights[parent], rows, options, no_gate, found, work)
+    return int(end + 1)
 
 
 @leaf
