@@ -348,8 +348,10 @@ def test_without_history_nothing_goes_back(world: Any) -> None:
     history = tracker._tracks["vue_1"]._history
     assert not history._epochs  # and nothing is kept
     assert not history._snapshots
-    # dt = 0: the missing RSU of the last stamp is an epoch of its own
-    partial = ran(world, [*batches[:9], batches[9][:2]], history_s=0.0)
+    # dt = 0: the missing RSU of the last stamp is an epoch of its own; alone it may show a turn
+    straight = {"history_s": 0.0, "manoeuvre_speed_sd_mps": 0.0}
+    tracker = ran(world, batches, **straight)
+    partial = ran(world, [*batches[:9], batches[9][:2]], **straight)
     (output,) = fed(partial, batches[9][2:])
     assert (output.status.used, output.revised) == (1, False)
     np.testing.assert_allclose(

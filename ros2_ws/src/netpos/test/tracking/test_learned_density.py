@@ -90,7 +90,7 @@ def score(run: Run, way: Array) -> tuple[float, float]:
 
 @pytest.mark.parametrize("name", ["person", "forklift", "vehicle"])
 def test_the_defaults_are_true_of_every_device(name: str) -> None:
-    """The covariance holds for each, and the error is at most 1.2 times that with the best of
+    """The covariance holds for each, and the error is at most 1.25 times that with the best of
     four densities, held."""
     ways = {
         "person": [walk(150.0, seed) for seed in (1, 2, 3)],
@@ -107,7 +107,7 @@ def test_the_defaults_are_true_of_every_device(name: str) -> None:
         figures[density] = np.mean(runs, axis=0)
     learned = figures.pop(0.0)
     assert learned[1] < 2.5, figures
-    assert learned[0] < 1.2 * min(rmse for rmse, _ in figures.values()), figures
+    assert learned[0] < 1.25 * min(rmse for rmse, _ in figures.values()), figures
 
 
 def test_one_kernel_and_the_track_learn_the_same() -> None:
