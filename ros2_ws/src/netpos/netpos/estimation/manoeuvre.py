@@ -106,10 +106,13 @@ def add_manoeuvre(speed: float, within_s: float, cov: Array) -> None:
 
 
 @leaf
-def side_turns(mean: Array, speed_sd: float) -> float:
-    """Probability that a manoeuvre of a device with the state mean (n,) is such a turn: as many
-    steps of sd ``speed_sd`` [m/s] per axis are about as large (Rayleigh's density)."""
+def side_turns(mean: Array, cov: Array, speed_sd: float) -> float:
+    """Probability that a manoeuvre of a device with the state mean (n,), cov (n, n) is such a
+    turn: as many steps of sd ``speed_sd`` [m/s] per axis are about as large (Rayleigh's density).
+    None where the velocity is less certain than the angle of such a turn: it has no side then."""
     speed2 = mean[X.VX] * mean[X.VX] + mean[X.VY] * mean[X.VY]
+    if cov[X.VX, X.VX] + cov[X.VY, X.VY] > TURN_ANGLE_SD * TURN_ANGLE_SD * speed2:
+        return 0.0
     ratio2 = 2.0 * speed2 / (speed_sd * speed_sd)
     return float(TURN_SIZES * ratio2 * math.exp(-0.5 * ratio2))
 

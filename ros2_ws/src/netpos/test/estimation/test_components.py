@@ -398,7 +398,7 @@ def turned_priors(x: Array, P: Array, within_s: float) -> list[tuple[float, Arra
     """Probability, mean and covariance: any step, and to either side."""
     ratio2 = 2.0 * (x[2:4] @ x[2:4]) / 5.0**2
     to_side = 0.35 * ratio2 * np.exp(-0.5 * ratio2)
-    if to_side < 0.005:
+    if to_side < 0.005 or np.trace(P[2:4, 2:4]) > np.radians(25.0) ** 2 * (x[2:4] @ x[2:4]):
         return [(1.0, x, with_turn(P, within_s))]
     sides = [(to_side, *with_side_turn(x, P, side, within_s)) for side in (1.0, -1.0)]
     return [(1.0 - 2.0 * to_side, x, with_turn(P, within_s)), *sides]

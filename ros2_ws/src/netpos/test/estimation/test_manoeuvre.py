@@ -135,6 +135,16 @@ def test_a_turn_to_a_side_has_the_moments_of_draws(side: float) -> None:
     )
 
 
+CERTAIN = 1e-4 * np.eye(6)
+
+
+def test_a_velocity_that_is_not_known_has_no_side() -> None:
+    """25 degrees of 4 m/s are 1.75 m/s, of both axes together."""
+    along = np.array([0.0, 0.0, 4.0, 0.0, 0.0, 0.0])
+    for sd, is_known in ((1.2, True), (1.3, False)):
+        assert (side_turns(along, sd**2 * np.eye(6), SPEED) > 0.0) is is_known
+
+
 def test_turns_to_a_side_are_as_many_as_steps_of_their_size() -> None:
     """Of steps drawn from what is declared, those within a third of the size of the turn, for a
     device that is as fast as declared; hardly any for one that stands, or that is much faster: an
@@ -145,7 +155,7 @@ def test_turns_to_a_side_are_as_many_as_steps_of_their_size() -> None:
         along[2:4] = speed, 0.0
         size = math.sqrt(2.0) * speed
         share = (np.abs(steps - size) < 0.35 * size).mean()
-        assert side_turns(along, SPEED) == pytest.approx(share, rel=0.06)
+        assert side_turns(along, CERTAIN, SPEED) == pytest.approx(share, rel=0.06)
     for speed in (0.0, 3.0 * SPEED):
         along[2:4] = speed, 0.0
-        assert side_turns(along, SPEED) < 2e-3
+        assert side_turns(along, CERTAIN, SPEED) < 2e-3

@@ -36,7 +36,8 @@ _DRAWS = 4  # positions of a particle in the cloud
 class StepMotion(Motion):
     """steps_hz: rate of velocity steps, of sd step_sd [m/s] per axis. to_sides: those
     about as large as a turn, within this share of its size, turn the device by 90 degrees to
-    either side, but for a share turn_speed_sd of its speed and turn_angle_sd [rad]."""
+    either side, but for a share turn_speed_sd of its speed and turn_angle_sd [rad], if its
+    velocity is known better."""
 
     steps_hz: float = 0.0
     step_sd: float = 0.0
@@ -139,6 +140,8 @@ class GaussianParticles:
         mean, cov = self.mean[parent], self.cov[parent]
         ratio2 = 2.0 * np.square(mean[:, 2:4]).sum(axis=1) / self._motion.step_sd**2
         sides = self._motion.to_sides * ratio2 * np.exp(-0.5 * ratio2)
+        known = self._motion.turn_angle_sd**2 * np.square(mean[:, 2:4]).sum(axis=1)
+        sides[np.trace(cov[:, 2:4, 2:4], axis1=1, axis2=2) > known] = 0.0
         side = np.where(self._rng.random(count) < 0.5, 1.0, -1.0)
         side[self._rng.random(count) >= sides] = 0.0
         mean, cov = self._stepped(mean, cov, after, side)

@@ -95,8 +95,8 @@ def test_a_velocity_step_agrees_with_a_sum_over_its_time() -> None:
 
 
 def test_a_turn_to_a_side_agrees_with_a_sum_over_its_time() -> None:
-    """As above; all devices that turn do so to a side, with 5 degrees and a twentieth of the speed
-    more or less."""
+    """As above; all devices that turn do so to a side, with 10 degrees and a twentieth of the
+    speed more or less."""
     sd, far, dt, rate, speed, noise, value = 0.3, 1e4, 2.0, 0.1, 5.0, 0.5, 3.0
     start = Start(mean=np.array([0, 0, speed, 0]), position_sd=sd, velocity_sd=sd, **KNOWN_CLOCK)
     motion = StepMotion(
@@ -105,7 +105,7 @@ def test_a_turn_to_a_side_agrees_with_a_sum_over_its_time() -> None:
         step_sd=speed,
         to_sides=0.5 * math.e,  # all
         turn_speed_sd=0.05,
-        turn_angle_sd=math.radians(5.0),
+        turn_angle_sd=math.radians(10.0),
     )
     oracle = GaussianParticles(start, motion, 20_000, seed=2)
     oracle.advance(np.array([dt]), bearing(value / far, noise / far, -far)[None])

@@ -31,7 +31,7 @@ def turned(prior: Mixture, parent: int, within_s: float, options: FilterOptions)
     """What a component ``parent`` of ``prior`` is if the device, in the last ``within_s`` seconds,
     turned to a side at its speed, or its velocity changed by any step."""
     speed_sd, mean, cov = options.manoeuvre_speed_sd, prior.means[parent], prior.covs[parent]
-    n, end, share = mean.size, 0, side_turns(mean, speed_sd)
+    n, end, share = mean.size, 0, side_turns(mean, cov, speed_sd)
     means, covs = np.empty((TURNS_MAX, n)), np.empty((TURNS_MAX, n, n))
     logs = np.full(TURNS_MAX, prior.log_weights[parent] + math.log(TURNS_HZ * within_s))
     share = share if share > _LEAST_SHARE else 0.0
