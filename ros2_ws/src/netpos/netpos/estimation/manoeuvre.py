@@ -25,7 +25,9 @@ from netpos.messages.values import Array
 
 # The filter follows a manoeuvre as long as its gate passes it, so that it is noticed later.
 _FOLLOWED = 2.0
-TURN_SIZES = 0.7  # width of the steps that turns are, over their mean
+# A turn to a side: steps of the velocity from 0.65 to 1.35 times its size are taken for such
+# turns; its speed and its angle differ by so much.
+TURN_SIZES = 0.7
 TURN_ANGLE_SD = math.radians(25.0)
 TURN_SPEED_SD = 0.25  # of the speed
 

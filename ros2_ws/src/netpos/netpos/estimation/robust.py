@@ -71,8 +71,9 @@ def _log_odds(prior: float) -> float:
 
 
 @leaf
-def mixed(probability: float, mean: float, variance: float) -> tuple[float, float, float]:
-    """Mean and variance of an excess that is 0 with probability 1 - ``probability``."""
+def mixed_excess(probability: float, mean: float, variance: float) -> tuple[float, float, float]:
+    """Probability, mean [m] and variance [m^2] of an excess that is 0 with probability 1 -
+    ``probability``, else of ``mean`` [m], ``variance`` [m^2]."""
     spread = probability * (1.0 - probability) * mean * mean
     return probability, probability * mean, probability * variance + spread
 
@@ -117,7 +118,7 @@ def exponential_excess(
     z = innovation / sd - sd / mean_m
     probability = _probability(_log_odds(prior) + math.log(sd / mean_m) + _log_mills(z))
     mean, variance = positive_normal(z)
-    return mixed(  # type: ignore[no-any-return]
+    return mixed_excess(  # type: ignore[no-any-return]
         probability, sd * mean, innovation_var * variance
     )
 
@@ -186,7 +187,7 @@ def matching_cost(
     K' P^-1 K = A / (S R) with A = S - R.
     """
     known = (innovation_var - measurement_var) / (innovation_var * measurement_var)
-    _, _, together = mixed(blocked, mean, variance)
+    _, _, together = mixed_excess(blocked, mean, variance)
     return 0.5 * (math.log1p(known * together) - blocked * math.log1p(known * variance))
 
 

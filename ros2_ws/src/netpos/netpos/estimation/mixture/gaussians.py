@@ -44,6 +44,16 @@ def one_component(mean: Array, cov: Array) -> Mixture:
 
 
 @kernel
+def together(first: Mixture, second: Mixture) -> Mixture:
+    """The components of both, with the weights they have."""
+    return Mixture(
+        np.concatenate((first.means, second.means)),
+        np.concatenate((first.covs, second.covs)),
+        np.concatenate((first.log_weights, second.log_weights)),
+    )
+
+
+@kernel
 def combine(means: Array, covs: Array, weights: Array, mean: Array, cov: Array) -> None:
     """Mean and covariance of the mixture, the spread of the means included: eq. 11.6.6-14, 15;
     written to ``mean`` (n,) and ``cov`` (n, n)."""

@@ -20,7 +20,7 @@ from netpos.estimation.mixture.candidates import (
     mixture_of,
     outlier_log,
 )
-from netpos.estimation.mixture.gaussians import Mixture
+from netpos.estimation.mixture.gaussians import Mixture, together
 from netpos.estimation.mixture.paths import (
     add_both_paths,
     fuse_by,
@@ -30,12 +30,7 @@ from netpos.estimation.mixture.paths import (
     reweight_by_best,
 )
 from netpos.estimation.mixture.reduction import reduced
-from netpos.estimation.mixture.ring import (
-    RING_MAX,
-    RING_MERGE_COST,
-    cut_along_ring,
-    splits,
-)
+from netpos.estimation.mixture.ring import RING_MAX, RING_MERGE_COST, cut_along_ring, splits
 from netpos.estimation.mixture.turns import TURNS_MAX, add_explanations, may_turn, turned
 from netpos.estimation.predicted import predict_rows, predicted_rows
 from netpos.estimation.sensors.row import group_end
@@ -124,18 +119,6 @@ def _add_candidates(
 
 
 @kernel
-def _with_turns(components: Mixture, within_s: float, options: FilterOptions) -> Mixture:
-    """The components, and what the most probable one is if it turned."""
-    best = int(np.argmax(components.log_weights))
-    parts = turned(components, best, within_s, options)
-    return Mixture(
-        np.concatenate((components.means, parts.means)),
-        np.concatenate((components.covs, parts.covs)),
-        np.concatenate((components.log_weights, parts.log_weights)),
-    )
-
-
-@kernel
 def _explained(
     prior: Mixture, count: int, single: EpochInput, within_s: float, options: FilterOptions
 ) -> Candidates:
@@ -186,7 +169,8 @@ def in_turn(
         single = EpochInput(epoch.dt_s, epoch.unheard_s, epoch.rejected_in_row, alone)
         prior, count = components, components.log_weights.size
         if begins and stop == raw.shape[0]:
-            prior = _with_turns(components, within_s, options)
+            best = int(np.argmax(components.log_weights))
+            prior = together(components, turned(components, best, within_s, options))
         found = _explained(prior, count, single, within_s, options)
         top, taken = found.log_weights.max(), found.accepted[:, 0]
         accepted[group] = 0.0

@@ -22,7 +22,7 @@ from netpos.estimation.mixture.candidates import (
 from netpos.estimation.mixture.gaussians import Mixture, fuse_value
 from netpos.estimation.mixture.ring import RING_MERGE_COST
 from netpos.estimation.predicted import PredictedRows, predict_rows, predicted_rows
-from netpos.estimation.robust import blocked_excess, matching_cost, mixed
+from netpos.estimation.robust import blocked_excess, matching_cost, mixed_excess
 from netpos.estimation.sensors.row import group_end
 from netpos.messages.values import Array
 
@@ -84,9 +84,10 @@ def paths_of(row: Array, innovation: float, known_var: float, robust: RobustOpti
     blocked = Path(math.log(share) + likelier, 1.0, excess, excess_var)
     smaller = math.exp(-abs(blocked.log - direct.log))
     either_log = max(blocked.log, direct.log) + math.log1p(smaller)
-    chance, mean, variance_of_both = mixed(math.exp(blocked.log - either_log), excess, excess_var)
-    cost = matching_cost(chance, excess, excess_var, variance, row[VARIANCE])
-    return Paths(direct, blocked, Path(either_log, chance, mean, variance_of_both), cost)
+    both = mixed_excess(math.exp(blocked.log - either_log), excess, excess_var)
+    either = Path(either_log, both[0], both[1], both[2])
+    cost = matching_cost(both[0], excess, excess_var, variance, row[VARIANCE])
+    return Paths(direct, blocked, either, cost)
 
 
 @kernel

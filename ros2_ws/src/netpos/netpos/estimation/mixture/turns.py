@@ -17,7 +17,7 @@ from netpos.estimation.manoeuvre import (
     turn_to_side,
 )
 from netpos.estimation.mixture.candidates import Candidates, apply, apply_predicted
-from netpos.estimation.mixture.gaussians import Mixture
+from netpos.estimation.mixture.gaussians import Mixture, together
 from netpos.messages.values import Array
 
 TURN_PERIOD_S = 0.25  # a component "it has turned" begins so long after the last, with one RSU
@@ -129,11 +129,9 @@ def may_have_turned(components: Mixture, open_s: float, speed: float) -> Mixture
     share = min(TURNS_HZ * open_s, 0.5)
     if share <= 0.0 or speed <= 0.0:
         return components
-    turned = covs.copy()
+    wide = covs.copy()
     for k in range(log_weights.size):
-        add_manoeuvre(speed, open_s, turned[k])
-    return Mixture(
-        np.concatenate((means, means)),
-        np.concatenate((covs, turned)),
-        np.concatenate((log_weights + math.log1p(-share), log_weights + math.log(share))),
-    )
+        add_manoeuvre(speed, open_s, wide[k])
+    straight = Mixture(means, covs, log_weights + math.log1p(-share))
+    both: Mixture = together(straight, Mixture(means, wide, log_weights + math.log(share)))
+    return both
