@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -55,3 +55,15 @@ def graph(domain_id: int, tmp_path: Path) -> Iterator[Graph]:
     """A ROS graph of its own; what is still running at the end is killed."""
     with Graph(domain_id, tmp_path / "logs") as running:
         yield running
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """What the processes of a graph have written is told with the test that failed."""
+    report = yield
+    running = getattr(item, "funcargs", {}).get("graph")
+    if report.when == "call" and report.failed and running is not None:
+        report.sections += [(each.name, each.describe()) for each in running.processes]
+    return report

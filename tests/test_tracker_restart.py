@@ -44,7 +44,12 @@ def test_a_restarted_tracker_finds_the_device_again(
     # the others go on without it
     wait_until(lambda: stamps(truth.messages)[-1] > killed_ns + 10**9, "the simulator to go on")
     graph.run("ekf_tracker", "ekf_tracker", parameters={"scenario": scenario})
-    odometry.wait_for(seen + AFTER, 90.0)
+    try:
+        odometry.wait_for(seen + AFTER, 90.0)
+    except TimeoutError as error:
+        raise AssertionError(
+            f"{error}; the last status: {status.messages[statuses:][-1:]}"
+        ) from error
     after = odometry.messages[seen:]
     assert simulator.running, simulator.describe()
 
