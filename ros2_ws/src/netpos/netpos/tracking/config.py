@@ -128,7 +128,13 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
     clock_walk_density: float = real(
         5e-7, 0.0, 1.0, "continuous: clock random-walk frequency noise [(s/s)/sqrt(s)]"
     )
-    clock_offset_sd_s: float = real(1e-4, 0.0, 1e3, "initial clock offset sd, mean 0")
+    clock_offset_sd_s: float = real(
+        1e-4,
+        0.0,
+        1e3,
+        "clock offset sd of a device just switched on, mean 0; a first fix takes any other that"
+        " makes the times agree",
+    )
     clock_drift_mean: float = real(25e-6, -1.0, 1.0, "initial clock drift [s/s]")
     clock_drift_sd: float = real(30e-6, 0.0, 1.0, "initial clock drift sd [s/s]")
     initial_speed_sd_mps: float = real(5.0, 1e-3, 1e3, "initial velocity sd per axis, mean 0")

@@ -58,6 +58,7 @@ _ATTEMPT_NS = 100_000_000
 # Odds of another heading this much worse in cost (chi-square 0.99, 2 dof) rule it out; places that
 # cannot be told apart are waited for from the same share on, and carried along below it.
 _RIVAL_COST, _RIVAL_SHARE = 9.21, 0.01
+_ANY_CLOCK_M = SPEED_OF_LIGHT_MPS * 1.0  # a second
 _CONTRADICTS = 9.0  # mean squared residual over variance
 _NEAREST_M = 1.0
 _HEADINGS = 16
@@ -171,7 +172,8 @@ class Initialiser:
 
         Of three or more RSUs one may err grossly: what the others say is a part of the posterior.
         Where the measurements contradict each other and leaving out one RSU makes them agree, the
-        fix is that of the others.
+        fix is that of the others; where another clock offset than what is declared does, which is
+        that of a device just switched on, it is that.
         """
         newest = self._window[-1][0]
         if newest < self._next_attempt_ns:
@@ -184,7 +186,7 @@ class Initialiser:
             return None
         solutions, agrees = [agreed], self._consistent(agreed.fits[0], len(rows))
         if not agrees:
-            solutions = self._without_one(rows, ages) or solutions
+            solutions = self._without_one(rows, ages) or self._any_clock(rows, ages) or solutions
         cost, _, cov = solutions[0].fits[0]
         misfit = max(1.0, cost / len(rows))
         lacks = self._lacks(rows, cov, misfit)
@@ -275,6 +277,13 @@ class Initialiser:
             if fits:
                 solutions.append(others._replace(fits=fits))
         return sorted(solutions, key=lambda solution: solution.fits[0][0])
+
+    def _any_clock(self, rows: Array, ages: Array) -> list[_Solution]:
+        """The solution with a consistent fit whatever the clock offset is, if there is one."""
+        problem = self._problem(rows, ages)
+        problem.prior_var[4] = _ANY_CLOCK_M**2
+        fits = [fit for fit in self._fits(rows, problem) if self._consistent(fit, len(rows))]
+        return [_Solution(problem, fits)] if fits else []
 
     def _one_errs(self, rows: Array, problem: Problem) -> list[_Solution]:
         """Solutions in which one of the RSUs errs grossly, of at least three."""

@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pytest
 from first_fix import at, fix_of, measure, rsu, solve
+from netpos.estimation.measurement import KIND, VALUE, Kind
 from netpos.estimation.rows import linear_rows, speed_row
 from netpos.messages.values import AngleConvention, Array, Field
 from netpos.tracking.config import TrackerConfig
@@ -76,6 +77,35 @@ def test_two_directions_and_times_give_the_clock(clock_m: float) -> None:
     assert 0.0 < cov[4, 4] < 1.0
     assert mean[5] == pytest.approx(25e-6 * speed_of_light, rel=1e-3)  # nothing says otherwise
     assert cov[5, 5] == pytest.approx((30e-6 * speed_of_light) ** 2, rel=1e-3)
+
+
+@pytest.mark.parametrize("clock_m", [3e5, -9e5, 3e7])
+def test_a_clock_that_has_run_for_long_is_no_contradiction(clock_m: float) -> None:
+    """Declared is the offset of a device just switched on, 30 km: after minutes it is another."""
+    stations = [rsu(0, 0), rsu(60, 0), rsu(30, 50)]
+    solution = solve(TrackerConfig(), stations, at(25.0, 20.0, clock_m), Field.AZIMUTH | Field.TOA)
+    assert solution is not None
+    mean, cov = solution
+    np.testing.assert_allclose(mean[:2], [25.0, 20.0], atol=0.1)
+    assert abs(mean[4] - clock_m) < 0.2
+    assert 0.0 < cov[4, 4] < 1.0
+
+
+def test_another_clock_does_not_excuse_a_wrong_rsu() -> None:
+    """A clock that is known contradicts a time that is 60 m late: that of one RSU of three, with
+    which three times and any clock would fit a wrong place."""
+    stations = [rsu(0, 0), rsu(60, 0), rsu(30, 50)]
+    rows = [
+        measure(s, at(25.0, 20.0), Field.AZIMUTH | Field.TOA, group=i)
+        for i, s in enumerate(stations)
+    ]
+    rows[1][rows[1][:, KIND] == Kind.TOA, VALUE] += 60.0
+    initialiser = Initialiser(TrackerConfig(**KNOWN_CLOCK))
+    initialiser.add(T0, np.vstack(rows), np.zeros(6), tuple(stations))
+    solution = fix_of(initialiser)
+    assert solution is not None
+    np.testing.assert_allclose(solution[0][:2], [25.0, 20.0], atol=0.2)
+    assert abs(solution[0][4]) < 1.0
 
 
 def test_three_ranges() -> None:
