@@ -424,7 +424,11 @@ def test_a_refused_fix_is_an_outlier_a_tail_or_a_turn(
     delay_s = 2.0 * np.sqrt(2.0 * TURNING.gate_nis[2] / np.trace(np.linalg.inv(S))) / 5.0
     within_s = max(unheard_s, delay_s)
     whitened = np.linalg.slogdet(np.linalg.cholesky(R))[1]  # rows are decorrelated fixes
-    outlier = np.log(1e-2) - 2.0 * np.log(2.0 * np.pi)
+    root = np.linalg.cholesky(R)
+    innovation = np.abs(np.linalg.solve(root, z - x[:2]))
+    sd = np.sqrt(np.diag(np.linalg.solve(root, np.linalg.solve(root, S).T)))
+    octaves = 1.0 + np.log(1e3)
+    outlier = np.log(1e-2) - np.log(2.0 * octaves * np.maximum(innovation, sd)).sum()
     priors = turned_priors(x, P, within_s)
     turns = [(share, *updated(z, m, C)) for share, m, C in priors if passes(z, m, C)]
     assert (len(turns) > 1) is (velocity[0] == 0.0)

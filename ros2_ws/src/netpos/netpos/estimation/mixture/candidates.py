@@ -19,14 +19,14 @@ from netpos.estimation.engine import (
 )
 from netpos.estimation.fit import neg2_log_likelihood
 from netpos.estimation.gate import accepted_rows
-from netpos.estimation.measurement import GROUP, is_range
+from netpos.estimation.measurement import GATE_VARIANCE, GROUP
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.predicted import PredictedRows, predict_rows
 from netpos.estimation.sensors.row import group_end
 from netpos.messages.values import Array
 
-_OUTLIERS = 1e-2  # of all values; those of a range lie anywhere within
-_OUTLIER_RANGE_M = 100.0
+_OUTLIERS = 1e-2  # of all values
+_FARTHEST_OUTLIER = 1e3  # standard deviations
 
 
 class Update(NamedTuple):
@@ -93,11 +93,15 @@ def mixture_of(found: Candidates) -> Mixture:
 
 
 @kernel
-def outlier_log(rows: Array) -> float:
-    """Log density of the values of one measurement that has nothing to do with the device."""
+def outlier_log(rows: Array, predicted: PredictedRows, start: int, stop: int) -> float:
+    """Log density of the rows ``start`` to ``stop`` of one measurement that has nothing to do with
+    where they are ``predicted``: nobody knows how far off such values are, so each octave beyond
+    the standard deviation is as likely."""
     total = math.log(_OUTLIERS)
-    for i in range(rows.shape[0]):
-        total -= math.log(_OUTLIER_RANGE_M if is_range(rows[i]) else 2.0 * math.pi)
+    for i in range(start, stop):
+        known = predicted.prior_var[i] + predicted.second_order_var[i]
+        off = max(abs(predicted.innovation[i]), math.sqrt(rows[i, GATE_VARIANCE] + known))
+        total -= math.log(2.0 * (1.0 + math.log(_FARTHEST_OUTLIER)) * off)
     return total
 
 
@@ -120,7 +124,7 @@ def log_likelihood(
     while start < rows.shape[0]:
         stop = group_end(rows, start)
         if accepted[int(rows[start, GROUP])] == 0.0:
-            total += outlier_log(rows[start:stop])
+            total += outlier_log(rows, predicted, start, stop)
         start = stop
     return float(total)
 

@@ -91,7 +91,7 @@ def _add_ring(
     else:
         end = _add_pieces(prior, k, row, _EITHER, 0.0, end, options, found)
     found.means[end], found.covs[end] = mean, cov
-    found.log_weights[end] = log_weight + paths.direct.log + outlier_log(rows)
+    found.log_weights[end] = log_weight + paths.direct.log + outlier_log(rows, predicted, 0, 1)
     return int(end + 1)
 
 
