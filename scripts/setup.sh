@@ -145,7 +145,7 @@ fi
 kernels="$built
 kernels=$(grep -rlE --include='*.py' '@kernel|@leaf|njit' ros2_ws/src/netpos/netpos | sort | xargs cat | sha256sum | cut -d' ' -f1)"
 if [ "$(cat ros2_ws/install/.netpos-kernels 2>/dev/null || true)" != "$kernels" ]; then
-  say "compiling the kernels (four minutes)"
+  say "compiling the kernels (about seven minutes)"
   load_environment
   python -m netpos.warm_up || say "the kernels could not be compiled ahead; they will be at their first use"
   printf '%s\n' "$kernels" >ros2_ws/install/.netpos-kernels
