@@ -58,7 +58,7 @@ _ATTEMPT_NS = 100_000_000
 # Odds of another heading this much worse in cost (chi-square 0.99, 2 dof) rule it out; places that
 # cannot be told apart are waited for from the same share on, and carried along below it.
 _RIVAL_COST, _RIVAL_SHARE = 9.21, 0.01
-_ANY_CLOCK_M = SPEED_OF_LIGHT_MPS * 1.0  # a second
+_ANY_CLOCK_S = 1.0
 _CONTRADICTS = 9.0  # mean squared residual over variance
 _NEAREST_M = 1.0
 _HEADINGS = 16
@@ -172,8 +172,8 @@ class Initialiser:
 
         Of three or more RSUs one may err grossly: what the others say is a part of the posterior.
         Where the measurements contradict each other and leaving out one RSU makes them agree, the
-        fix is that of the others; where another clock offset than what is declared does, which is
-        that of a device just switched on, it is that.
+        fix is that of the others. Otherwise another clock offset may make them agree: the declared
+        one is that of a device just switched on.
         """
         newest = self._window[-1][0]
         if newest < self._next_attempt_ns:
@@ -280,8 +280,10 @@ class Initialiser:
 
     def _any_clock(self, rows: Array, ages: Array) -> list[_Solution]:
         """The solution with a consistent fit whatever the clock offset is, if there is one."""
+        if not any(BY_KIND[int(kind)].has_clock for kind in np.unique(rows[:, KIND])):
+            return []
         problem = self._problem(rows, ages)
-        problem.prior_var[4] = _ANY_CLOCK_M**2
+        problem.prior_var[4] = (SPEED_OF_LIGHT_MPS * _ANY_CLOCK_S) ** 2
         fits = [fit for fit in self._fits(rows, problem) if self._consistent(fit, len(rows))]
         return [_Solution(problem, fits)] if fits else []
 

@@ -66,9 +66,11 @@ def test_direction_and_time_with_an_unknown_clock_waits() -> None:
     assert solve(config, [rsu(0, 0)], at(20.0, 30.0, 5000.0), Field.AZIMUTH | Field.TOA) is None
 
 
-@pytest.mark.parametrize("clock_m", [0.0, 6000.0, -9000.0])
-def test_two_directions_and_times_give_the_clock(clock_m: float) -> None:
-    stations = [rsu(0, 0), rsu(60, 0)]
+@pytest.mark.parametrize("heard", [2, 3])
+@pytest.mark.parametrize("clock_m", [0.0, 6000.0, -9000.0, 3e5, -9e5, 3e7])
+def test_directions_and_times_give_the_clock(clock_m: float, heard: int) -> None:
+    """Also where it is not the declared one, 30 km: it has run for long."""
+    stations = [rsu(0, 0), rsu(60, 0), rsu(30, 50)][:heard]
     solution = solve(TrackerConfig(), stations, at(25.0, 20.0, clock_m), Field.AZIMUTH | Field.TOA)
     assert solution is not None
     mean, cov = solution
@@ -77,18 +79,6 @@ def test_two_directions_and_times_give_the_clock(clock_m: float) -> None:
     assert 0.0 < cov[4, 4] < 1.0
     assert mean[5] == pytest.approx(25e-6 * speed_of_light, rel=1e-3)  # nothing says otherwise
     assert cov[5, 5] == pytest.approx((30e-6 * speed_of_light) ** 2, rel=1e-3)
-
-
-@pytest.mark.parametrize("clock_m", [3e5, -9e5, 3e7])
-def test_a_clock_that_has_run_for_long_is_no_contradiction(clock_m: float) -> None:
-    """Declared is the offset of a device just switched on, 30 km: after minutes it is another."""
-    stations = [rsu(0, 0), rsu(60, 0), rsu(30, 50)]
-    solution = solve(TrackerConfig(), stations, at(25.0, 20.0, clock_m), Field.AZIMUTH | Field.TOA)
-    assert solution is not None
-    mean, cov = solution
-    np.testing.assert_allclose(mean[:2], [25.0, 20.0], atol=0.1)
-    assert abs(mean[4] - clock_m) < 0.2
-    assert 0.0 < cov[4, 4] < 1.0
 
 
 def test_another_clock_does_not_excuse_a_wrong_rsu() -> None:
