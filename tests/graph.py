@@ -118,6 +118,17 @@ class Collector:
         return list(self.messages)
 
 
+def wait_for_rsus(told: Collector, count: int, tracker: str = "ekf_tracker") -> None:
+    """Wait until a tracker says in /diagnostics that it knows so many RSUs; a subscription that is
+    matched may get a measurement before the description of its RSU."""
+    line = (f"{tracker}: rsus", f"{count} RSUs known")
+    wait_until(
+        lambda: line in [(s.name, s.message) for m in list(told.messages) for s in m.status],
+        ", ".join(line),
+        60.0,
+    )
+
+
 class Graph:
     """The processes of one ROS domain, and a node of the test in it."""
 

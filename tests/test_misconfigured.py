@@ -199,6 +199,7 @@ def test_a_device_that_nobody_hears_is_coasting(graph: Graph) -> None:
     start(graph)
     graph.wait_for_subscribers(MEASUREMENTS)
     network.describe()
+    network.wait_for("rsus", "4 RSUs known", DiagnosticStatus.OK)
     for k in range(20):
         network.send(epoch("vue_1", 0.1 * k))
     status.wait_for(20)

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from diagnostic_msgs.msg import DiagnosticArray
 from feed import PLACES, measurement
-from graph import LATCHED, Graph
+from graph import LATCHED, Graph, wait_for_rsus
 from nav_msgs.msg import Odometry
 from netpos.bags import BagReader
 from netpos.messages.values import RsuInfo
@@ -35,6 +36,7 @@ def test_the_tracker_alone_with_a_file_of_parameters(
     text = file.read_text(encoding="utf-8").replace("device_height_m: 0.0", "device_height_m: 1.3")
     file.write_text(text.replace("vues: [vue_1]", "vues: [tag_7]"), encoding="utf-8")
     odometry = graph.collect("/tag_7/odometry", Odometry)
+    told = graph.collect("/diagnostics", DiagnosticArray)
     infos = graph.publisher(INFOS, RsuInfoMessage, LATCHED)
     measured = graph.publisher(MEASUREMENTS, RsuMeasurement)
     script = str(repository / "scripts" / "run_tracker.sh")
@@ -47,6 +49,7 @@ def test_the_tracker_alone_with_a_file_of_parameters(
     topics = [topic.replace("vue_1", "tag_7") for topic in ESTIMATES]
     for topic in topics:  # the recorder hears them, and this process the odometry
         graph.wait_for_subscribers(topic, 2 if topic.endswith("odometry") else 1)
+    wait_for_rsus(told, len(PLACES))
     for k in range(60):
         for name in PLACES:
             measured.publish(measurement(name, 0.1 * k, "tag_7"))

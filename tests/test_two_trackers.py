@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from feed import PLACES, measurement
-from graph import LATCHED, Graph, wait_until
+from graph import LATCHED, Graph, wait_for_rsus, wait_until
 from nav_msgs.msg import Odometry
 from netpos.bags import BagReader
 from netpos.messages.values import RsuInfo
@@ -62,6 +62,7 @@ def test_two_trackers_of_one_name_of_a_device(graph: Graph, tmp_path: Path) -> N
     for site, heard_by in (("site_a", 2), ("site_b", 1)):  # the recorder hears site_a, too
         for publisher in (infos[site], measured[site]):
             wait_until(lambda p=publisher, n=heard_by: p.get_subscription_count() >= n, site, 60.0)
+        wait_for_rsus(told, len(PLACES), f"{site}/ekf_tracker")
     for k in range(EPOCHS):
         for name in PLACES:
             for publisher in measured.values():
