@@ -15,13 +15,19 @@ _WAITING = 1000  # names
 @dataclass(slots=True)
 class _Device:
     """Sound items of a device: stamps of the first and the newest, and how many; stamp of its
-    first fix, and whether a later epoch agreed with it."""
+    first fix, and whether a later epoch agreed with it. posed: somebody said where it is."""
 
     first_ns: int = 0
     newest_ns: int = 0
     sound: int = 0
     fix_ns: int | None = None
     fixed: bool = False
+    posed: bool = False
+
+    @property
+    def seeks_fix(self) -> bool:
+        """Whether a first fix is sought for it."""
+        return self.sound > 0 and not self.fixed and not self.posed
 
     def hear(self, stamp_ns: int) -> None:
         """Note a sound item."""
@@ -37,7 +43,8 @@ class Admission:
     first fix takes time of the others. So where a tenth of ``limit`` are candidates of which
     something sound has come, a new one must have been heard at an earlier stamp as well, and no
     more than this tenth enter in a second of the stamps: names that are made up and heard once
-    cost no track. Where all places are taken, one makes room for a new device with something
+    cost no track. A device that is given a pose needs no such fix: it enters at once, and is none
+    of this tenth. Where all places are taken, one makes room for a new device with something
     sound, the first that there is of these:
 
     - a device of which nothing sound has come;
@@ -61,11 +68,15 @@ class Admission:
         self._pattern = re.compile(pattern) if pattern else None
         self._silence_ns = silence_ns
 
-    def admit(self, vue_id: str, stamp_ns: int, *, sound: bool) -> tuple[str | None, str | None]:
-        """Take note of an item of a device; the reason why the device is not admitted, and the
-        device that makes room for it, None each."""
+    def admit(
+        self, vue_id: str, stamp_ns: int, *, sound: bool, pose: bool = False
+    ) -> tuple[str | None, str | None]:
+        """Take note of an item of a device, ``pose``: of a pose that it is given; the reason why
+        the device is not admitted, and the device that makes room for it, None each."""
+        posed = sound and pose
         known = self._devices.get(vue_id)
         if known is not None:
+            known.posed |= posed
             if sound:
                 known.hear(stamp_ns)
             return None, None
@@ -73,7 +84,8 @@ class Admission:
             return self._turn_away(vue_id, NOT_ALLOWED), None
         leaves = None
         if len(self._devices) < self._limit:
-            if sound and self._is_crowded() and not self._may_enter(vue_id, stamp_ns):
+            waits = sound and not posed and self._is_crowded()
+            if waits and not self._may_enter(vue_id, stamp_ns):
                 return self._turn_away(vue_id, TOO_MANY), None
         else:
             leaves = self._who_leaves(vue_id, stamp_ns) if sound else None
@@ -81,7 +93,7 @@ class Admission:
                 return self._turn_away(vue_id, TOO_MANY), None
             del self._devices[leaves]
             self._waiting.pop(vue_id, None)
-        device = self._devices[vue_id] = _Device()
+        device = self._devices[vue_id] = _Device(posed=posed)
         if sound:
             device.hear(stamp_ns)
         return None, leaves
@@ -120,7 +132,7 @@ class Admission:
 
     def _is_crowded(self) -> bool:
         """Whether there are so many candidates that a new one must wait."""
-        return sum(d.sound > 0 and not d.fixed for d in self._devices.values()) >= self._tenth
+        return sum(d.seeks_fix for d in self._devices.values()) >= self._tenth
 
     def _may_enter(self, vue_id: str, stamp_ns: int) -> bool:
         """Whether a name was heard at an earlier stamp, and few others entered in this second of

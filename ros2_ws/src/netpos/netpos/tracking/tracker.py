@@ -168,7 +168,8 @@ class Tracker:
 
     def _admits(self, item: Item | ImuSample, sound: bool) -> str | None:
         """Why the device of an item is not tracked, None where it is."""
-        shut, leaves = self._admission.admit(item.vue_id, item.stamp_ns, sound=sound)
+        pose = isinstance(item, InitialPose)
+        shut, leaves = self._admission.admit(item.vue_id, item.stamp_ns, sound=sound, pose=pose)
         if leaves is not None:
             for kept in (self._sequencers, self._tracks, self._clocks, self._untold):
                 kept.pop(leaves, None)

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
-from netpos.messages.values import Field, RsuMeasurement
+from netpos.messages.values import Field, InitialPose, RsuMeasurement
 from netpos.tracking import Tracker, TrackerConfig
 from street_run import truth
 
@@ -90,6 +91,21 @@ def test_a_candidate_that_was_heard_more_often_stays(world: Any) -> None:
     assert tracker.lacks_something("waits")
     assert not tracker.lacks_something("made_up_19")
     assert not tracker.lacks_something("nobody")
+
+
+def test_devices_that_are_given_poses_enter_all_at_once(world: Any) -> None:
+    """They need no first fix that takes time of the others, and leave room for those that do."""
+    tracker = tracker_of(world, max_devices=20)
+    start_ns = heard(world, "bus_0", 0.0)[0].stamp_ns
+    place = np.append(truth(0.0)[:2], 0.0)
+    for k in range(10):
+        pose = InitialPose(stamp_ns=start_ns, vue_id=f"bus_{k}", position=place, cov=np.eye(3))
+        assert tracker.add(pose) is None
+    tracker.process()
+    found = [run(world, tracker, f"bus_{k}", 0.0, 1) for k in range(10)]
+    assert found == [[None] * 3] * 10
+    seekers = [run(world, tracker, f"tag_{k}", 0.0, 1) for k in range(3)]
+    assert seekers == [[None] * 3] * 2 + [["too_many_devices"] * 3]
 
 
 def test_a_replay_admits_the_same(world: Any) -> None:
