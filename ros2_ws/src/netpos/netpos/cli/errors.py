@@ -44,8 +44,8 @@ def _tell(error: BaseException) -> None:
 
 
 def _is_interrupt(error: BaseException) -> bool:
-    """Ctrl-C, also one that came while compiled code was called, which Python reports as a
-    ``SystemError``."""
+    """Ctrl-C, also one that Python reports as another error because of it: a ``SystemError`` where
+    compiled code was called, a ``RuntimeError`` where a class was made."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
         cause = cause.__cause__ or cause.__context__
@@ -61,16 +61,16 @@ class Commands(TyperGroup):
         """Run the chosen command."""
         try:
             return super().invoke(ctx)
-        except (KeyboardInterrupt, SystemError) as error:
-            if not _is_interrupt(error):
-                raise
-            typer.echo("netpos: interrupted", err=True)
-            raise typer.Exit(INTERRUPTED) from None
-        except BrokenPipeError:  # the reader of our output has gone, as in `netpos ... | head`
+        except (typer.Exit, BrokenPipeError):  # the reader has gone, as in `netpos ... | head`
             raise
-        except _BAD_INPUT as error:
-            _tell(error)
-            raise typer.Exit(2) from error
-        except (WorkFailedError, OSError) as error:
-            _tell(error)
-            raise typer.Exit(1) from error
+        except (KeyboardInterrupt, Exception) as error:
+            if _is_interrupt(error):
+                typer.echo("netpos: interrupted", err=True)
+                raise typer.Exit(INTERRUPTED) from None
+            if isinstance(error, _BAD_INPUT):
+                _tell(error)
+                raise typer.Exit(2) from error
+            if isinstance(error, (WorkFailedError, OSError)):
+                _tell(error)
+                raise typer.Exit(1) from error
+            raise

@@ -45,18 +45,20 @@ def test_bars_in_a_log_tell_the_end_of_each(
     assert capsys.readouterr().err == "netpos: runs: 3 of 3\n"
 
 
+@pytest.mark.parametrize("kind", [SystemError, RuntimeError])
 @pytest.mark.parametrize("caused", [True, False])
-def test_an_interrupt_inside_compiled_code_is_an_interrupt(
-    caused: bool, monkeypatch: pytest.MonkeyPatch
+def test_an_interrupt_is_one_whatever_python_makes_of_it(
+    caused: bool, kind: type[Exception], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Python tells of it as a SystemError; any other is an error of the program and stays loud."""
+    """A SystemError inside compiled code, a RuntimeError while a class is made; any other is an
+    error of the program and stays loud."""
 
     def invoke(*_: object) -> None:
-        error = SystemError("returned a result with an exception set")
+        error = kind("returned a result with an exception set")
         raise error from (KeyboardInterrupt() if caused else None)
 
     monkeypatch.setattr(Commands.__mro__[1], "invoke", invoke)
-    with pytest.raises(Exit if caused else SystemError) as raised:
+    with pytest.raises(Exit if caused else kind) as raised:
         Commands(name="netpos").invoke(None)
     assert getattr(raised.value, "exit_code", 130) == 130
 
