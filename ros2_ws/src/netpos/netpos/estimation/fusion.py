@@ -9,8 +9,8 @@ import numpy as np
 
 from netpos.estimation.compile import inlined, kernel, leaf, local_array, spliced
 from netpos.estimation.factor import factor
-from netpos.estimation.predicted import PredictedRows
-from netpos.estimation.state import N_CORE, X
+from netpos.estimation.predicted import PredictedRows, along_gradient
+from netpos.estimation.state import N_CORE
 from netpos.messages.values import Array
 
 # The workspace: vectors of one entry per row or state, then the prior covariance (n), H (m), H P
@@ -53,32 +53,6 @@ def predicted_in(work: Array, n: int, m: int) -> PredictedRows:
     )
 
 
-@inlined
-def _project(
-    n: int, P: Array, h: Array, residual: float, step: Array, Ph: Array
-) -> tuple[float, float]:
-    """P h to ``Ph`` (n,); returns h P h' and what the rows before have left of ``residual``."""
-    still = h[X.VX] == 0.0 and h[X.VY] == 0.0 and h[X.DRIFT] == 0.0
-    if n == N_CORE and still:  # position and clock only
-        for a in range(n):
-            Ph[a] = P[X.PX, a] * h[X.PX] + P[X.PY, a] * h[X.PY] + P[X.CLOCK, a] * h[X.CLOCK]
-        hPh = h[X.PX] * Ph[X.PX] + h[X.PY] * Ph[X.PY] + h[X.CLOCK] * Ph[X.CLOCK]
-        residual -= h[X.PX] * step[X.PX]
-        residual -= h[X.PY] * step[X.PY]
-        return hPh, residual - h[X.CLOCK] * step[X.CLOCK]
-    for a in range(n):
-        Ph[a] = 0.0
-    for b in range(n):
-        if h[b] != 0.0:
-            for a in range(n):
-                Ph[a] += P[b, a] * h[b]
-            residual -= h[b] * step[b]
-    hPh = 0.0
-    for a in range(n):
-        hPh += h[a] * Ph[a]
-    return hPh, residual
-
-
 class LinearRows(NamedTuple):
     """Rows linearised at one state: innovation (m,), H (m, n), variance (m,); those with ``use``
     (m,) 0 are left out."""
@@ -100,7 +74,10 @@ def _fuse_rows(
     for i in range(rows.H.shape[0]):
         if rows.use[i] == 0.0:
             continue
-        hPh, residual = _project(n, P, rows.H[i], rows.innovation[i], step, Ph)
+        h, residual = rows.H[i], rows.innovation[i]
+        hPh = along_gradient(n, P, h, Ph)
+        for a in range(n):
+            residual -= h[a] * step[a]
         variance = rows.variance[i]
         s = hPh + variance
         distance += residual * residual / s

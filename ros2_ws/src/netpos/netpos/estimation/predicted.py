@@ -8,13 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netpos.estimation.compile import kernel, leaf
+from netpos.estimation.compile import inlined, kernel, leaf
 from netpos.estimation.measurement import (
     GATE_VARIANCE,
     curvature_mean,
     curvature_variance,
     innovation_row,
 )
+from netpos.estimation.state import N_CORE, X
 from netpos.messages.values import Array
 
 
@@ -37,6 +38,27 @@ class PredictedRows(NamedTuple):
     second_order_var: Array
 
 
+@inlined
+def along_gradient(n: int, P: Array, h: Array, Ph: Array) -> float:
+    """Variance that P (n, n) has along the gradient ``h`` (n,), most of whose entries are 0; fills
+    ``Ph`` (n,), P times ``h``."""
+    still = h[X.VX] == 0.0 and h[X.VY] == 0.0 and h[X.DRIFT] == 0.0
+    if n == N_CORE and still:  # position and clock only
+        for a in range(N_CORE):
+            Ph[a] = P[X.PX, a] * h[X.PX] + P[X.PY, a] * h[X.PY] + P[X.CLOCK, a] * h[X.CLOCK]
+        return float(h[X.PX] * Ph[X.PX] + h[X.PY] * Ph[X.PY] + h[X.CLOCK] * Ph[X.CLOCK])
+    for a in range(n):
+        Ph[a] = 0.0
+    for b in range(n):
+        if h[b] != 0.0:
+            for a in range(n):
+                Ph[a] += P[b, a] * h[b]
+    total = 0.0
+    for a in range(n):
+        total += h[a] * Ph[a]
+    return total
+
+
 @leaf
 def predict_rows(
     mean: Array, cov: Array, rows: Array, height_m: float, predicted: PredictedRows
@@ -46,17 +68,12 @@ def predict_rows(
     n = mean.size
     for i in range(rows.shape[0]):
         h, hp = predicted.H[i], predicted.HP[i]
-        predicted.second_order_var[i] = curvature_variance(rows[i], mean, cov, height_m)
+        # Both before anything is stored: they share the direction and the distance of the RSU.
+        variance = curvature_variance(rows[i], mean, cov, height_m)
         bend = curvature_mean(rows[i], mean, cov, height_m)
+        predicted.second_order_var[i] = variance
         predicted.innovation[i] = innovation_row(rows[i], mean, height_m, h) - bend
-        total = 0.0
-        for a in range(n):
-            value = 0.0
-            for b in range(n):
-                value += cov[a, b] * h[b]
-            hp[a] = value
-            total += h[a] * value
-        predicted.prior_var[i] = total
+        predicted.prior_var[i] = along_gradient(n, cov, h, hp)
 
 
 @leaf

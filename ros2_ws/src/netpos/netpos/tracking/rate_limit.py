@@ -67,10 +67,8 @@ class RateLimit:
         if stamps is None:
             return False
         slot = stamp_ns // self._apart_ns
-        return any(
-            0 < abs(stamps.get(k, stamp_ns) - stamp_ns) < self._apart_ns
-            for k in (slot - 1, slot, slot + 1)
-        )
+        near = [stamps[k] for k in (slot - 1, slot, slot + 1) if k in stamps]
+        return any(0 < abs(ns - stamp_ns) < self._apart_ns for ns in near)
 
     def _count(self, source: tuple[str, str], second: int) -> None:
         seconds = _of_source(self._counts, source)

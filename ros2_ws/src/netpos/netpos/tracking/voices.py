@@ -70,9 +70,10 @@ class _Source:
         if half_ns == 0:
             return False
         slot = item.stamp_ns // half_ns
-        near = [m for k in range(slot - 4, slot + 5) if (m := self.values.get(k)) is not None]
-        if not any(0 < abs(m.stamp_ns - item.stamp_ns) < half_ns for m in near):
+        beside = [m for k in range(slot - 1, slot + 2) if (m := self.values.get(k)) is not None]
+        if not any(0 < abs(m.stamp_ns - item.stamp_ns) < half_ns for m in beside):
             return False
+        near = [m for k in range(slot - 4, slot + 5) if (m := self.values.get(k)) is not None]
         near = [m for m in near if m.stamp_ns != item.stamp_ns]
         series = sorted([*near, item], key=lambda m: m.stamp_ns)
         if not any(bends(*three) for three in zip(series, series[1:], series[2:], strict=False)):

@@ -94,9 +94,9 @@ def mixture_of(found: Candidates) -> Mixture:
 
 @kernel
 def outlier_log(rows: Array, predicted: PredictedRows, start: int, stop: int) -> float:
-    """Log density of the rows ``start`` to ``stop`` of one measurement that has nothing to do with
-    where they are ``predicted``: nobody knows how far off such values are, so each octave beyond
-    the standard deviation is as likely."""
+    """Log density of the rows ``start`` to ``stop`` of one measurement that is wrong by nobody
+    knows how much: beyond the standard deviation of what is ``predicted`` each octave is as
+    likely."""
     total = math.log(_OUTLIERS)
     for i in range(start, stop):
         known = predicted.prior_var[i] + predicted.second_order_var[i]

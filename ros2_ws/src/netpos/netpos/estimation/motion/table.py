@@ -48,6 +48,9 @@ else:
     Model.__doc__ = "How a device moves: name and number of every model of the table."
 
 
+_BY_NAME = {m.name.lower(): (m,) for m in MODELS if m.summary is not None}
+
+
 def words() -> dict[str, str]:
     """What a planar track may be told to move like, and what each word means beside its name."""
     models = {m.name.lower(): m.summary for m in MODELS if m.summary is not None}
@@ -56,8 +59,7 @@ def words() -> dict[str, str]:
 
 def models_of(word: str) -> tuple[MotionModel, ...]:
     """The models of one of ``words``: one, or those of a set; none for another word."""
-    by_name = {m.name.lower(): (m,) for m in MODELS if m.summary is not None}
-    return SETS.get(word, by_name.get(word, ()))
+    return SETS.get(word, _BY_NAME.get(word, ()))
 
 
 def parameters() -> dict[str, Any]:
