@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import scipy.io
 from netpos import write_bag
-from netpos.bags.importers.own import Columns, Truth, import_csv, import_ros
-from netpos.bags.importers.own.columns import SPEED_OF_LIGHT_MPS
+from netpos.bags.importers.own.columns import SPEED_OF_LIGHT_MPS, Columns
+from netpos.bags.importers.own.recording import Truth, import_csv, import_ros
 from netpos.bags.importers.own.truth import TruthColumns
 from netpos.messages.values import Array, Field, Odometry, RsuInfo, RsuMeasurement
 from netpos.world.geodesy import Datum

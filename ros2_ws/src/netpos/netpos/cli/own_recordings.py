@@ -12,7 +12,8 @@ from netpos.cli.progress import doing
 from netpos.cli.runs import parse_setting, refuse_existing
 
 if TYPE_CHECKING:
-    from netpos.bags.importers.own import Columns, Truth
+    from netpos.bags.importers.own.columns import Columns
+    from netpos.bags.importers.own.recording import Truth
     from netpos.messages.values import RsuInfo
 
 Bag = Annotated[Path, typer.Argument(help="Bag to write; it must not exist.")]
@@ -134,7 +135,7 @@ def import_csv(
 
     One measurement a line, or one column for each RSU.
     """
-    from netpos.bags.importers.own import import_csv as work  # noqa: PLC0415
+    from netpos.bags.importers.own.recording import import_csv as work  # noqa: PLC0415
     from netpos.bags.importers.own.records import DELIMITERS  # noqa: PLC0415
 
     refuse_existing(bag)
@@ -190,7 +191,7 @@ def import_ros(
 
     Fields are given by their path; the RSU's own position may be one of them.
     """
-    from netpos.bags.importers.own import import_ros as work  # noqa: PLC0415
+    from netpos.bags.importers.own.recording import import_ros as work  # noqa: PLC0415
 
     refuse_existing(bag)
     with doing("importing"):
@@ -240,7 +241,7 @@ def tell(bag: Path, counts: Mapping[str, int]) -> None:
 
 
 def _columns(mapping: str, units: str, sd: str, vue: str, lever_arm: str | None) -> Columns:
-    from netpos.bags.importers.own import Columns  # noqa: PLC0415
+    from netpos.bags.importers.own.columns import Columns  # noqa: PLC0415
 
     arm = (0.0, 0.0, 0.0) if lever_arm is None else three(lever_arm, "--lever-arm")
     return Columns.parse(mapping, units, sd, vue_id=vue, lever_arm_m=arm)
@@ -272,8 +273,8 @@ def truth_option(
     origin: str | None = None,
 ) -> Truth | None:
     """The truth that the options describe; ``source``: a text file (Path) or a topic."""
-    from netpos.bags.importers.own import Truth  # noqa: PLC0415
     from netpos.bags.importers.own.alignment import Way  # noqa: PLC0415
+    from netpos.bags.importers.own.recording import Truth  # noqa: PLC0415
     from netpos.bags.importers.own.truth import TUM, TruthColumns  # noqa: PLC0415
 
     if source is None:

@@ -114,7 +114,7 @@ def _truth_from(
 ) -> TruthOf:
     """A function that reads a truth and aligns it with the measurements of a bag."""
     from netpos.bags import BagReader  # noqa: PLC0415
-    from netpos.bags.importers.own import truth_of  # noqa: PLC0415
+    from netpos.bags.importers.own.recording import truth_of  # noqa: PLC0415
     from netpos.cli.own_recordings import truth_option  # noqa: PLC0415
     from netpos.evaluation.contents import config_of  # noqa: PLC0415
     from netpos.tracking.config import TrackerConfig  # noqa: PLC0415

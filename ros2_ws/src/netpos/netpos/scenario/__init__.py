@@ -1,7 +1,31 @@
-"""One YAML file is one reproducible run: load it, simulate it, write it to a bag."""
+"""One YAML file is one reproducible run: load it, simulate it, write it to a bag.
 
-from netpos.scenario.load import ScenarioError, load_scenario, scenario_names
-from netpos.scenario.schema import Scenario
-from netpos.scenario.simulation import Simulation
+The names of this package are imported when they are first used: a tracker that reads its
+parameters (``settings``) needs neither a simulator nor what that one imports.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from netpos.scenario.load import ScenarioError, load_scenario, scenario_names
+    from netpos.scenario.schema import Scenario
+    from netpos.scenario.simulation import Simulation
 
 __all__ = ["Scenario", "ScenarioError", "Simulation", "load_scenario", "scenario_names"]
+
+_MODULES = {
+    "Scenario": "schema",
+    "ScenarioError": "load",
+    "Simulation": "simulation",
+    "load_scenario": "load",
+    "scenario_names": "load",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

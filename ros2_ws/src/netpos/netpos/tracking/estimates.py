@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import log_ndtr
 
 from netpos.estimation import engine
 from netpos.estimation.accel_density import (
@@ -340,10 +339,13 @@ def cut_off_behind(mean: Array, cov: Array, origin: Array, front: Array) -> floa
     Ph = cov[:, POSITION] @ front
     sd = math.sqrt(float(front @ Ph[POSITION]))
     z = float(front @ (mean[POSITION] - origin)) / sd
-    share = float(log_ndtr(z))
+    left, variance = positive_normal(z)
+    if z > 0.0:
+        share = math.log1p(-0.5 * math.erfc(z / math.sqrt(2.0)))
+    else:  # by the density over the hazard rate left - z: no underflow far behind
+        share = -0.5 * (z * z + math.log(2.0 * math.pi)) - math.log(left - z)
     if z < -_FARTHEST_BEHIND_SD:
         return share
-    left, variance = positive_normal(z)
     mean += Ph * ((left - z) / sd)
     cov -= np.outer(Ph, Ph) * ((1.0 - variance) / sd**2)
     return share

@@ -12,7 +12,8 @@ import pytest
 from imported_bag import values
 from netpos.bags import BagError, BagReader
 from netpos.bags.importers.common import recordings
-from netpos.bags.importers.own import Columns, Truth, import_csv, import_ros
+from netpos.bags.importers.own.columns import Columns
+from netpos.bags.importers.own.recording import Truth, import_csv, import_ros
 from netpos.bags.importers.own.rsus import read_rsus
 from netpos.bags.importers.own.truth import TUM, TruthColumns
 from netpos.messages.values import Field, RsuInfo

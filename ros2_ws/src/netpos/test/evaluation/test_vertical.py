@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from imported_bag import values
-from netpos.bags.importers.own import Columns, Truth, import_csv
+from netpos.bags.importers.own.columns import Columns
+from netpos.bags.importers.own.recording import Truth, import_csv
 from netpos.bags.importers.own.truth import TruthColumns
 from netpos.evaluation.metrics import Run, score
 from netpos.evaluation.pairing import Trajectory

@@ -12,6 +12,7 @@ from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimates import cut_off_behind, start_from
 from netpos.tracking.rsus import Rsu
 from netpos.tracking.tracker import Tracker
+from scipy.special import log_ndtr
 from scipy.stats import norm, truncnorm
 
 WALLS = {"west": (0.0, 0.0, 0.0), "north": (3.0, 3.0, -90.0), "south": (3.0, -3.0, 90.0)}
@@ -62,6 +63,13 @@ def test_what_contradicts_the_estimate_does_not_cut_it(ahead_sd: float, cut: boo
     assert bool(mean[0] > 0.0) is cut
     assert bool(cov[0, 0] < 1.0) is cut
     assert np.linalg.eigvalsh(cov).min() > 0.0
+
+
+@pytest.mark.parametrize("ahead_sd", [-200.0, -38.0, -5.0, -1.0, 0.0, 1e-9, 2.0, 9.0, 50.0])
+def test_the_share_in_front_is_that_of_scipy(ahead_sd: float) -> None:
+    mean, cov = np.array([ahead_sd, 0.0, 1.0, 0.0, 0.0, 0.0]), np.eye(6)
+    share = cut_off_behind(mean, cov, np.zeros(2), np.array([1.0, 0.0]))
+    assert share == pytest.approx(log_ndtr(ahead_sd), rel=1e-12, abs=1e-300)
 
 
 def _info(name: str) -> RsuInfo:

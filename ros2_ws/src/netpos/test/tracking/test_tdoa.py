@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from netpos.bags import BagReader, BagWriter, codec
 from netpos.bags.importers.common import recordings
-from netpos.bags.importers.own import Columns, Truth, import_csv
+from netpos.bags.importers.own.columns import Columns
+from netpos.bags.importers.own.recording import Truth, import_csv
 from netpos.bags.importers.own.truth import TruthColumns
 from netpos.bags.recording import number_beacons
 from netpos.evaluation import evaluate_bag

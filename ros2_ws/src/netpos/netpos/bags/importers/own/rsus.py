@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from netpos.bags.errors import BagError
 from netpos.bags.importers.common import yaw_quaternion
@@ -106,6 +105,8 @@ def _of_geodetic(file: str, name: str, values: dict[str, Any], datum: Datum) -> 
         ) from None
     place = datum.to_map(np.array([[latitude, longitude, height]]))[0]
     axes = datum.enu_axes(latitude, longitude)
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - 0.3 s of a tracker's start
+
     turn = Rotation.from_matrix(axes) * Rotation.from_quat(yaw_quaternion(math.radians(yaw)))
     return RsuInfo(rsu_id=name, position=place, quaternion=turn.as_quat())
 
