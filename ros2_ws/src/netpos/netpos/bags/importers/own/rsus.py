@@ -95,6 +95,9 @@ def _datum(file: str, datum: Any) -> Datum:
 
 def _of_geodetic(file: str, name: str, values: dict[str, Any], datum: Datum) -> RsuInfo:
     """An RSU whose place is given on the earth; its yaw counts from the local east."""
+    # Not at the top: few lists need it, and every tracker would load it.
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
     try:
         latitude, longitude = float(values["latitude"]), float(values["longitude"])
         height, yaw = float(values.get("height", 0.0)), float(values.get("yaw_deg", 0.0))
@@ -105,8 +108,6 @@ def _of_geodetic(file: str, name: str, values: dict[str, Any], datum: Datum) -> 
         ) from None
     place = datum.to_map(np.array([[latitude, longitude, height]]))[0]
     axes = datum.enu_axes(latitude, longitude)
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - 0.3 s of a tracker's start
-
     turn = Rotation.from_matrix(axes) * Rotation.from_quat(yaw_quaternion(math.radians(yaw)))
     return RsuInfo(rsu_id=name, position=place, quaternion=turn.as_quat())
 
