@@ -14,10 +14,10 @@ from operator import itemgetter
 from typing import Any
 
 import rclpy
-import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from netpos import __version__
 from netpos.bags import LOST_METADATA, BagError, BagWriter
+from netpos.common.yaml_text import dump_yaml
 from netpos.messages.topics import CLOCK, DIAGNOSTICS, RUN_TOPICS, below
 from netpos_node import init, message_class, waiting
 from rclpy.node import Node
@@ -189,7 +189,7 @@ class RecordNode(Node):
         """Note what was lost, and finish the bag, unless it could not be written any more."""
         if self.writer.closed:
             return
-        self.writer.note(LOST_METADATA, yaml.safe_dump(self.lost))
+        self.writer.note(LOST_METADATA, dump_yaml(self.lost))
         self.recording.close()
 
     def report(self) -> str:

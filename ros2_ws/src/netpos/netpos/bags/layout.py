@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.records import Channel, Metadata, Schema
@@ -15,6 +14,7 @@ from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import dump_qos_v9
 
 from netpos.common.files import write_text
+from netpos.common.yaml_text import dump_yaml
 
 VERSION = 9
 ROS_DISTRO = "jazzy"
@@ -79,7 +79,7 @@ def qos_yaml(profiles: list[Qos]) -> str:
     """Profiles as the text of an MCAP channel's ``offered_qos_profiles``."""
     if not profiles:
         return ""
-    return str(yaml.safe_dump(dump_qos_v9(profiles), sort_keys=False)).strip()
+    return dump_yaml(dump_qos_v9(profiles), sort_keys=False).strip()
 
 
 def describe(
@@ -127,7 +127,7 @@ def describe(
 
 def dump(information: Mapping[str, Any]) -> str:
     """YAML text of a mapping, keys in the given order."""
-    return str(yaml.safe_dump(dict(information), sort_keys=False, allow_unicode=True))
+    return dump_yaml(dict(information), sort_keys=False, allow_unicode=True)
 
 
 def write_metadata(folder: Path, information: Mapping[str, Any]) -> None:

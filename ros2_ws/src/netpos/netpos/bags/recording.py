@@ -11,13 +11,12 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 import netpos
 from netpos.bags.errors import BagError
 from netpos.bags.reader import BagReader
 from netpos.bags.types import codec
 from netpos.bags.writer import whole_bag
+from netpos.common.yaml_text import dump_yaml
 from netpos.messages.topics import (
     CLOCK_STATE,
     GROUND_TRUTH,
@@ -67,7 +66,7 @@ def write_values(
     merged += [(s.stamp_ns, of_vue(s.vue_id, IMU), messages.imu_to_msg(s)) for s in imu]
     merged.sort(key=lambda item: item[0])
     kept = {"netpos_version": netpos.__version__, **(metadata or {})}
-    kept["tracker"] = yaml.safe_dump(dict(tracker or {}))
+    kept["tracker"] = dump_yaml(dict(tracker or {}))
     with whole_bag(Path(path), metadata=kept) as writer:
         for info in rsus:
             message = messages.rsu_info_to_msg(replace(info, stamp_ns=start_ns))

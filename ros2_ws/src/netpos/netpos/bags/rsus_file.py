@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from netpos.bags.errors import BagError
 from netpos.bags.importers.own.rsus import read_rsus
@@ -16,6 +15,7 @@ from netpos.bags.reader import BagReader
 from netpos.bags.types import codec
 from netpos.bags.writer import whole_bag
 from netpos.common.files import write_text
+from netpos.common.yaml_text import dump_yaml
 from netpos.messages.fields import bad_stamp, malformed_nanosec
 from netpos.messages.topics import RSU_INFO, RSU_LEARNED, is_tracker_output
 from netpos.messages.values import RsuErrors, RsuInfo
@@ -66,8 +66,8 @@ def save_rsus(bag: Path, file: Path) -> list[RsuInfo]:
             scatter = zip(scatter_of.quantities, scatter_of.scatter, strict=True)
             text = ", ".join(f"{quantity} {value:.2f}" for quantity, value in scatter)
             lines.append(f"  # learned; scatter over the sd stated: {text}")
-        entry = yaml.safe_dump(_entry(info), default_flow_style=True, width=10_000).strip()
-        name = yaml.safe_dump(info.rsu_id).splitlines()[0]  # in quotes where it must be
+        entry = dump_yaml(_entry(info), default_flow_style=True, width=10_000).strip()
+        name = dump_yaml(info.rsu_id).splitlines()[0]  # in quotes where it must be
         lines.append(f"  {name}: {entry}")
     write_text(file, "\n".join(lines) + "\n")
     return declared
@@ -76,7 +76,7 @@ def save_rsus(bag: Path, file: Path) -> list[RsuInfo]:
 def rsus_text(infos: Iterable[RsuInfo]) -> str:
     """RSUs as the YAML of such a file, every digit kept."""
     entries = {info.rsu_id: _entry(info, None) for info in infos}
-    return str(yaml.safe_dump({"rsus": entries}, width=10_000))
+    return dump_yaml({"rsus": entries}, width=10_000)
 
 
 def load_rsus(file: Path, bag: Path, out: Path) -> list[str]:

@@ -1,4 +1,5 @@
-"""The only way to read YAML: fast, plain values only, with limits against hostile documents.
+"""The only way to read and write YAML: fast, plain values only, with limits against hostile
+documents.
 
 A few lines with aliases of aliases describe more values than fit into memory, and deep nesting
 overflows the stack. Bags and scenarios of others may contain both.
@@ -15,6 +16,7 @@ SIZE_MAX = 16 * 1024**2  # characters; metadata of a bag with a thousand topics 
 DEPTH_MAX = 60
 VALUES_MAX = 1_000_000  # aliases followed
 _FAST = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_FAST_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
 class YamlError(ValueError):
@@ -56,6 +58,12 @@ def load_yaml(text: str) -> Any:
         raise _yaml_error(error) from error
     except (ValueError, OverflowError) as error:  # a date or a number that there is not
         raise YamlError(f"not valid YAML: {error}") from error
+
+
+def dump_yaml(value: Any, **style: Any) -> str:
+    """The text of plain values; ``style`` as PyYAML's ``dump`` takes it. Raises
+    ``yaml.YAMLError`` for other values."""
+    return str(yaml.dump(value, Dumper=_FAST_DUMPER, **style))
 
 
 def compose_yaml(text: str, loader: Any) -> yaml.Node | None:

@@ -12,7 +12,7 @@ import yaml
 from pydantic import ValidationError
 
 from netpos.common.parameters import FaultsError
-from netpos.common.yaml_text import YamlError, compose_yaml
+from netpos.common.yaml_text import YamlError, compose_yaml, dump_yaml
 from netpos.scenario.schema import Scenario
 
 _SHARED = Path("share/netpos_bringup/scenarios")
@@ -73,7 +73,7 @@ def load_scenario(
 def scenario_text(scenario: Scenario) -> str:
     """A scenario as YAML, with the seed it runs with; ``scenario_of_text`` reads it."""
     content = scenario.model_dump(mode="json", exclude_unset=True)
-    return str(yaml.safe_dump({**content, "seed": scenario.seed}, sort_keys=False))
+    return dump_yaml({**content, "seed": scenario.seed}, sort_keys=False)
 
 
 def scenario_of_text(text: str, path: Path) -> Scenario:

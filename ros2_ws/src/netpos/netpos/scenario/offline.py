@@ -6,10 +6,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import yaml
-
 import netpos
 from netpos.bags import BagWriter, codec
+from netpos.common.yaml_text import dump_yaml
 from netpos.inertial.pdr import PedestrianDeadReckoning
 from netpos.inertial.pdr_config import PdrConfig
 from netpos.inertial.pdr_values import values_of
@@ -43,11 +42,11 @@ def simulate_to_bag(
     metadata = {
         "netpos_version": netpos.__version__,
         "scenario": scenario_text(scenario),
-        "tracker": yaml.safe_dump(dict(scenario.tracker)),
+        "tracker": dump_yaml(dict(scenario.tracker)),
     }
     if scenario.networks:
         names = [network.name for network in scenario.networks]
-        metadata["fusion"] = yaml.safe_dump({"networks": names, **scenario.fusion})
+        metadata["fusion"] = dump_yaml({"networks": names, **scenario.fusion})
     with BagWriter(Path(bag_path), metadata=metadata) as bag:
         for item in timeline(Simulation(scenario), clock_hz, measured=True):
             if isinstance(item, int):

@@ -7,12 +7,10 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from netpos.bags import BagError, BagReader
 from netpos.bags.importers.own.rsus import read_rsus, rsus_of_text
 from netpos.bags.rsus_file import rsus_text
-from netpos.common.yaml_text import YamlError, load_yaml
+from netpos.common.yaml_text import YamlError, dump_yaml, load_yaml
 from netpos.messages import topics
 from netpos.messages.values import RsuInfo
 from netpos.tracking.config import TrackerConfig
@@ -91,14 +89,14 @@ def known_parameters(recorded: Mapping[str, Any]) -> dict[str, Any]:
 def tracker_fact(config: TrackerConfig, rsus: str = "") -> dict[str, str]:
     """Facts of a bag: every parameter of its tracker, and its list of RSUs; trackers of several
     networks have the same facts."""
-    facts = {TRACKER_FACT: yaml.safe_dump(asdict(replace(config, network="")))}
+    facts = {TRACKER_FACT: dump_yaml(asdict(replace(config, network="")))}
     return facts | ({RSUS_FACT: rsus} if rsus else {})
 
 
 def change_fact(stamp_ns: int, values: Mapping[str, Any]) -> dict[str, str]:
     """What a bag is told of parameters that changed while its tracker ran, after the estimate of
     ``stamp_ns``."""
-    return {CHANGE_FACT: yaml.safe_dump({"stamp_ns": stamp_ns, **values})}
+    return {CHANGE_FACT: dump_yaml({"stamp_ns": stamp_ns, **values})}
 
 
 def list_of(file: Path | str, datum: str = "") -> str:
@@ -118,7 +116,7 @@ def not_usual(config: TrackerConfig) -> dict[str, Any]:
 
 def fusion_fact(networks: tuple[str, ...], config: FusionConfig) -> dict[str, str]:
     """Facts of a bag: the networks and the fusion of their tracks."""
-    return {FUSION_FACT: yaml.safe_dump({"networks": list(networks), **asdict(config)})}
+    return {FUSION_FACT: dump_yaml({"networks": list(networks), **asdict(config)})}
 
 
 def _mapping(bag: BagReader, name: str) -> dict[str, Any] | None:
