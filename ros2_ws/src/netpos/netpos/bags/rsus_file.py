@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,11 @@ from netpos.messages.fields import bad_stamp, malformed_nanosec
 from netpos.messages.topics import RSU_INFO, RSU_LEARNED, is_tracker_output
 from netpos.messages.values import RsuErrors, RsuInfo
 
+_DIFFERENCE = "TDOA"
 _BIAS_OF = {
     "RANGE": "range_bias_sd_m",
     "TOA": "range_bias_sd_m",
+    _DIFFERENCE: "range_bias_sd_m",
     "AZIMUTH": "azimuth_bias_sd_rad",
     "COSINE_Y": "azimuth_bias_sd_rad",
     "ELEVATION": "elevation_bias_sd_rad",
@@ -56,8 +59,7 @@ def save_rsus(bag: Path, file: Path) -> list[RsuInfo]:
     if not infos:
         raise BagError(f"{bag} has no {RSU_INFO}: there is nothing to save")
     declared = [
-        _declaring(info, learned[name]) if name in learned else info
-        for name, info in sorted(infos.items())
+        _declaring(info, _quantities(name, infos, learned)) for name, info in sorted(infos.items())
     ]
     lines = [f"# RSUs of {bag.name}; m, rad, s, axes of map", "rsus:"]
     for info in declared:
@@ -66,9 +68,9 @@ def save_rsus(bag: Path, file: Path) -> list[RsuInfo]:
             scatter = zip(scatter_of.quantities, scatter_of.scatter, strict=True)
             text = ", ".join(f"{quantity} {value:.2f}" for quantity, value in scatter)
             lines.append(f"  # learned; scatter over the sd stated: {text}")
-        entry = dump_yaml(_entry(info), default_flow_style=True, width=10_000).strip()
+        content = dump_yaml(_entry(info), default_flow_style=True, width=10_000).strip()
         name = dump_yaml(info.rsu_id).splitlines()[0]  # in quotes where it must be
-        lines.append(f"  {name}: {entry}")
+        lines.append(f"  {name}: {content}")
     write_text(file, "\n".join(lines) + "\n")
     return declared
 
@@ -120,14 +122,33 @@ def load_rsus(file: Path, bag: Path, out: Path) -> list[str]:
     return sorted(wanted)
 
 
-def _declaring(info: RsuInfo, errors: RsuErrors) -> RsuInfo:
+def _quantities(
+    name: str, others: Iterable[str], learned: Mapping[str, RsuErrors]
+) -> list[tuple[str, float, float]]:
+    """Quantity, sd and correlation time of the biases learned of an RSU. The bias of a difference
+    with one of ``others`` is that of two RSUs: half of its variance, on average over all of its
+    differences, is of this one."""
+    found = []
+    if name in learned:
+        own = learned[name]
+        found = list(zip(own.quantities, own.bias_spread, own.correlation_time_s, strict=True))
+    pairs = [pair for other in others for pair in (f"{name}-{other}", f"{other}-{name}")]
+    of_pairs = [learned[pair] for pair in pairs if pair in learned]
+    if of_pairs:
+        spreads, times = np.array(
+            [(e.bias_spread[0], e.correlation_time_s[0]) for e in of_pairs]
+        ).T
+        sd = math.sqrt(0.5 * float(np.mean(spreads**2)))
+        found.append((_DIFFERENCE, sd, float(np.mean(times))))
+    return found
+
+
+def _declaring(info: RsuInfo, learned: Iterable[tuple[str, float, float]]) -> RsuInfo:
     """With the learned errors instead of the declared ones; of several quantities that share a
     bias the larger sd and its time."""
     changes: dict[str, float] = {}
     largest = 0.0
-    for quantity, sd, time_s in zip(
-        errors.quantities, errors.bias_spread, errors.correlation_time_s, strict=True
-    ):
+    for quantity, sd, time_s in learned:
         name = _BIAS_OF.get(quantity)
         if name is None:
             continue

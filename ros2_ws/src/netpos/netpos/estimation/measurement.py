@@ -29,6 +29,7 @@ from netpos.estimation.sensors.row import (
     KIND,
     LEVER,
     ORIGIN,
+    REFERENCE,
     ROW_WIDTH,
     VALUE,
     VARIANCE,
@@ -49,6 +50,7 @@ __all__ = [
     "KIND",
     "LEVER",
     "ORIGIN",
+    "REFERENCE",
     "ROW_WIDTH",
     "VALUE",
     "VARIANCE",
@@ -218,6 +220,10 @@ def predict_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
             if index >= 0:
                 h[index] = 1.0
                 value += mean[index]
+        reference = int(row[REFERENCE])
+        if reference > 0:
+            h[reference] = -1.0
+            value -= mean[reference]
     return value
 
 

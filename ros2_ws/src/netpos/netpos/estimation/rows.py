@@ -26,6 +26,7 @@ from netpos.estimation.measurement import (
     KIND,
     LEVER,
     ORIGIN,
+    REFERENCE,
     ROW_WIDTH,
     VALUE,
     VARIANCE,
@@ -78,6 +79,8 @@ class Coupling:
     common: Mapping[Kind, int]  # state index of the bias its network shares
     inflation: Mapping[Kind, float]  # variance factor of correlated noise
     gate: Mapping[Kind, float] = field(default_factory=dict)  # variance factor of single values
+    reference: Mapping[Kind, int] = field(default_factory=dict)
+    """State index of the bias of the RSU that a difference counts from."""
 
 
 UNCOUPLED = Coupling({}, {}, {})
@@ -165,7 +168,8 @@ def put_scalars(
         row[KIND], row[VALUE] = kind, value
         row[VARIANCE] = row[GATE_VARIANCE] = variance
         row[BIAS] = row[COMMON] = -1.0
-        row[GROUP], row[HEADING], row[BLOCKED], row[HEIGHT] = group, heading, 0.0, 0.0
+        row[GROUP], row[HEADING] = group, heading
+        row[BLOCKED] = row[HEIGHT] = row[REFERENCE] = 0.0
         for i in range(HEADING - AXES):
             row[AXES + i] = place[_POSE + i]
         for i in range(3):
@@ -251,6 +255,13 @@ def couple(rows: Array, kinds: tuple[Kind, ...], coupling: Coupling) -> None:
         row[GATE_VARIANCE] *= coupling.gate.get(kind, 1.0)
         row[BIAS] = coupling.bias.get(kind, -1)
         row[COMMON] = coupling.common.get(kind, -1)
+        row[REFERENCE] = coupling.reference.get(kind, 0)
+
+
+def drop_biases(rows: Array) -> None:
+    """Let ``rows`` (m, ROW_WIDTH) name no states of slow errors, in place."""
+    rows[:, BIAS] = rows[:, COMMON] = -1.0
+    rows[:, REFERENCE] = 0.0
 
 
 def rsu_rows(

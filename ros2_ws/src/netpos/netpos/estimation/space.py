@@ -33,6 +33,7 @@ from netpos.estimation.measurement import (
     KIND,
     LEVER,
     ORIGIN,
+    REFERENCE,
     ROW_WIDTH,
     VALUE,
     VARIANCE,
@@ -126,6 +127,10 @@ def innovation_at(row: Array, nav: Array, C: Array, h: Array) -> float:
             if Err.CLOCK < index < h.size:  # a state without clock and biases takes none
                 h[index] = 1.0
                 value += nav[index + 1]
+        reference = int(row[REFERENCE])
+        if Err.CLOCK < reference < h.size:
+            h[reference] = -1.0
+            value -= nav[reference + 1]
     difference = row[VALUE] - value
     return float(wrap(difference)) if is_cyclic(row) else float(difference)
 

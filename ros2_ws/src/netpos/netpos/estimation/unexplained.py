@@ -8,6 +8,7 @@ from netpos.estimation.compile import kernel
 from netpos.estimation.measurement import (
     BIAS,
     HEIGHT,
+    REFERENCE,
     VARIANCE,
     curvature_mean,
     curvature_variance,
@@ -20,9 +21,9 @@ from netpos.messages.values import Array
 @kernel
 def unexplained(mean: Array, cov: Array, rows: Array, height_m: float) -> Array:
     """What the posterior mean (n,), cov (n, n) leaves of each row (m, 8): the residual with the
-    RSU's own bias in it; its expected square, without; the variance of the update; the derivatives
-    of the row by position x, y and clock offset; the own bias; and the derivative by the height, 0
-    where that is known."""
+    bias of the RSU in it, less that of the reference; its expected square, without; the variance
+    of the update; the derivatives of the row by position x, y and clock offset; that bias; and the
+    derivative by the height, 0 where that is known."""
     n = mean.size
     h, out = np.empty(n), np.zeros((rows.shape[0], 8))
     for i in range(rows.shape[0]):
@@ -33,8 +34,9 @@ def unexplained(mean: Array, cov: Array, rows: Array, height_m: float) -> Array:
         for a in range(n):
             for b in range(n):
                 q += h[a] * cov[a, b] * h[b]
-        index = int(row[BIAS])
-        bias = mean[index] if index >= 0 else 0.0
+        own, reference = int(row[BIAS]), int(row[REFERENCE])
+        bias = mean[own] if own >= 0 else 0.0
+        bias -= mean[reference] if reference > 0 else 0.0
         out[i, 0], out[i, 1] = residual + bias, residual * residual + q
         out[i, 2] = row[VARIANCE] + curvature_variance(row, mean, cov, height_m)
         out[i, 3], out[i, 4], out[i, 5] = h[X.PX], h[X.PY], h[X.CLOCK]

@@ -30,7 +30,7 @@ from netpos.tracking.models import (
     slow_states,
     start_state,
 )
-from netpos.tracking.rsus import Rsu
+from netpos.tracking.rsus import Rsu, SlowErrors
 
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -183,7 +183,7 @@ class Follower:
         config, first = self._config, self.first_bias
         sd = np.append(self._extra_sd, epochs.bias[0])
         heard_ns, rejected = int(epochs.stamps_ns[0]), 0
-        known = first + self.own_slow.shape[1]
+        known = max(first + self.own_slow.shape[1], fix.means.shape[1])
         estimate = estimates.start_from(config, heard_ns, fix)
         for k, stamp in enumerate(epochs.stamps_ns.tolist()):
             rows = epochs.rows[epochs.row_start[k] : epochs.row_start[k + 1]].copy()
@@ -211,15 +211,14 @@ class Follower:
     def _first_fix(self, epochs: Epochs, first: int) -> tuple[int, Mixture] | None:
         """Epoch and components of a first fix by the rows from ``first`` on; None where they do
         not suffice."""
-        initialiser = Initialiser(self._config)
-        variance = np.append(epochs.bias[0] ** 2, 0.0)  # the last: no bias
+        initialiser, known = Initialiser(self._config), self.own_slow.shape[1]
         for k in range(first, epochs.stamps_ns.size):
             rows = epochs.rows[epochs.row_start[k] : epochs.row_start[k + 1]]
-            index = rows[:, BIAS].astype(int)
-            bias_var = variance[np.where(index < 0, -1, index - self.first_bias)]
+            known = max(known, int(rows[:, BIAS].max(initial=-1.0)) + 1 - self.first_bias)
+            slow = SlowErrors(self.first_bias, epochs.bias[0, :known], np.ones(known, np.bool_))
             heard = tuple(self._rsus[i] for i in epochs.rsu[k] if i >= 0)
-            initialiser.add(int(epochs.stamps_ns[k]), rows, bias_var, heard)
-            fix = initialiser.solve()
+            initialiser.add(int(epochs.stamps_ns[k]), rows, heard)
+            fix = initialiser.solve(slow)
             if fix is not None:
                 return k, fix
         return None

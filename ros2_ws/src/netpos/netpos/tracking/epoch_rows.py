@@ -21,11 +21,17 @@ from netpos.estimation.measurement import (
     Kind,
     linearise,
 )
-from netpos.estimation.rows import ROWS_MAX, couple, linear_rows, put_measurement, speed_row
-from netpos.estimation.sensors.table import BY_KIND
+from netpos.estimation.rows import (
+    ROWS_MAX,
+    UNCOUPLED,
+    couple,
+    linear_rows,
+    put_measurement,
+    speed_row,
+)
 from netpos.estimation.state import KNOWN_HEIGHT, N_CORE, VELOCITY, HeightState, X
 from netpos.messages.values import Array, Field, GroundSpeed, RsuMeasurement, Velocity
-from netpos.tracking.rsus import REFERENCED, BiasStates, Rsu
+from netpos.tracking.rsus import REFERENCED, BiasStates, Rsu, bias_sd
 
 Source = RsuMeasurement | Velocity | GroundSpeed
 Sites = tuple[bool, Array, Array | None]
@@ -61,15 +67,6 @@ class EpochRows:
         variance: Array = np.square(H[:, biases.first :]) @ np.square(biases.sd)
         return variance
 
-    def shared_errors(self, biases: BiasStates) -> Array:
-        """(m, 2): the part of ``slow_variance`` that each row has in common with all rows of its
-        COMMON state, and 1 where that error is the same at the next epoch, else 0."""
-        shared = np.zeros((len(self.rows), 2))
-        for error, row in zip(shared, self.rows, strict=True):
-            if row[COMMON] >= 0 and BY_KIND[int(row[KIND])].adds_biases:
-                error[:] = biases.common(int(row[COMMON]))
-        return shared
-
 
 class RowForm(NamedTuple):
     """How the rows of an epoch are written for an estimator.
@@ -92,9 +89,9 @@ def planar_form(heading: int = -1, height: HeightState = KNOWN_HEIGHT) -> RowFor
 _PLANAR = planar_form()
 
 
-def reference_place(m: RsuMeasurement, rsus: Mapping[str, Rsu]) -> Array | None:
-    """``rsu_place`` of the RSU that a difference counts from; None where there is none."""
-    return rsus[m.reference_rsu_id].place if int(m.fields) & REFERENCED else None
+def reference_of(m: RsuMeasurement, rsus: Mapping[str, Rsu]) -> Rsu | None:
+    """The RSU that a difference counts from; None where there is none."""
+    return rsus[m.reference_rsu_id] if int(m.fields) & REFERENCED else None
 
 
 def shared_references(items: Sequence[Source]) -> Collection[str]:
@@ -127,18 +124,21 @@ def epoch_rows_of(
     for group, item in enumerate(items):
         first = end
         if isinstance(item, RsuMeasurement):
-            rsu = rsus[item.rsu_id]
-            sites = rsu.cone, rsu.place, reference_place(item, rsus)
+            rsu, reference = rsus[item.rsu_id], reference_of(item, rsus)
+            sites = rsu.cone, rsu.place, None if reference is None else reference.place
             end = form.put(rows, first, item, sites, group)
             if biases is None:
                 continue
             shares = item.reference_rsu_id in shared
             if biases.learned is not None:
                 stated = rows[first:end, VARIANCE]
-                coupling = biases.learned_coupling(rsu, item, stated, biases.learned, shares)
+                coupling = biases.learned_coupling(
+                    rsu, item, stated, biases.learned, reference, shares
+                )
+            else:
+                coupling = biases.coupling(rsu, item, reference, shares)
+            if coupling is not UNCOUPLED:
                 couple(rows[first:end], rsu.kinds(item), coupling)
-            elif shares or not rsu.plain:
-                couple(rows[first:end], rsu.kinds(item), biases.coupling(rsu, item, shares))
             continue
         if isinstance(item, Velocity):
             block = linear_rows(item.velocity, item.cov, _VELOCITY_H, group)
@@ -179,11 +179,11 @@ def mostly_accepted(epoch_rows: EpochRows, accepted: Sequence[float]) -> bool:
     return 2 * sum(votes) >= len(votes)
 
 
-def widen(innovations: Array, rows: Array, rsu: Rsu) -> None:
-    """Let the sd in ``innovations`` (m, 2) of ``rows`` without bias states hold the RSU's biases,
-    in place."""
+def widen(innovations: Array, rows: Array, rsu: Rsu, reference: Rsu | None) -> None:
+    """Let the sd in ``innovations`` (m, 2) of ``rows`` without bias states hold the biases of the
+    RSU and of the ``reference`` of differences, in place."""
     for pair, row in zip(innovations, rows, strict=True):
-        pair[1] = math.hypot(pair[1], rsu.bias_sd(Kind(int(row[KIND]))))
+        pair[1] = math.hypot(pair[1], bias_sd(Kind(int(row[KIND])), rsu, reference))
 
 
 def fits(innovations: Array, gate: Array) -> bool:

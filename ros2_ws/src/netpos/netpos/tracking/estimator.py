@@ -29,7 +29,14 @@ from netpos.messages.values import (
     TrackMode,
 )
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.epoch_rows import EpochRows, RowForm, Source, epoch_rows_of, widen
+from netpos.tracking.epoch_rows import (
+    EpochRows,
+    RowForm,
+    Source,
+    epoch_rows_of,
+    reference_of,
+    widen,
+)
 from netpos.tracking.estimates import UpdateResult
 from netpos.tracking.imu_buffer import ImuBuffer
 from netpos.tracking.initialise import Initialiser
@@ -163,7 +170,7 @@ class Estimator(ABC):
         estimate with their sd, which holds these biases (m, 2)."""
         rows = epoch_rows_of([item], self._rsus, None, self._form)
         innovations = self.innovations(rows.rows)
-        widen(innovations, rows.rows, self._rsus[item.rsu_id])
+        widen(innovations, rows.rows, self._rsus[item.rsu_id], reference_of(item, self._rsus))
         return rows, innovations
 
     def heard(self, epoch_rows: EpochRows) -> tuple[Rsu, ...]:
@@ -185,17 +192,15 @@ class Estimator(ABC):
         for the true pose."""
 
     def _collect(self, window: Initialiser, stamp_ns: int, epoch_rows: EpochRows) -> None:
-        """Give ``window`` the rows of an epoch, of planar form, and their slow errors."""
-        shared = epoch_rows.shared_errors(self.biases)
-        bias_var = np.maximum(epoch_rows.slow_variance(self.biases) - shared[:, 0], 0.0)
-        window.add(stamp_ns, epoch_rows.rows, bias_var, self.heard(epoch_rows), shared)
+        """Give ``window`` the rows of an epoch, of planar form."""
+        window.add(stamp_ns, epoch_rows.rows, self.heard(epoch_rows))
 
     def _excess_cost(self, window: Initialiser, stamp_ns: int, pose: InitialPose) -> float:
         """``Initialiser.excess_cost`` of a pose, however sure it is of itself."""
         mean, cov = pose_state(self._config, pose.position[:2], pose.cov[:2, :2])
         var = np.diag(cov).copy()
         var[POSITION] = np.maximum(var[POSITION], _POSE_SD_MIN_M**2)
-        return window.excess_cost(stamp_ns, mean, var)
+        return window.excess_cost(stamp_ns, mean, var, self.biases.slow_errors)
 
     @abstractmethod
     def start_from_pose(self, stamp_ns: int, pose: InitialPose) -> bool:

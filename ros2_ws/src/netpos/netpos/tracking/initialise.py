@@ -1,11 +1,12 @@
 """The first fix: the most probable state behind the first measurements, with the covariance it
 deserves.
 
-A maximum a posteriori fit of [x, y, vx, vy, clock, drift], and of the height where it is unknown,
-at the newest stamp to all measurements of a short window: Gauss-Newton from several starts, under
-a prior as wide as the coverage of the RSUs, the initial speed and the clock allow. It takes any
-mixture of angles, times, ranges and fixes, and it waits while the measurements leave the position
-open.
+A maximum a posteriori fit of [x, y, vx, vy, clock, drift], and of the slow errors in the
+measurements (the height too, where it is unknown), at the newest stamp to all measurements of a
+short window: Gauss-Newton from several starts, under a prior as wide as the coverage of the RSUs,
+the initial speed and the clock allow. It takes any mixture of angles, times, ranges and fixes, and
+it waits while the measurements leave the position open. The track goes on with the slow errors as
+the fit found them: what they have in common with the position is not heard twice.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from netpos.estimation.measurement import (
     KIND,
     LEVER,
     ORIGIN,
-    ROW_WIDTH,
+    REFERENCE,
     VALUE,
     VARIANCE,
     Kind,
@@ -45,13 +46,14 @@ from netpos.estimation.mixture.ridge import Fit, components_of, inverse
 from netpos.estimation.mixture.ring import RING_MERGE_COST
 from netpos.estimation.mixture.window import Window, normal_equations
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
+from netpos.estimation.rows import drop_biases
 from netpos.estimation.sensors.table import BY_KIND
 from netpos.estimation.state import N_CORE
 from netpos.messages.values import Array
 from netpos.tracking import wrong_rsu
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.models import carries_modes
-from netpos.tracking.rsus import Rsu
+from netpos.tracking.models import carries_modes, slow_states, state_of_fit
+from netpos.tracking.rsus import Rsu, SlowErrors
 
 _REFINED = 12
 _ATTEMPT_NS = 100_000_000
@@ -63,8 +65,7 @@ _CONTRADICTS = 9.0  # mean squared residual over variance
 _NEAREST_M = 1.0
 _HEADINGS = 16
 _HEADING_SD_MAX = 0.5
-# Columns behind those of a row: what ``Initialiser.add`` is told of its slow errors.
-_BIAS_VAR, _SHARED_VAR, _LASTS, _COMMON_STATE = range(ROW_WIDTH, ROW_WIDTH + 4)
+_LEAST_SD = 1e-9  # of a slow error
 _RAY_M = (2.0, 6.0, 15.0, 40.0, 100.0)
 _RAYS_REACH_M = 150.0  # where devices are farther from the RSUs, the rays are longer
 _CIRCLE = tuple(2.0 * math.pi * i / 12 for i in range(12))
@@ -86,8 +87,8 @@ class _Solution(NamedTuple):
     fits: list[Fit]
     log_odds: float = 0.0
 
-    def mixture(self, misfit: float, n: int, is_possible: Callable[[Array], bool]) -> Mixture:
-        """The posterior of the first ``n`` states; a ``misfit`` above 1 enlarges all variances."""
+    def mixture(self, misfit: float, is_possible: Callable[[Array], bool]) -> Mixture:
+        """The posterior of all states; a ``misfit`` above 1 enlarges all variances."""
 
         def equations(state: Array) -> tuple[float, Array, Array]:
             cost, b, A = normal_equations(state, *self.problem)
@@ -95,7 +96,7 @@ class _Solution(NamedTuple):
 
         fits = [(cost / misfit, mean, cov * misfit) for cost, mean, cov in self.fits]
         means, covs, log_weights = components_of(equations, fits, is_possible)
-        return Mixture(means[:, :n], covs[:, :n, :n], log_weights + self.log_odds)
+        return Mixture(means, covs, log_weights + self.log_odds)
 
 
 def joined(mixtures: Sequence[Mixture]) -> Mixture:
@@ -125,14 +126,10 @@ class Initialiser:
     def __init__(self, config: TrackerConfig) -> None:
         self._config = config
         self._window: deque[tuple[int, Array, tuple[Rsu, ...]]] = deque()
+        self._own = slow_states(config).slow_errors
         self._next_attempt_ns = 0
         self.missing = ""
         """What a first fix lacks, for people; empty before the first attempt."""
-
-    @property
-    def _states(self) -> int:
-        """Number of states of a first fix."""
-        return N_CORE + (self._config.device_height_sd_m > 0.0)
 
     def copy(self) -> Initialiser:
         """An independent copy."""
@@ -142,33 +139,21 @@ class Initialiser:
         twin.missing = self.missing
         return twin
 
-    def add(
-        self,
-        stamp_ns: int,
-        rows: Array,
-        bias_var: Array,
-        rsus: tuple[Rsu, ...],
-        shared: Array | None = None,
-    ) -> None:
-        """Take the rows (m, ROW_WIDTH) of one epoch; ``bias_var`` (m,) is the variance of the
-        biases in each. ``shared`` (m, 2): variance of the error that each row has in common with
-        all of its COMMON state, and 1 where it is the same at the next epoch; None: of none."""
-        if shared is None:
-            shared = np.zeros((len(rows), 2))
-        slow = np.column_stack([bias_var, shared, rows[:, COMMON]])
+    def add(self, stamp_ns: int, rows: Array, rsus: tuple[Rsu, ...]) -> None:
+        """Take the rows (m, ROW_WIDTH) of one epoch, which name their slow errors as a track
+        does."""
         rows = rows.copy()
-        rows[:, BIAS] = rows[:, COMMON] = rows[:, HEADING] = -1
-        rows[rows[:, HEIGHT] > 0, HEIGHT] = N_CORE
-        self._window.append((stamp_ns, np.column_stack([rows, slow]), rsus))
+        rows[:, HEADING] = -1
+        self._window.append((stamp_ns, rows, rsus))
         oldest = stamp_ns - int(self._config.initial_window_s * 1e9)
         while self._window[0][0] < oldest:
             self._window.popleft()
 
-    def solve(self) -> Mixture | None:
-        """State (6,) at the newest stamp, the height of the device over its mean as the seventh
-        where it is unknown, as a mixture: a place that is a thin arc is a row of components, and
-        places that cannot be told apart are modes. None while the position is open, or for most
-        of the window while there are several modes.
+    def solve(self, slow: SlowErrors | None = None) -> Mixture | None:
+        """State (n,) of a track at the newest stamp, with the ``slow`` errors that rows name
+        (None: those of the device alone), as a mixture: a place that is a thin arc is a row of
+        components, and places that cannot be told apart are modes. None while the position is
+        open, or for most of the window while there are several modes.
 
         Of three or more RSUs one may err grossly: what the others say is a part of the posterior.
         Where the measurements contradict each other and leaving out one RSU makes them agree, the
@@ -179,14 +164,19 @@ class Initialiser:
         if newest < self._next_attempt_ns:
             return None
         self._next_attempt_ns = newest + _ATTEMPT_NS
-        rows, ages = self._stacked()
-        agreed = self._solution(rows, ages)
+        slow = slow or self._own
+        rows, ages, errors_sd = self._stacked(slow)
+        agreed = self._solution(rows, ages, errors_sd)
         if not agreed.fits:
             self.missing = f"no place in front of the RSUs fits {self._heard(rows)}"
             return None
         solutions, agrees = [agreed], self._consistent(agreed.fits[0], len(rows))
         if not agrees:
-            solutions = self._without_one(rows, ages) or self._any_clock(rows, ages) or solutions
+            solutions = (
+                self._without_one(rows, ages, errors_sd)
+                or self._any_clock(rows, ages, errors_sd)
+                or solutions
+            )
         cost, _, cov = solutions[0].fits[0]
         misfit = max(1.0, cost / len(rows))
         lacks = self._lacks(rows, cov, misfit)
@@ -195,14 +185,25 @@ class Initialiser:
             return None
         if agrees and self._config.isolate_rsus:
             solutions += self._one_errs(rows, agreed.problem)
-        n = self._states
-        mixture = joined([s.mixture(misfit, n, self._plausible) for s in solutions])
+        mixture = joined(
+            [self._of_track(s.mixture(misfit, self._plausible), slow) for s in solutions]
+        )
         waited_s = (newest - self._window[0][0]) * 1e-9
         waits = waited_s < 0.8 * self._config.initial_window_s or not carries_modes(self._config)
         if waits and has_modes(mixture, _RIVAL_SHARE):
             self.missing = f"more than one place fits {self._heard(rows)}; waiting for more"
             return None
         return mixture
+
+    def _of_track(self, mixture: Mixture, slow: SlowErrors) -> Mixture:
+        """The states of a track, of the components of a fit."""
+        n = N_CORE + int(slow.lasts.sum())
+        states = [
+            state_of_fit(self._config, mean[:n], cov[:n, :n], slow)
+            for mean, cov in zip(mixture.means, mixture.covs, strict=True)
+        ]
+        means, covs = np.array([mean for mean, _ in states]), np.array([cov for _, cov in states])
+        return Mixture(means, covs, mixture.log_weights)
 
     def _lacks(self, rows: Array, cov: Array, misfit: float) -> str:
         """What a fit of the covariance ``cov`` lacks, for people; empty where it lacks nothing."""
@@ -220,15 +221,15 @@ class Initialiser:
             )
         return ""
 
-    def excess_cost(self, stamp_ns: int, mean: Array, var: Array) -> float:
+    def excess_cost(self, stamp_ns: int, mean: Array, var: Array, slow: SlowErrors) -> float:
         """How much worse the window fits where the device is at ``mean`` (6,), with variances
         ``var`` (6,), at ``stamp_ns`` than where it fits best: chi-square with 2 degrees of freedom
         for the true position. 0 without measurements of the time."""
         age_s = (stamp_ns - self._window[-1][0]) * 1e-9 if self._window else math.inf
         if age_s > self._config.initial_window_s:
             return 0.0
-        rows, ages = self._stacked()
-        problem = self._problem(rows, ages)
+        rows, ages, errors_sd = self._stacked(slow)
+        problem = self._problem(rows, ages, errors_sd)
         fits = self._fits(rows, problem)
         if not fits:
             return 0.0
@@ -241,12 +242,15 @@ class Initialiser:
         cost = _solve(start, problem._replace(prior=mean, prior_var=var))[0]
         return max(0.0, cost - fits[0][0])
 
-    def _stacked(self) -> tuple[Array, Array]:
-        """The rows of the window, and their ages [s], <= 0, against the newest."""
+    def _stacked(self, slow: SlowErrors) -> tuple[Array, Array, Array]:
+        """The rows of the window, their ages [s], <= 0, against the newest, and the sd of the slow
+        errors that are states of the fit."""
         newest = self._window[-1][0]
         rows = np.vstack([entry[1] for entry in self._window])
-        ages = [np.full(len(entry[1]), (entry[0] - newest) * 1e-9) for entry in self._window]
-        return rows, np.concatenate(ages)
+        ages = np.concatenate(
+            [np.full(len(entry[1]), (entry[0] - newest) * 1e-9) for entry in self._window]
+        )
+        return rows, ages, _name_states_of_fit(rows, ages, slow)
 
     def _heard(self, rows: Array) -> str:
         """What was measured, by whom."""
@@ -258,11 +262,11 @@ class Initialiser:
         """Whether the cost of a fit is one that true measurements have."""
         return bool(fit[0] <= chi_square_bound(rows, 1.0 - self._config.gate_probability))
 
-    def _solution(self, rows: Array, ages: Array) -> _Solution:
-        problem = self._problem(rows, ages)
+    def _solution(self, rows: Array, ages: Array, errors_sd: Array) -> _Solution:
+        problem = self._problem(rows, ages, errors_sd)
         return _Solution(problem, self._fits(rows, problem))
 
-    def _without_one(self, rows: Array, ages: Array) -> list[_Solution]:
+    def _without_one(self, rows: Array, ages: Array, errors_sd: Array) -> list[_Solution]:
         """Solutions with a consistent fit without one of the RSUs, best first; none of fewer than
         three RSUs."""
         placed = wrong_rsu.placed(rows)
@@ -272,17 +276,17 @@ class Initialiser:
         solutions = []
         for origin in origins:
             keep = ~placed | (rows[:, ORIGIN:AXES] != origin).any(axis=1)
-            others = self._solution(rows[keep], ages[keep])
+            others = self._solution(rows[keep], ages[keep], errors_sd)
             fits = [fit for fit in others.fits if self._consistent(fit, int(keep.sum()))]
             if fits:
                 solutions.append(others._replace(fits=fits))
         return sorted(solutions, key=lambda solution: solution.fits[0][0])
 
-    def _any_clock(self, rows: Array, ages: Array) -> list[_Solution]:
+    def _any_clock(self, rows: Array, ages: Array, errors_sd: Array) -> list[_Solution]:
         """The solution with a consistent fit whatever the clock offset is, if there is one."""
         if not any(BY_KIND[int(kind)].has_clock for kind in np.unique(rows[:, KIND])):
             return []
-        problem = self._problem(rows, ages)
+        problem = self._problem(rows, ages, errors_sd)
         problem.prior_var[4] = (SPEED_OF_LIGHT_MPS * _ANY_CLOCK_S) ** 2
         fits = [fit for fit in self._fits(rows, problem) if self._consistent(fit, len(rows))]
         return [_Solution(problem, fits)] if fits else []
@@ -295,7 +299,7 @@ class Initialiser:
             found.append(_Solution(changed, self._fits(rows, changed), case.log_odds))
         return [solution for solution in found if solution.fits]
 
-    def _problem(self, rows: Array, ages: Array) -> Problem:
+    def _problem(self, rows: Array, ages: Array, errors_sd: Array) -> Problem:
         cfg = self._config
         c = SPEED_OF_LIGHT_MPS
         origins = np.array([r.info.position[:2] for e in self._window for r in e[2]])
@@ -307,13 +311,10 @@ class Initialiser:
         prior = np.array([*centre, 0.0, 0.0, 0.0, c * cfg.clock_drift_mean])
         sd = np.array([reach, reach, *([cfg.initial_speed_sd_mps] * 2)])
         clock_sd = c * np.array([cfg.clock_offset_sd_s, max(cfg.clock_drift_sd, 1e-15)])
-        prior_var = np.concatenate([sd, np.maximum(clock_sd, 1e-6)]) ** 2
-        if cfg.device_height_sd_m > 0.0:
-            prior = np.append(prior, 0.0)
-            prior_var = np.append(prior_var, cfg.device_height_sd_m**2)
-        shared, shared_var = _shared_errors(rows, ages)
-        window = Window(ages, _bias_inflated(rows), shared, shared_var, cfg.device_height_m)
-        return Problem(window, prior, prior_var)
+        errors_sd = np.maximum(errors_sd, _LEAST_SD)
+        prior_var = np.concatenate([sd, np.maximum(clock_sd, 1e-6), errors_sd]) ** 2
+        prior = np.append(prior, np.zeros(errors_sd.size))
+        return Problem(Window(ages, rows, cfg.device_height_m), prior, prior_var)
 
     def _fits(self, rows: Array, problem: Problem) -> list[Fit]:
         """Solutions from the most promising starts, best first."""
@@ -339,7 +340,7 @@ class Initialiser:
         }
         for rsu in heard.values():
             dx, dy = state[:2] - rsu.info.position[:2]
-            up = state[N_CORE : self._states].sum()
+            up = state[N_CORE : N_CORE + self._own.sd.size].sum()
             dz = self._config.device_height_m + up - rsu.info.position[2]
             near = dx * dx + dy * dy + dz * dz < _NEAREST_M**2
             if not rsu.in_front(dx, dy) or (near and tuple(rsu.info.position) not in ranged):
@@ -356,7 +357,7 @@ def with_heading(
     if not levers.any():
         return None
     rows = rows.copy()
-    rows[:, BIAS] = rows[:, COMMON] = -1
+    drop_biases(rows)
     rows[rows[:, HEADING] >= 0, HEADING] = 6
     rows[:, GROUP] = 0
     reach = 30.0 * float(np.hypot(levers[:, 0], levers[:, 1]).max())  # the fix tells no heading
@@ -386,29 +387,23 @@ def _is_sound(fit: Fit) -> bool:
     return bool(math.isfinite(cost) and np.linalg.eigvalsh(cov[:2, :2])[0] > 0.0)
 
 
-def _bias_inflated(rows: Array) -> Array:
-    """Rows with a variance under which averaging many biased values never beats the bias.
-
-    A bias shared by k rows of the same sensor counts k times in each, so that their mean keeps the
-    bias' variance.
-    """
-    rows, bias_var = rows[:, :ROW_WIDTH].copy(), rows[:, _BIAS_VAR]
-    sensors, sensor = np.unique(rows[:, [KIND, *range(ORIGIN, AXES)]], axis=0, return_inverse=True)
-    count = np.bincount(sensor.reshape(-1), minlength=len(sensors))
-    rows[:, VARIANCE] += count[sensor.reshape(-1)] * bias_var
-    return rows
-
-
-def _shared_errors(rows: Array, ages_s: Array) -> tuple[Array, Array]:
-    """``Window.shared`` and ``Window.shared_var`` of rows with their slow errors."""
-    shared = np.full(len(rows), -1)
-    has = rows[:, _SHARED_VAR] > 0.0
-    if not has.any():
-        return shared, np.zeros(0)
-    since_s = np.where(rows[has, _LASTS] > 0.0, 1.0, ages_s[has])  # of an age of its own, or all
-    names = np.column_stack([rows[has, _COMMON_STATE], since_s])
-    _, first, shared[has] = np.unique(names, axis=0, return_index=True, return_inverse=True)
-    return shared, rows[has, _SHARED_VAR][first]
+def _name_states_of_fit(rows: Array, ages_s: Array, slow: SlowErrors) -> Array:
+    """Let ``rows`` (m, ROW_WIDTH) name the ``slow`` errors as states of the fit, in place: behind
+    those of the device first those that last, then the others, of every epoch its own. Their
+    sd."""
+    sd, rank = slow.sd[slow.lasts], np.cumsum(slow.lasts) - 1
+    for column in (BIAS, COMMON, REFERENCE, HEIGHT):
+        named = np.flatnonzero(rows[:, column] >= slow.first)
+        error = rows[named, column].astype(int) - slow.first
+        lasts = slow.lasts[error]
+        rows[named[lasts], column] = N_CORE + rank[error[lasts]]
+        new, error = named[~lasts], error[~lasts]
+        if new.size:
+            epochs = np.column_stack([error, ages_s[new]])
+            _, first, which = np.unique(epochs, axis=0, return_index=True, return_inverse=True)
+            rows[new, column] = N_CORE + sd.size + which.reshape(-1)
+            sd = np.append(sd, slow.sd[error[first]])
+    return sd
 
 
 def _starts(rows: Array, centre: Array, reach_m: float) -> list[Array]:

@@ -16,7 +16,7 @@ from netpos.estimation.state import N_CORE, POSITION, HeightState, X
 from netpos.messages.values import Array
 from netpos.tracking.config import ROBUST, TrackerConfig
 from netpos.tracking.learning import LearnedErrors
-from netpos.tracking.rsus import BiasStates
+from netpos.tracking.rsus import BiasStates, SlowErrors
 
 
 def gate_thresholds(probability: float) -> Array:
@@ -137,16 +137,19 @@ def slow_states(config: TrackerConfig, learned: LearnedErrors | None = None) -> 
 
 def start_state(config: TrackerConfig, mean: Array, cov: Array) -> tuple[Array, Array]:
     """Mean and covariance that a filter starts from: core states (6,), (6, 6), to which the
-    motion model's own states and the height come; a height that was fitted with them is the
-    seventh. What has all of them stays as it is."""
-    height = height_state(config).entry
-    if not height:
-        return augmented(mean, cov, initial_extra_sd(config))
-    sd = np.append(initial_extra_sd(config), config.device_height_sd_m)
-    if mean.size in (N_CORE, N_CORE + sd.size):
-        return augmented(mean, cov, sd)
-    fitted = [*range(N_CORE), height]
-    start, start_cov = np.zeros(height + 1), np.diag(np.append(np.zeros(N_CORE), np.square(sd)))
+    motion model's own states and the height come. What has all of them stays as it is."""
+    sd = np.append(initial_extra_sd(config), slow_states(config).sd)
+    return augmented(mean, cov, sd)
+
+
+def state_of_fit(
+    config: TrackerConfig, mean: Array, cov: Array, slow: SlowErrors
+) -> tuple[Array, Array]:
+    """Mean and covariance that a filter starts from after a fit: core states and the slow errors
+    that last, (n,), (n, n). The motion model's own states and the other errors are not known."""
+    sd = np.concatenate([np.zeros(N_CORE), initial_extra_sd(config), slow.sd])
+    fitted = np.concatenate([np.arange(N_CORE), slow.first + np.flatnonzero(slow.lasts)])
+    start, start_cov = np.zeros(sd.size), np.diag(sd**2)
     start[fitted] = mean
     start_cov[np.ix_(fitted, fitted)] = cov
     return start, start_cov

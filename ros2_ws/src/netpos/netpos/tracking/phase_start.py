@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from netpos.estimation.measurement import AXES, BIAS, COMMON, GROUP, ORIGIN, VALUE, VARIANCE
+from netpos.estimation.measurement import AXES, GROUP, ORIGIN, VALUE, VARIANCE
 from netpos.estimation.mixture.sectors import phase_place, sectors_of_fix
 from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.phase_fix import TWO_PI, init_hypothesis, phase_scale
+from netpos.estimation.rows import drop_biases
 from netpos.messages.values import Array, Velocity
 from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig
@@ -101,7 +102,7 @@ class PhaseStart:
         rest = rows[rows[:, GROUP] != rows[at, GROUP]].copy()
         if len(rest):
             rest[:, GROUP] = np.unique(rest[:, GROUP], return_inverse=True)[1]
-            rest[:, BIAS] = rest[:, COMMON] = -1  # no states yet
+            drop_biases(rest)  # no states yet
             estimate.step(stamp_ns, 0.0, 0, rest, NO_BIAS)
         return estimate
 

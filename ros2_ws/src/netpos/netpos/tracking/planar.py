@@ -12,7 +12,7 @@ import numpy as np
 from netpos.estimation.fit import innovations_with_sd
 from netpos.estimation.measurement import VARIANCE
 from netpos.estimation.mixture.gaussians import Mixture, moments, one_component
-from netpos.estimation.state import POSITION, VELOCITY
+from netpos.estimation.state import N_CORE, POSITION, VELOCITY
 from netpos.messages.values import (
     Array,
     InitialPose,
@@ -153,14 +153,16 @@ class PlanarEstimator(Estimator):
         pose = self._pose_at(stamp_ns)
         if pose is None:
             self._collect(self._initialiser, stamp_ns, epoch_rows)
-        fix = one_component(*pose) if pose is not None else self._initialiser.solve()
+        slow = self.biases.slow_errors
+        fix = one_component(*pose) if pose is not None else self._initialiser.solve(slow)
         if fix is None:
             return FirstFix(False)
         if self._heading >= 0:
             rows = epoch_rows.rows.copy()
             rows[:, VARIANCE] += bias_var
             mean, cov = moments(fix)
-            turned = with_heading(mean, cov, rows, self._config.device_height_m)
+            core = mean[:N_CORE], cov[:N_CORE, :N_CORE]
+            turned = with_heading(*core, rows, self._config.device_height_m)
             if turned is None:
                 self._initialiser.missing = _OPEN_HEADING
                 return FirstFix(False, refused="heading_open")

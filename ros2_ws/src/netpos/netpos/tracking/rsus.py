@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from netpos.estimation.measurement import BIAS, GATE_VARIANCE, GROUP, Kind
+from netpos.estimation.measurement import BIAS, GATE_VARIANCE, GROUP, REFERENCE, Kind
 from netpos.estimation.rows import UNCOUPLED, Coupling, rsu_axes, rsu_place, scalar_kinds
 from netpos.estimation.sensors.table import BY_KIND, SENSORS, readings
 from netpos.estimation.state import N_CORE, VELOCITY
@@ -22,7 +23,7 @@ from netpos.messages.values import (
     RsuMeasurement,
     StepCalibration,
 )
-from netpos.tracking.learning import WINDOW_S, LearnedErrors, Name
+from netpos.tracking.learning import WINDOW_S, ErrorModel, LearnedErrors, Name
 from netpos.tracking.rest import rests
 
 _RSU = "rsu/"
@@ -54,14 +55,9 @@ class Rsu:
         return cls(info, axes, rsu_place(info, axes), cone, not any(slow))
 
     def bias_sd(self, kind: Kind) -> float:
-        """Standard deviation of the RSU's own bias in rows of a kind; 0 where it has none. A
-        difference has those of two RSUs alike."""
-        sensor = BY_KIND[kind]
-        if sensor.bias_sd is None:
-            return 0.0
-        reading = sensor.reading
-        factor = math.sqrt(2.0) if reading is not None and reading.has_reference else 1.0
-        return factor * float(getattr(self.info, sensor.bias_sd))
+        """Standard deviation of the RSU's own bias in rows of a kind; 0 where it has none."""
+        name = BY_KIND[kind].bias_sd
+        return 0.0 if name is None else float(getattr(self.info, name))
 
     def common_bias_sd(self, kind: Kind) -> float:
         """Standard deviation of the bias that its network shares in rows of a kind; 0: none."""
@@ -95,11 +91,48 @@ class StepErrors:
     tau_s: float = 0.0
 
 
-def _name(m: RsuMeasurement, kind: Kind) -> tuple[str, str]:
-    """Whose errors those of a measurement's row of a kind are: of an RSU, or of a pair."""
+def is_difference(kind: Kind) -> bool:
+    """Whether a row of a kind compares an RSU with a second one, the reference."""
     reading = BY_KIND[kind].reading
-    pair = reading is not None and reading.has_reference
-    return _RSU + (f"{m.rsu_id}-{m.reference_rsu_id}" if pair else m.rsu_id), kind.name
+    return reading is not None and reading.has_reference
+
+
+def bias_sd(kind: Kind, rsu: Rsu, reference: Rsu | None) -> float:
+    """Standard deviation of the biases in a row of a kind: the RSU's own, and in a difference that
+    of the reference, too."""
+    own = rsu.bias_sd(kind)
+    return math.hypot(own, reference.bias_sd(kind)) if reference and is_difference(kind) else own
+
+
+def _name(m: RsuMeasurement, kind: Kind) -> Name:
+    """Whose errors those of a measurement's row of a kind are: of an RSU, or of a pair."""
+    of_pair = f"{m.rsu_id}-{m.reference_rsu_id}"
+    return _RSU + (of_pair if is_difference(kind) else m.rsu_id), kind.name
+
+
+class _Ends(NamedTuple):
+    """The states of the biases in a row: the RSU's own, and the one that is subtracted (0:
+    none)."""
+
+    own: int
+    reference: int
+
+    @property
+    def states(self) -> tuple[int, ...]:
+        """Those that there are."""
+        return self[:2] if self.reference else self[:1]
+
+
+class SlowErrors(NamedTuple):
+    """The slow errors that rows name as states of a track.
+
+    first : index of the state of the first of them
+    sd (k,) : standard deviation of each; lasts (k,) : whether it is the same at the next epoch
+    """
+
+    first: int
+    sd: Array
+    lasts: npt.NDArray[np.bool_]
 
 
 class PriorChange(NamedTuple):
@@ -120,8 +153,10 @@ class BiasStates:
     learned: LearnedErrors | None = None
     sd: list[float] = field(default_factory=list)
     tau_s: list[float] = field(default_factory=list)
-    _slots: dict[tuple[str, str], int] = field(default_factory=dict)
-    _last_ns: dict[tuple[str, str], int] = field(default_factory=dict)
+    _slots: dict[Name, int] = field(default_factory=dict)
+    _ends: dict[Name, _Ends] = field(default_factory=dict)
+    """Of those learned."""
+    _last_ns: dict[Name, int] = field(default_factory=dict)
     version: int = 0
     """Changes with ``sd`` and ``tau_s``."""
 
@@ -136,6 +171,7 @@ class BiasStates:
             self.sd,
             self.tau_s,
             self._slots,
+            self._ends,
             last_ns,
             self.version,
         )
@@ -144,43 +180,51 @@ class BiasStates:
         """(2, k): standard deviation and time constant of each."""
         return np.array([self.sd, self.tau_s]).reshape(2, -1)
 
-    def common(self, state: int) -> tuple[float, bool]:
-        """Variance of the error with the index ``state``, and whether it lasts from one epoch to
-        the next."""
-        k = state - self.first
-        return self.sd[k] ** 2, self.tau_s[k] > _RENEWED_S
+    @property
+    def slow_errors(self) -> SlowErrors:
+        """All of them, as a first fix takes them."""
+        return SlowErrors(self.first, np.array(self.sd), np.array(self.tau_s) > _RENEWED_S)
 
-    def coupling(self, rsu: Rsu, m: RsuMeasurement, shares: bool = False) -> Coupling:
+    def coupling(
+        self, rsu: Rsu, m: RsuMeasurement, reference: Rsu | None = None, shares: bool = False
+    ) -> Coupling:
         """Coupling of the rows of ``m`` as the RSU declares it; new biases are added to ``sd`` and
         ``tau_s``.
 
+        reference : the RSU from which a difference counts
         shares : another difference of this epoch counts from the same RSU
         """
-        if rsu.plain and not shares:
+        if rsu.plain and not shares and (reference is None or reference.plain):
             return UNCOUPLED
         info = rsu.info
         bias: dict[Kind, int] = {}
         common: dict[Kind, int] = {}
         inflation: dict[Kind, float] = {}
+        subtracted: dict[Kind, int] = {}
         for kind in rsu.kinds(m):
             if rsu.bias_sd(kind) > 0.0:
-                name = _name(m, kind)
-                bias[kind] = self._slot(name, rsu.bias_sd(kind), info.bias_correlation_time_s)
+                bias[kind] = self._bias_slot(rsu, kind)
+            if reference is not None and is_difference(kind) and reference.bias_sd(kind) > 0.0:
+                subtracted[kind] = self._bias_slot(reference, kind)
             if rsu.common_bias_sd(kind) > 0.0:
                 common[kind] = self._common_slot(rsu, kind)
             if info.noise_correlation_time_s > 0.0:
                 inflation[kind] = self._inflation(m, info.noise_correlation_time_s, kind)
-        if not shares:
-            return Coupling(bias, common, inflation)
-        return self._with_reference(rsu, m, Coupling(bias, common, inflation))
+        declared = Coupling(bias, common, inflation, reference=subtracted)
+        return self._with_shared_noise(rsu, m, declared) if shares else declared
 
-    def _with_reference(self, rsu: Rsu, m: RsuMeasurement, own: Coupling) -> Coupling:
+    def _bias_slot(self, rsu: Rsu, kind: Kind) -> int:
+        """Index of an RSU's own bias as it declares it."""
+        name = _RSU + rsu.info.rsu_id, kind.name
+        return self._slot(name, rsu.bias_sd(kind), rsu.info.bias_correlation_time_s)
+
+    def _with_shared_noise(self, rsu: Rsu, m: RsuMeasurement, own: Coupling) -> Coupling:
         """The coupling with half of the variance of a difference in a state that those of one
         epoch with the same reference share, and that is new at every epoch."""
         common, inflation, gate = dict(own.common), dict(own.inflation), dict(own.gate)
         for kind in rsu.kinds(m):
             reading = BY_KIND[kind].reading
-            if reading is None or not reading.has_reference:
+            if reading is None or not is_difference(kind):
                 continue
             sd = reading.scale * math.sqrt(getattr(m, reading.variance) / 2.0)
             name = ("reference/" + m.reference_rsu_id, kind.name)
@@ -191,7 +235,7 @@ class BiasStates:
             common[kind] = self.first + k
             inflation[kind] = 0.5 * inflation.get(kind, 1.0)
             gate[kind] = 0.5 * gate.get(kind, 1.0)
-        return Coupling(own.bias, common, inflation, gate)
+        return Coupling(own.bias, common, inflation, gate, own.reference)
 
     def learned_coupling(
         self,
@@ -199,12 +243,14 @@ class BiasStates:
         m: RsuMeasurement,
         variance: Array,
         learned: LearnedErrors,
+        reference: Rsu | None = None,
         shares: bool = False,
     ) -> Coupling:
         """Coupling of the rows of ``m``, of ``variance`` (rows,) as stated, by what is learned of
-        the RSU; new biases are added to ``sd`` and ``tau_s``. ``shares`` as for ``coupling``."""
+        the RSU; new biases are added to ``sd`` and ``tau_s``. The rest as for ``coupling``."""
         info = rsu.info
         bias: dict[Kind, int] = {}
+        subtracted: dict[Kind, int] = {}
         common: dict[Kind, int] = {}
         inflation: dict[Kind, float] = {}
         gate: dict[Kind, float] = {}
@@ -212,17 +258,31 @@ class BiasStates:
             if BY_KIND[kind].bias_sd is None:
                 continue
             name = _name(m, kind)
-            declared = rsu.bias_sd(kind), info.bias_correlation_time_s
+            declared = bias_sd(kind, rsu, reference), info.bias_correlation_time_s
             model = learned.model(name, math.sqrt(var), *declared, m.stamp_ns)
             tau_s = info.noise_correlation_time_s or WINDOW_S
             correlated = self._inflation(m, tau_s, kind)
-            bias[kind] = self._slot(name, model.bias_sd, model.time_s(0.0))
+            ends = self._learned_ends(name, m, kind, model)
+            bias[kind] = ends.own
+            if ends.reference:
+                subtracted[kind] = ends.reference
             inflation[kind] = model.scale * correlated
             gate[kind] = model.gate_scale
             if rsu.common_bias_sd(kind) > 0.0:
                 common[kind] = self._common_slot(rsu, kind)
-        learned_so = Coupling(bias, common, inflation, gate)
-        return self._with_reference(rsu, m, learned_so) if shares else learned_so
+        learned_so = Coupling(bias, common, inflation, gate, subtracted)
+        return self._with_shared_noise(rsu, m, learned_so) if shares else learned_so
+
+    def _learned_ends(self, name: Name, m: RsuMeasurement, kind: Kind, model: ErrorModel) -> _Ends:
+        """The states of the biases of what is learned under ``name``. Those of the two RSUs of a
+        difference are alike until other pairs tell them apart."""
+        if name not in self._ends:
+            two = is_difference(kind)
+            sd, tau_s = model.bias_sd / math.sqrt(1.0 + two), model.time_s(0.0)
+            own = self._slot((_RSU + m.rsu_id, kind.name), sd, tau_s)
+            other = self._slot((_RSU + m.reference_rsu_id, kind.name), sd, tau_s) if two else 0
+            self._ends = {**self._ends, name: _Ends(own, other)}
+        return self._ends[name]
 
     def learn(
         self,
@@ -238,11 +298,11 @@ class BiasStates:
         if learned is None:
             return [], []
         (rows, accepted), (mean, cov) = fitted, posterior
-        names = {i: name for name, i in self._slots.items()}
+        names = {ends: name for name, ends in self._ends.items()}
         left = unexplained(mean, cov, rows, height_m).tolist()
         for row, said in zip(rows, left, strict=True):
-            name = names.get(int(row[BIAS]))
-            if name not in learned.models or not accepted[int(row[GROUP])]:
+            name = names.get(_Ends(int(row[BIAS]), int(row[REFERENCE])))
+            if name is None or not accepted[int(row[GROUP])]:
                 continue
             stated = float(row[GATE_VARIANCE]) / learned.models[name].gate_scale
             learned.hear(name, row, said, stated)
@@ -251,16 +311,37 @@ class BiasStates:
         speed = 0.0 if still else math.hypot(*velocity)
         learned.move(stamp_ns, speed)
         concluded = learned.conclude(stamp_ns, mean, height_m)
+        return concluded, self._take_learned(learned, concluded, speed)
+
+    def _take_learned(
+        self, learned: LearnedErrors, concluded: Collection[Name], speed_mps: float
+    ) -> list[PriorChange]:
+        """Give each bias state the sd and time learned of it; the states whose sd changed. Of
+        several pairs with an RSU the one counts that leaves least to it: where all of its pairs
+        err much, it does itself."""
+        least: dict[int, float] = {}  # half of the smallest variance of a pair with each state
+        for name, model in learned.models.items():
+            for state in self._ends[name].states:
+                half = 0.5 * model.bias_sd**2
+                least[state] = min(half, least.get(state, half))
+        said: dict[int, tuple[float, float]] = {}
+        changed = set()
+        for name, model in learned.models.items():
+            states = self._ends[name].states
+            for state in states:
+                others = sum(least[other] for other in states if other != state)
+                new = model.bias_sd**2 - others, model.time_s(speed_mps)
+                said[state] = min(new, said.get(state, new))
+                changed |= {state} if name in concluded else set()
         self.sd, self.tau_s = self.sd.copy(), self.tau_s.copy()
         changes = []
-        for name, model in learned.models.items():
-            index = self._slots[name]
-            k = index - self.first
-            self.tau_s[k] = model.time_s(speed)
-            if name in concluded:
-                changes.append(PriorChange(index, self.sd[k], model.bias_sd))
-                self.sd[k] = model.bias_sd
-        return concluded, changes
+        for state, (variance, time_s) in said.items():
+            k = state - self.first
+            self.tau_s[k] = time_s
+            if state in changed:
+                changes.append(PriorChange(state, self.sd[k], math.sqrt(variance)))
+                self.sd[k] = math.sqrt(variance)
+        return changes
 
     def errors(
         self, names: Iterable[Name], mean: Array, cov: Array, stamp_ns: int, vue_id: str
@@ -275,7 +356,7 @@ class BiasStates:
         found = []
         for rsu_id, of_it in quantities.items():
             models = [self.learned.models[rsu_id, quantity] for quantity in of_it]
-            states = [self._slots[rsu_id, quantity] for quantity in of_it]
+            biases = [self._bias_of((rsu_id, quantity), mean, cov) for quantity in of_it]
             found.append(
                 RsuErrors(
                     stamp_ns=stamp_ns,
@@ -283,13 +364,22 @@ class BiasStates:
                     vue_id=vue_id,
                     quantities=tuple(of_it),
                     scatter=tuple(math.sqrt(model.gate_scale) for model in models),
-                    bias=tuple(float(mean[i]) for i in states),
-                    bias_sd=tuple(math.sqrt(cov[i, i]) for i in states),
+                    bias=tuple(bias for bias, _ in biases),
+                    bias_sd=tuple(sd for _, sd in biases),
                     bias_spread=tuple(model.bias_sd for model in models),
                     correlation_time_s=tuple(model.time_s(0.0) for model in models),
                 )
             )
         return tuple(found)
+
+    def _bias_of(self, name: Name, mean: Array, cov: Array) -> tuple[float, float]:
+        """The bias of what is learned under ``name``, or the difference of two, and its sd."""
+        own, other = self._ends[name]
+        h = np.zeros(mean.size)
+        h[own] = 1.0
+        if other:
+            h[other] = -1.0
+        return float(h @ mean), math.sqrt(float(h @ cov @ h))
 
     def of_steps(self, source: str) -> tuple[int, int]:
         """State indices of the length factor and the heading offset of a source of step
@@ -326,7 +416,7 @@ class BiasStates:
         for kind in rsu.kinds(m):
             self._last_ns[_name(m, kind)] = m.stamp_ns
 
-    def _slot(self, name: tuple[str, str], sd: float, tau_s: float) -> int:
+    def _slot(self, name: Name, sd: float, tau_s: float) -> int:
         if name not in self._slots:
             self._slots = {**self._slots, name: self.first + len(self.sd)}
             self.sd = [*self.sd, sd]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from netpos.estimation.measurement import BIAS, HEIGHT, VALUE, linearise
+from netpos.estimation.measurement import BIAS, HEIGHT, REFERENCE, VALUE, linearise
 from netpos.estimation.state import X
 from netpos.messages.values import Array
 
@@ -27,7 +27,7 @@ def unshifted(
     a third, and what is left of it looks like an error of the RSU.
     """
     rows = rows.copy()
-    rows[:, BIAS] = -1.0
+    rows[:, BIAS], rows[:, REFERENCE] = -1.0, 0.0
     shifted = [int(X.PX), int(X.PY), int(X.CLOCK)]
     height = int(rows[:, HEIGHT].max())
     if height > 0:  # one that is unknown may explain a residual, too

@@ -10,8 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from netpos.estimation.chi_square import chi_square_bound
-from netpos.estimation.measurement import BIAS, COMMON, GROUP, KIND, LEVER, VARIANCE, Kind
+from netpos.estimation.measurement import GROUP, KIND, LEVER, VARIANCE, Kind
 from netpos.estimation.position_fix import FixStatus, fix_position, start_of
+from netpos.estimation.rows import drop_biases
 from netpos.estimation.space import linearise_in_space
 from netpos.estimation.state import NAV_POSITION, Err, Nav
 from netpos.inertial.alignment import fit_course, way_of
@@ -164,7 +165,7 @@ def _residual_cost(rows: Array, position: Array) -> tuple[float, float, int]:
     nav, at = np.zeros(NAV), rows.copy()
     nav[NAV_POSITION], nav[Nav.QW] = position, 1.0
     at[:, LEVER : LEVER + 3] = 0.0  # the fix is the antenna's
-    at[:, [BIAS, COMMON]] = -1.0
+    drop_biases(at)
     residual, _, _ = linearise_in_space(at, nav, np.zeros((ERR, ERR)))
     weight, times = 1.0 / rows[:, VARIANCE], rows[:, KIND] == Kind.TOA
     if times.any():

@@ -1,7 +1,8 @@
 """One RSU that errs grossly: a case that a first fix allows for.
 
 Its errors, one in each quantity and one in everything that others compare with it, are states of
-the fit: what the RSU says of changes still counts, where it is from then on does not.
+the fit in place of its slow errors: what the RSU says of changes still counts, where it is from
+then on does not.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from netpos.estimation.measurement import AXES, BIAS, COMMON, KIND, ORIGIN, VARIANCE, Kind
+from netpos.estimation.measurement import AXES, BIAS, KIND, ORIGIN, REFERENCE, VARIANCE, Kind
 from netpos.estimation.mixture.window import Window
 from netpos.messages.values import Array
 
@@ -58,11 +59,13 @@ def cases(window: Window, prior: Array, prior_var: Array) -> Iterator[Case]:
         log_odds = math.log(_WRONG)
         for column, of_it in (
             (BIAS, own & _is_at(origins, place)),
-            (COMMON, _is_at(references, place)),
+            (REFERENCE, _is_at(references, place)),
         ):
             for kind in np.unique(rows[of_it, KIND]):
                 alike = of_it & (rows[:, KIND] == kind)
-                variance = _GROSS_SD**2 * float(rows[alike, VARIANCE].mean())
+                slow = rows[alike, column].astype(int)
+                slow_var = np.where(slow > 0, prior_var[slow], 0.0)
+                variance = _GROSS_SD**2 * float((rows[alike, VARIANCE] + slow_var).mean())
                 rows[alike, column] = len(states)
                 states, variances = np.append(states, 0.0), np.append(variances, variance)
                 log_odds -= 0.5 * math.log(2.0 * math.pi * variance)

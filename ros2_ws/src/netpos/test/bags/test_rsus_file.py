@@ -8,14 +8,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from netpos.bags import BagError, BagReader, codec
+from netpos.bags import BagError, BagReader, BagWriter, codec
 from netpos.bags.importers.own.rsus import read_rsus
 from netpos.bags.recording import write_values
 from netpos.bags.rsus_file import load_rsus, save_rsus
 from netpos.cli.main import app
 from netpos.evaluation import evaluate_bag
 from netpos.messages.topics import RSU_INFO, RSU_LEARNED
-from netpos.messages.values import AngleConvention, Field, Odometry, RsuInfo, RsuMeasurement
+from netpos.messages.values import (
+    AngleConvention,
+    Field,
+    Odometry,
+    RsuErrors,
+    RsuInfo,
+    RsuMeasurement,
+)
 from netpos.scenario.replay import replay_bag
 from typer.testing import CliRunner
 
@@ -87,6 +94,33 @@ def test_what_was_learned_is_saved_and_serves_the_next_day(bags: Path, tmp_path:
         )
     assert nees["tuesday"] > 10.0
     assert nees["told"] < 0.3 * nees["tuesday"]
+
+
+def test_the_biases_of_differences_are_those_of_their_rsus(tmp_path: Path) -> None:
+    learned = [
+        RsuErrors(
+            stamp_ns=S,
+            rsu_id=pair,
+            vue_id="v",
+            quantities=("TDOA",),
+            scatter=(1.0,),
+            bias=(0.1,),
+            bias_sd=(0.1,),
+            bias_spread=(spread,),
+            correlation_time_s=(time_s,),
+        )
+        for pair, spread, time_s in (("a1-a0", 0.4, 10.0), ("a2-a1", 0.2, 30.0))
+    ]
+    with BagWriter(tmp_path / "bag") as bag:
+        for info in INFOS:
+            bag.write(RSU_INFO, codec().rsu_info_to_msg(info), S)
+        for errors in learned:
+            bag.write(RSU_LEARNED, codec().rsu_errors_to_msg(errors), S)
+    saved = {info.rsu_id: info for info in save_rsus(tmp_path / "bag", tmp_path / "rsus.yaml")}
+    expected = {"a0": (0.08, 10.0), "a1": (0.05, 20.0), "a2": (0.02, 30.0), "a3": (0.0, 0.0)}
+    for name, (variance, time_s) in expected.items():
+        assert saved[name].range_bias_sd_m ** 2 == pytest.approx(variance)
+        assert saved[name].bias_correlation_time_s == pytest.approx(time_s)
 
 
 def test_a_file_reads_as_it_was_saved(bags: Path, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from netpos.estimation.forms import ekf, srukf
 from netpos.estimation.measurement import (
     AXES,
     KIND,
+    LEVER,
     ORIGIN,
     VALUE,
     Kind,
@@ -100,7 +101,7 @@ def test_the_paper_s_signs() -> None:
     rows = rows_by_kind(info)
     np.testing.assert_allclose(rows[Kind.RANGE][ORIGIN:AXES], [BASELINE / 2, 0, 0], atol=1e-12)
     for row in rows.values():
-        row[-3:] = 0.0
+        row[LEVER:] = 0.0
     phase = predict_row(rows[Kind.PHASE], np.array([2.0, 3.0, 0, 0, 0, 0]), 0.0, np.empty(6))
     expected = 2 * math.pi * BASELINE / WAVELENGTH * math.sin(math.atan2(2.0, 3.0))
     assert phase == pytest.approx(expected, abs=1e-12)

@@ -15,6 +15,7 @@ from netpos.estimation.measurement import (
     KIND,
     LEVER,
     ORIGIN,
+    REFERENCE,
     VALUE,
     Kind,
 )
@@ -36,7 +37,7 @@ from scipy.spatial.transform import Rotation
 LEVER_ARM = (0.4, -0.3, 1.2)
 QUANTITIES = Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE | Field.PHASE | Field.TDOA
 OTHER = RsuInfo(rsu_id="b", position=np.array([-10.0, 25.0, 3.0]))
-REFERENCE = rsu_place(OTHER, rsu_axes(OTHER))
+OTHER_PLACE = rsu_place(OTHER, rsu_axes(OTHER))
 
 
 def state(rng: np.random.Generator) -> Array:
@@ -76,7 +77,7 @@ def all_rows(rng: np.random.Generator) -> Array:
             tdoa_var=1e-18,
             lever_arm=LEVER_ARM,
         )
-        blocks.append(rsu_rows(m, info, rsu_axes(info), 0, reference=REFERENCE))
+        blocks.append(rsu_rows(m, info, rsu_axes(info), 0, reference=OTHER_PLACE))
     unwrapped = blocks[0][blocks[0][:, KIND] == Kind.PHASE].copy()
     unwrapped[:, KIND] = Kind.UNWRAPPED_PHASE
     blocks.append(unwrapped)
@@ -126,17 +127,18 @@ def test_clock_and_biases_are_states_of_their_own() -> None:
     """A TOA counts the clock's offset, every row of an RSU the biases it names; Jacobians are
     central differences in all states. Core states are no biases."""
     rng = np.random.default_rng(4)
-    slow = np.array([250.0, 3.0, 0.3, -0.2])  # offset, drift, own bias, the network's
+    # offset, drift; biases: its own, the network's, that of the RSU a difference counts from
+    slow = np.array([250.0, 3.0, 0.3, -0.2, 0.5])
     nav = np.append(state(rng), slow)
     n = nav.size - 1
     for row in all_rows(rng):
-        row[[BIAS, COMMON]] = 0, 1
+        row[[BIAS, COMMON, REFERENCE]] = 0, 1, 1
         plain = innovation(row, nav[:NAV])[0]
-        row[[BIAS, COMMON]] = ERR_BIASES, ERR_BIASES + 1
+        row[[BIAS, COMMON, REFERENCE]] = ERR_BIASES + np.arange(3)
         value, h = innovation(row, nav)
         from_rsu = int(row[KIND]) not in (Kind.BODY_VELOCITY, Kind.BODY_RATE)
         clock = slow[0] if row[KIND] == Kind.TOA else 0.0
-        expected = clock + (slow[2] + slow[3] if from_rsu else 0.0)
+        expected = clock + (slow[2] + slow[3] - slow[4] if from_rsu else 0.0)
         assert math.remainder(plain - value - expected, math.tau) == pytest.approx(0.0, abs=1e-9)
         np.testing.assert_allclose(
             h, slopes(row, nav, n), rtol=0, atol=2e-6, err_msg=str(row[KIND])

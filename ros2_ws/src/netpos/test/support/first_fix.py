@@ -9,7 +9,7 @@ from netpos.estimation.rows import rsu_rows
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.initialise import Initialiser
-from netpos.tracking.rsus import Rsu
+from netpos.tracking.rsus import Rsu, SlowErrors
 from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 from track_cases import T0
@@ -64,13 +64,13 @@ def solve(
 ) -> tuple[Array, Array] | None:
     initialiser = Initialiser(config)
     rows = np.vstack([measure(s, state, fields, rng, group=i) for i, s in enumerate(stations)])
-    initialiser.add(T0, rows, np.zeros(len(rows)), tuple(stations))
+    initialiser.add(T0, rows, tuple(stations))
     return fix_of(initialiser)
 
 
-def fix_of(initialiser: Initialiser) -> tuple[Array, Array] | None:
-    """Mean (6,) and covariance (6, 6) of a first fix."""
-    fix = initialiser.solve()
+def fix_of(initialiser: Initialiser, slow: SlowErrors | None = None) -> tuple[Array, Array] | None:
+    """Mean (n,) and covariance (n, n) of a first fix, of 6 states and the slow errors."""
+    fix = initialiser.solve(slow)
     if fix is None:
         return None
     weights = np.exp(fix.log_weights)

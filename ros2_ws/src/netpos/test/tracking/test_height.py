@@ -12,7 +12,7 @@ import pytest
 from netpos.bags.recording import number_beacons
 from netpos.messages.values import Array, Field, InitialPose, Odometry, RsuInfo, RsuMeasurement
 from netpos.tracking import Tracker, TrackerConfig, TrackOutput
-from netpos.tracking.models import start_state
+from netpos.tracking.models import slow_states, start_state, state_of_fit
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
@@ -415,7 +415,7 @@ def test_where_the_states_of_a_start_go() -> None:
         motion_model="constant_acceleration", accel_state_sd_mps2=2.0, device_height_sd_m=0.5
     )
     mean, A = np.arange(7.0), np.random.default_rng(1).normal(size=(7, 7))
-    x, P = start_state(config, mean, A @ A.T)
+    x, P = state_of_fit(config, mean, A @ A.T, slow_states(config).slow_errors)
     np.testing.assert_array_equal(x, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 0.0, 0.0, 6.0])
     fitted = [0, 1, 2, 3, 4, 5, 8]
     np.testing.assert_array_equal(P[np.ix_(fitted, fitted)], A @ A.T)

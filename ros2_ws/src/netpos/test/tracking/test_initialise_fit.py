@@ -7,24 +7,24 @@ import math
 import numpy as np
 import pytest
 from first_fix import at, fix_of, measure, rsu, solve
-from netpos.estimation.measurement import Kind, linearise
+from netpos.estimation.measurement import BIAS, COMMON, REFERENCE, VARIANCE, linearise
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.mixture.ridge import inverse as inverse_of
 from netpos.estimation.mixture.window import Window, normal_equations
 from netpos.estimation.rows import speed_row
-from netpos.messages.values import AngleConvention, Array, Field
+from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
+from netpos.tracking import Tracker
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.initialise import (
     Initialiser,
     Problem,
-    _bias_inflated,
     _clock_at,
     _is_sound,
     _solve,
     _starts,
     has_modes,
 )
-from netpos.tracking.rsus import Rsu
+from netpos.tracking.rsus import Rsu, SlowErrors
 from scipy.stats import chi2
 from track_cases import KNOWN_CLOCK, T0
 
@@ -45,57 +45,63 @@ def mixed_rows() -> tuple[list[Rsu], Array, Array]:
 
 
 def problem_of(rows: Array, prior: Array, prior_var: Array) -> Problem:
-    """Rows of one instant that share no errors."""
-    none = np.full(len(rows), -1)
-    return Problem(Window(np.zeros(len(rows)), rows, none, np.zeros(0), 0.0), prior, prior_var)
+    """Rows of one instant."""
+    return Problem(Window(np.zeros(len(rows)), rows, 0.0), prior, prior_var)
 
 
-def linearised(state: Array, window: Window) -> tuple[Array, Array, Array]:
-    """Innovations (m,), Jacobian (m, 6) and covariance (m, m) of the errors, row by row, through
-    the public model."""
-    R = np.diag(window.rows[:, 2])
-    for error, variance in enumerate(window.shared_var):
-        has = (window.shared == error).astype(float)
-        R += variance * np.outer(has, has)
+def linearised(state: Array, window: Window) -> tuple[Array, Array]:
+    """Innovations (m,) and Jacobian (m, n), row by row, through the public model."""
     left, J = [], []
     for age, row in zip(window.ages_s, window.rows, strict=True):
-        F = np.eye(6)
+        F = np.eye(state.size)
         F[0, 2] = F[1, 3] = F[4, 5] = age
         innovation, H = linearise(row[None], F @ state, window.height_m)
         left.append(innovation[0])
         J.append((H @ F)[0])
-    return np.array(left), np.array(J), R
+    return np.array(left), np.array(J)
 
 
 def cost_of(state: Array, problem: Problem) -> float:
     """Twice the negative log posterior."""
-    left, _, R = linearised(state, problem.window)
+    left, _ = linearised(state, problem.window)
     prior = np.sum((state - problem.prior) ** 2 / problem.prior_var)
-    return float(prior + left @ np.linalg.solve(R, left))
+    return float(prior + np.sum(left**2 / problem.window.rows[:, VARIANCE]))
 
 
 @pytest.mark.parametrize("shares", [False, True])
 def test_cost_gradient_and_curvature_of_the_fit(shares: bool) -> None:
-    """Without and with errors that some rows share, one of them between epochs."""
+    """Without and with errors that some rows share. The covariance of the device's states is that
+    of generalised least squares with correlated errors."""
     _, rows, ages = mixed_rows()
     prior = np.array([1.0, 2.0, 0.5, -0.5, 300.0, 20.0])
-    shared = np.full(len(rows), -1)
+    prior_var, errors_var = np.array([900.0, 900.0, 25.0, 25.0, 1e4, 400.0]), np.zeros(0)
+    signs = np.zeros((len(rows), 2 * shares))
     if shares:
-        shared[[0, 3, 4]], shared[[6, 7]] = 0, 1
-    window = Window(ages, rows, shared, np.array([0.5, 2.0])[: 2 * shares], 0.7)
-    problem = Problem(window, prior, np.array([900.0, 900.0, 25.0, 25.0, 1e4, 400.0]))
+        errors_var = np.array([0.5, 2.0])
+        for column, named, error in (
+            (BIAS, [0, 3, 4], 0),
+            (COMMON, [6, 7], 1),
+            (REFERENCE, [5], 0),
+        ):
+            rows[named, column] = 6 + error
+            signs[named, error] = -1.0 if column == REFERENCE else 1.0
+    window = Window(ages, rows, 0.7)
+    several = np.append(prior, 0.0 * errors_var), np.append(prior_var, errors_var)
+    problem = Problem(window, *several)
     rng = np.random.default_rng(2)
     for _ in range(5):
         state = np.array([-12.0, 0.5, 3.0, -2.0, 500.0, 40.0]) + rng.normal(size=6)
+        state = np.append(state, rng.normal(size=errors_var.size))
         cost, half_gradient, hessian = normal_equations(state, *problem)
         assert cost == pytest.approx(cost_of(state, problem), rel=1e-10)
-        numeric = np.empty(6)
-        for i, e in enumerate(np.eye(6) * 1e-5):
+        numeric = np.empty(state.size)
+        for i, e in enumerate(np.eye(state.size) * 1e-5):
             numeric[i] = (cost_of(state + e, problem) - cost_of(state - e, problem)) / 2e-5
         np.testing.assert_allclose(half_gradient, -numeric / 2, rtol=1e-5, atol=1e-3)
-        _, J, R = linearised(state, window)
-        expected = np.diag(1 / problem.prior_var) + J.T @ np.linalg.solve(R, J)
-        np.testing.assert_allclose(hessian, expected, rtol=1e-8, atol=1e-9)
+        J = linearised(state, window)[1][:, :6]
+        R = np.diag(rows[:, VARIANCE]) + signs @ np.diag(errors_var) @ signs.T
+        expected = np.linalg.inv(np.diag(1 / prior_var) + J.T @ np.linalg.solve(R, J))
+        np.testing.assert_allclose(np.linalg.inv(hessian)[:6, :6], expected, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -199,18 +205,6 @@ def test_a_mode_is_elsewhere_and_probable(share: float, apart: float, several: b
     assert has_modes(mixture, 0.01) is several
 
 
-def test_bias_variance_counts_once_per_row_of_the_sensor() -> None:
-    a, b = rsu(0, 0), rsu(40, 0)
-    fields = Field.RANGE | Field.AZIMUTH
-    rows = np.vstack([measure(s, at(9, 9), fields) for s in (a, a, a, b)])
-    bias_var = np.array([0.1, 2.0] * 4)
-    given = np.column_stack([rows, bias_var, np.zeros((8, 3))])
-    before = given.copy()
-    out = _bias_inflated(given)
-    np.testing.assert_array_equal(given, before)
-    np.testing.assert_allclose(out[:, 2] - rows[:, 2], [0.3, 6.0] * 3 + [0.1, 2.0])
-
-
 def test_no_fit_whose_covariance_drowned_in_rounding() -> None:
     assert _is_sound((1.0, np.zeros(6), np.eye(6)))
     assert not _is_sound((math.nan, np.zeros(6), np.eye(6)))
@@ -231,22 +225,22 @@ def test_old_measurements_leave_the_window() -> None:
     config = TrackerConfig(initial_window_s=1.0)
     initialiser = Initialiser(config)
     a, b = rsu(0, 0), rsu(40, 0)
-    initialiser.add(T0, measure(a, at(12, 25), Field.AZIMUTH), np.zeros(1), (a,))
+    initialiser.add(T0, measure(a, at(12, 25), Field.AZIMUTH), (a,))
     on_time = T0 + 1_000_000_000
-    initialiser.add(on_time, measure(b, at(12, 25), Field.AZIMUTH), np.zeros(1), (b,))
+    initialiser.add(on_time, measure(b, at(12, 25), Field.AZIMUTH), (b,))
     assert len(initialiser._window) == 2
-    initialiser.add(on_time + 1, measure(b, at(12, 25), Field.AZIMUTH), np.zeros(1), (b,))
+    initialiser.add(on_time + 1, measure(b, at(12, 25), Field.AZIMUTH), (b,))
     assert [entry[0] for entry in initialiser._window] == [on_time, on_time + 1]
 
 
 def test_attempts_are_at_least_a_tenth_of_a_second_apart() -> None:
     initialiser = Initialiser(TrackerConfig())
     a, b = rsu(0, 0), rsu(40, 0)
-    initialiser.add(T0, measure(a, at(12, 25), Field.AZIMUTH), np.zeros(1), (a,))
+    initialiser.add(T0, measure(a, at(12, 25), Field.AZIMUTH), (a,))
     assert initialiser.solve() is None
     for ms, solved in ((99, False), (100, True)):
         rows = measure(b, at(12, 25), Field.AZIMUTH)
-        initialiser.add(T0 + ms * 1_000_000, rows, np.zeros(1), (b,))
+        initialiser.add(T0 + ms * 1_000_000, rows, (b,))
         assert (initialiser.solve() is not None) is solved
 
 
@@ -258,8 +252,8 @@ def test_an_ambiguity_is_waited_for_most_of_the_window_only() -> None:
     stations = [rsu(0, 0), rsu(40, 0)]
     for ms in range(0, 1700, 100):
         rows = np.vstack([measure(s, at(12, 25), Field.RANGE, range_sd=0.3) for s in stations])
-        initialiser.add(T0 + ms * 1_000_000, rows, np.zeros(2), tuple(stations))
-        single.add(T0 + ms * 1_000_000, rows, np.zeros(2), tuple(stations))
+        initialiser.add(T0 + ms * 1_000_000, rows, tuple(stations))
+        single.add(T0 + ms * 1_000_000, rows, tuple(stations))
         fix = initialiser.solve()
         assert (fix is None) is (ms < 1600)
         assert single.solve() is None  # one Gaussian cannot be at two places
@@ -296,7 +290,7 @@ def test_inconsistent_measurements_widen_the_covariance() -> None:
     results = []
     for values in (good, bad):
         initialiser = Initialiser(TrackerConfig(initial_position_sd_max_m=50.0))
-        initialiser.add(T0, values, np.zeros(4), tuple(stations))
+        initialiser.add(T0, values, tuple(stations))
         solution = fix_of(initialiser)
         assert solution is not None
         results.append(solution)
@@ -305,7 +299,7 @@ def test_inconsistent_measurements_widen_the_covariance() -> None:
     # The limit is for the best place alone, of which the other minima are part in the mixture.
     for limit, found in ((0.9 * sds[1], False), (1.01 * sds[1], True)):
         strict = Initialiser(TrackerConfig(initial_position_sd_max_m=limit))
-        strict.add(T0, bad, np.zeros(4), tuple(stations))
+        strict.add(T0, bad, tuple(stations))
         assert (strict.solve() is not None) is found
     error = results[1][0][:2] - [20.0, 21.0]
     assert error @ np.linalg.solve(results[0][1][:2, :2], error) > 20.0
@@ -320,7 +314,7 @@ def test_the_one_of_four_that_contradicts_the_others_is_left_out(liar: int) -> N
     rows = np.vstack([measure(s, at(20.0, 21.0), fields, group=i) for i, s in enumerate(stations)])
     rows[2 * liar + 1, 1] += 30.0
     full = Initialiser(TrackerConfig(initial_position_sd_max_m=50.0))
-    full.add(T0, rows, np.zeros(8), tuple(stations))
+    full.add(T0, rows, tuple(stations))
     solution = fix_of(full)
     assert solution is not None
     np.testing.assert_allclose(solution[0][:2], [20.0, 21.0], atol=0.02)
@@ -340,34 +334,92 @@ def test_averaging_never_beats_the_bias() -> None:
     """Ten epochs with a 1 m bias in each range: the mean keeps the variance of the bias."""
     stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40)]
     config = TrackerConfig(initial_position_sd_max_m=0.2, initial_speed_sd_mps=1e-3)
-    biased, free = Initialiser(config), Initialiser(config)
+    wide = TrackerConfig(initial_speed_sd_mps=1e-3, isolate_rsus=False)
+    slow = SlowErrors(6, np.ones(3), np.ones(3, np.bool_))
+    biased, free, open_ = Initialiser(config), Initialiser(config), Initialiser(wide)
     for k in range(10):
         rows = np.vstack([measure(s, at(15.0, 15.0), Field.RANGE) for s in stations])
         stamp = T0 + k * 100_000_000
-        biased.add(stamp, rows, np.ones(3), tuple(stations))
-        free.add(stamp, rows, np.zeros(3), tuple(stations))
+        free.add(stamp, rows, tuple(stations))
+        rows[:, BIAS] = 6, 7, 8
+        biased.add(stamp, rows, tuple(stations))
+        open_.add(stamp, rows, tuple(stations))
     assert free.solve() is not None
-    assert biased.solve() is None  # its sd never gets below a metre or so
-    wide = Initialiser(TrackerConfig(initial_speed_sd_mps=1e-3, isolate_rsus=False))
-    for stamp, rows, rsus in biased._window:
-        wide.add(stamp, rows[:, :-1], rows[:, -1], rsus)
-    solution = fix_of(wide)
+    assert biased.solve(slow) is None  # its sd never gets below a metre or so
+    solution = fix_of(open_, slow)
     assert solution is not None
     H = np.array([(np.array([15.0, 15.0]) - s.info.position[:2]) for s in stations])
     H /= np.linalg.norm(H, axis=1)[:, None]
     expected = np.linalg.inv(H.T @ H / (1.0 + 0.3**2 / 10) + np.eye(2) / 150.0**2)
     np.testing.assert_allclose(solution[1][:2, :2], expected, rtol=1e-2, atol=1e-4)
+    # A range that is longer than it should be is as much nearer to the RSU: the ranges are known.
+    of_ranges = (
+        np.column_stack([H, np.eye(3)]) @ solution[1][np.ix_([0, 1, 6, 7, 8], [0, 1, 6, 7, 8])]
+    )
+    known = of_ranges @ np.column_stack([H, np.eye(3)]).T
+    np.testing.assert_allclose(np.diag(known), 0.3**2 / 10, rtol=0.02)
 
 
-def test_bias_columns_do_not_reach_outside_the_six_states() -> None:
-    """Rows that name bias states (6, 7) are fitted without them, and the caller's rows survive."""
+def test_errors_of_a_track_are_states_behind_its_own() -> None:
+    """Of a motion model with two states of its own; an error of one epoch is not known later. The
+    caller's rows survive."""
     stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40)]
     rows = np.vstack([measure(s, at(15.0, 15.0), Field.RANGE) for s in stations])
-    rows[:, 4], rows[:, 5] = 6, 7
-    initialiser = Initialiser(TrackerConfig())
-    initialiser.add(T0, rows, np.zeros(3), tuple(stations))
-    solution = fix_of(initialiser)
+    rows[:, BIAS], rows[:, COMMON] = (8, 8, 10), (9, 9, -1)
+    slow = SlowErrors(8, np.array([1.0, 0.5, 2.0]), np.array([True, False, True]))
+    initialiser = Initialiser(TrackerConfig(motion_model="constant_acceleration"))
+    initialiser.add(T0, rows, tuple(stations))
+    before = rows.copy()
+    solution = fix_of(initialiser, slow)
     assert solution is not None
-    np.testing.assert_allclose(solution[0][:2], 15.0, atol=0.02)
-    assert set(rows[:, 4]) == {6.0}
-    assert set(rows[:, 0]) == {float(Kind.RANGE)}
+    np.testing.assert_array_equal(rows, before)
+    mean, cov = solution
+    assert mean.size == 11
+    np.testing.assert_allclose(mean[:2], 15.0, atol=0.05)
+    np.testing.assert_allclose(cov[9, 9], 0.25)
+    assert np.count_nonzero(cov[9]) == 1
+    assert abs(cov[8, 0]) > 0.01
+    assert abs(cov[10, 0]) > 0.01
+
+
+def test_a_bias_counts_once_in_first_fix_and_track() -> None:
+    """A device that stands, and biases that stay: what the first fix has made of them is not heard
+    a second time."""
+    sites = np.array([(0.0, 0.0), (40.0, 0.0), (0.0, 40.0)])
+    place, draws, nees = np.array([15.0, 18.0]), 60, 0.0
+    for seed in range(draws):
+        rng = np.random.default_rng(seed)
+        tracker = Tracker(
+            TrackerConfig(
+                hold_s=0.0,
+                accel_density_mps2_sqrthz=1e-3,
+                initial_speed_sd_mps=1e-2,
+                isolate_rsus=False,
+                device_height_m=0.0,
+            )
+        )
+        for name, site in zip("abc", sites, strict=True):
+            info = RsuInfo(
+                rsu_id=name,
+                position=np.array([*site, 0.0]),
+                range_bias_sd_m=0.5,
+                bias_correlation_time_s=1e5,
+            )
+            tracker.add_rsu(info)
+        ranges = np.linalg.norm(place - sites, axis=1) + rng.normal(0.0, 0.5, 3)
+        for k in range(30):
+            for name, value in zip("abc", ranges, strict=True):
+                item = RsuMeasurement(
+                    stamp_ns=T0 + k * 100_000_000,
+                    rsu_id=name,
+                    vue_id="v",
+                    fields=Field.RANGE,
+                    range_m=float(value + rng.normal(0.0, 0.05)),
+                    range_var=0.05**2,
+                )
+                tracker.add(item)
+        odometry = tracker.flush()[-1].odometry
+        assert odometry is not None
+        away = (odometry.position - [*place, 0.0])[:2]
+        nees += float(away @ np.linalg.solve(odometry.pose_cov[:2, :2], away))
+    assert chi2.ppf(0.001, 2 * draws) < nees < chi2.ppf(0.999, 2 * draws)

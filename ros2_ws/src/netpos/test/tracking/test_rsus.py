@@ -56,7 +56,7 @@ def test_bias_sd_by_kind() -> None:
         Kind.RANGE: 0.3,
         Kind.PHASE: 0.0,
         Kind.UNWRAPPED_PHASE: 0.0,
-        Kind.TDOA: pytest.approx(0.3 * math.sqrt(2.0)),  # of two RSUs
+        Kind.TDOA: 0.3,
     }
 
 

@@ -55,10 +55,11 @@ def tdoa(stamp_ns: int, name: str, reference: str, value_m: float, sd_m: float =
     )
 
 
-def tracker(names: Sequence[str] = tuple(SITES), **config: Any) -> Tracker:
+def tracker(names: Sequence[str] = tuple(SITES), bias_sd_m: float = 0.0, **config: Any) -> Tracker:
     made = Tracker(TrackerConfig(**{"hold_s": 0.0, **config}))
     for name in names:
-        made.add_rsu(RsuInfo(rsu_id=name, position=np.array(SITES[name])))
+        slow = {"range_bias_sd_m": bias_sd_m, "bias_correlation_time_s": 10.0}
+        made.add_rsu(RsuInfo(rsu_id=name, position=np.array(SITES[name]), **slow))
     return made
 
 
@@ -187,9 +188,13 @@ def test_differences_with_one_reference_share_its_error(names: tuple[str, ...]) 
     np.testing.assert_allclose(fix.pose_cov[:2, :2], cov, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("bias_sd_m", [0.0, 0.02])
 @pytest.mark.parametrize("names", [("a", "b"), ("a", "b", "c"), tuple(SITES)])
-def test_its_twin_is_a_time_of_arrival_with_unknown_emission(names: tuple[str, ...]) -> None:
-    """n receivers that time a beacon of unknown emission say what n - 1 differences say."""
+def test_its_twin_is_a_time_of_arrival_with_unknown_emission(
+    names: tuple[str, ...], bias_sd_m: float
+) -> None:
+    """n receivers that time a beacon of unknown emission say what n - 1 differences say, also
+    where each has a bias."""
     sd = FINE_M / np.sqrt(2)
     late = {name: distance(name) + 0.01 * k for k, name in enumerate(names)}
     times = [
@@ -207,32 +212,37 @@ def test_its_twin_is_a_time_of_arrival_with_unknown_emission(names: tuple[str, .
         tdoa(START_NS, n, names[0], late[n] - late[names[0]], FINE_M) for n in names[1:]
     ]
     # The offset's prior is what is not known: 3 km.
-    unknown = {**ONE_STEP, "clock_offset_sd_s": 1e-5}
-    by_time = fix_of(said(tracker(**unknown), [prior(START_NS), *number_beacons(times)]))
-    by_difference = fix_of(
-        said(tracker(**ONE_STEP), [prior(START_NS), *number_beacons(differences)])
-    )
+    timed = tracker(bias_sd_m=bias_sd_m, clock_offset_sd_s=1e-5, **ONE_STEP)
+    compared = tracker(bias_sd_m=bias_sd_m, **ONE_STEP)
+    by_time = fix_of(said(timed, [prior(START_NS), *number_beacons(times)]))
+    by_difference = fix_of(said(compared, [prior(START_NS), *number_beacons(differences)]))
     np.testing.assert_allclose(by_time.position, by_difference.position, rtol=1e-6)
     np.testing.assert_allclose(by_time.pose_cov, by_difference.pose_cov, rtol=1e-6, atol=1e-9)
 
 
-def test_an_emission_that_is_unknown_every_time_tracks_like_differences() -> None:
-    """White frequency noise of 1e-4 s/sqrt(s) makes the clock forget itself between beacons."""
+@pytest.mark.parametrize("bias_sd_m", [0.0, 0.4])
+def test_an_emission_that_is_unknown_every_time_tracks_like_differences(bias_sd_m: float) -> None:
+    """White frequency noise of 1e-4 s/sqrt(s) makes the clock forget itself between beacons. A
+    bias lasts: it is that of an RSU in all its times, and in all its differences; both tracks
+    begin at the same pose then, because a first fix takes slow errors for independent."""
     rng = np.random.default_rng(3)
     found = {}
     for kind in ("time", "difference"):
         made = tracker(
+            bias_sd_m=bias_sd_m,
             clock_white_density=1e-4,
             clock_offset_sd_s=1e-3,
             coverage_radius_m=100.0,
             accel_density_mps2_sqrthz=0.5,
         )
         rng = np.random.default_rng(3)
-        outputs = []
+        biases = rng.normal(size=len(SITES))
+        outputs = said(made, [prior(START_NS - 1)]) if bias_sd_m else []
         for k in range(100):
             stamp_ns = START_NS + k * 100_000_000
             noise = rng.normal(scale=SD_M / np.sqrt(2), size=len(SITES))
-            late = dict(zip(SITES, [distance(n) for n in SITES] + noise, strict=True))
+            late = {n: distance(n) + bias_sd_m * b for n, b in zip(SITES, biases, strict=True)}
+            late = {n: late[n] + e for n, e in zip(SITES, noise, strict=True)}
             emission_m = float(rng.normal(scale=1000.0))
             if kind == "time":
                 items = [

@@ -56,7 +56,7 @@ def test_ranges_of_which_one_may_be_wrong(sites: int, late_sd: float) -> None:
     seen[1] += late_sd * SD_M
     np.testing.assert_allclose(rows[:, VALUE], seen)
     initialiser = Initialiser(config)
-    initialiser.add(T0, rows, np.zeros(len(rows)), tuple(stations))
+    initialiser.add(T0, rows, tuple(stations))
     fix = fix_of(initialiser)
     assert fix is not None
 

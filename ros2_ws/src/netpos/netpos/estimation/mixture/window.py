@@ -15,16 +15,12 @@ class Window(NamedTuple):
     """Measurements of a short time.
 
     ages_s (m,) : when each was made, <= 0 before the stamp of the state
-    rows (m, ROW_WIDTH) : without states of slow errors
-    shared (m,) : the error that a row has in common with others, -1: none
-    shared_var (k,) : variance of each of these errors
+    rows (m, ROW_WIDTH) : the slow errors in them are states behind those of the device
     height_m : nominal height of the device
     """
 
     ages_s: Array
     rows: Array
-    shared: Array
-    shared_var: Array
     height_m: float
 
 
@@ -32,15 +28,12 @@ class Window(NamedTuple):
 def normal_equations(
     state: Array, window: Window, prior: Array, prior_var: Array
 ) -> tuple[float, Array, Array]:
-    """Cost, gradient (n,) and Gauss-Newton Hessian (n, n) of the fit at ``state`` (n,). Errors
-    that rows share are eliminated: rows with the variances d and the common error of variance c
-    weigh D^-1 - D^-1 1 1' D^-1 / (1 / c + 1' D^-1 1), the inverse of D + c 1 1' (Woodbury)."""
-    rows, n, k = window.rows, state.size, window.shared_var.size
+    """Cost, gradient (n,) and Gauss-Newton Hessian (n, n) of the fit at ``state`` (n,)."""
+    rows, n = window.rows, state.size
     A = np.diag(1.0 / prior_var)
     difference = prior - state
     b = difference / prior_var
     cost = float((difference * b).sum())
-    weight, by_residual, by_h = np.zeros(k), np.zeros(k), np.zeros((k, n))
     h = np.zeros(n)
     past = state.copy()
     for i in range(rows.shape[0]):
@@ -59,14 +52,4 @@ def normal_equations(
         cost += w * residual * residual
         b += w * residual * h
         A += w * np.outer(h, h)
-        error = int(window.shared[i])
-        if error >= 0:
-            weight[error] += w
-            by_residual[error] += w * residual
-            by_h[error] += w * h
-    for error in range(k):
-        share = 1.0 / (1.0 / window.shared_var[error] + weight[error])
-        cost -= share * by_residual[error] ** 2
-        b -= share * by_residual[error] * by_h[error]
-        A -= share * np.outer(by_h[error], by_h[error])
     return cost, b, A

@@ -118,7 +118,8 @@ class Sensor:
     has_clock: bool = False
     """The device's clock offset is added to the value."""
     adds_biases: bool = True
-    """The states BIAS and COMMON of the row are added to the value; False: the model uses them."""
+    """The states BIAS and COMMON of the row are added to the value, and REFERENCE is subtracted;
+    False: the model uses them."""
     is_range: bool = False
     """A distance, so that a blocked path makes it late and one epoch leaves a ring."""
     in_strapdown: bool = False

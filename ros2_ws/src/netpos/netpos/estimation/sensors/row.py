@@ -11,7 +11,8 @@ array a compiled kernel can take:
     HEADING (state index of the device's heading, or -1), LEVER 3 (of the antenna in the device, m;
     forward and left count only where there is a heading), BLOCKED (probability that the path was
     blocked; 0: the option's), HEIGHT (state index of the device's height over the nominal one; 0:
-    the height is known)
+    the height is known), REFERENCE (state index of the bias that is subtracted, that of the RSU a
+    difference counts from; 0: none)
 
 A sensor may keep other figures in ORIGIN and AXES; its module says which.
 """
@@ -23,8 +24,8 @@ from netpos.messages.values import Array
 
 KIND, VALUE, VARIANCE, GATE_VARIANCE, BIAS, COMMON, GROUP, ORIGIN = range(8)
 AXES = 10
-HEADING, LEVER, BLOCKED, HEIGHT = 19, 20, 23, 24
-ROW_WIDTH = 25
+HEADING, LEVER, BLOCKED, HEIGHT, REFERENCE = 19, 20, 23, 24, 25
+ROW_WIDTH = 26
 
 
 @inlined

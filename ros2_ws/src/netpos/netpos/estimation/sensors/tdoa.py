@@ -1,8 +1,8 @@
 """Time difference of arrival: how much later an RSU hears a beacon than another, |d| - |d - b|.
 
 b is the position of the reference from the RSU, in map [m]; a row keeps it in the first three of
-its AXES. The device's clock cancels. So does the bias that a network shares; the row's own bias is
-that of the pair.
+its AXES. The device's clock cancels. So does the bias that a network shares; those of the two
+RSUs themselves stay, as a difference.
 """
 
 from __future__ import annotations
