@@ -2,13 +2,23 @@
 
 ``BagWriter`` and ``BagReader`` are for the ordinary case, ``netpos.bags.recover`` saves what a
 killed recorder left, ``netpos.bags.importers`` turn other people's recordings into bags.
+
+The names of this package are imported when they are first used: a node needs the encoding of its
+messages, and no file.
 """
 
-from netpos.bags.errors import BagError
-from netpos.bags.layout import LOST_METADATA
-from netpos.bags.reader import BagEntry, BagReader, TopicInfo
-from netpos.bags.types import cdr_codec, codec, has_common_definition, typestore
-from netpos.bags.writer import BagWriter, whole_bag
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from netpos.common.lazy import imported_when_used
+
+if TYPE_CHECKING:
+    from netpos.bags.errors import BagError
+    from netpos.bags.layout import LOST_METADATA
+    from netpos.bags.reader import BagEntry, BagReader, TopicInfo
+    from netpos.bags.types import cdr_codec, codec, has_common_definition, typestore
+    from netpos.bags.writer import BagWriter, whole_bag
 
 __all__ = [
     "LOST_METADATA",
@@ -23,3 +33,20 @@ __all__ = [
     "typestore",
     "whole_bag",
 ]
+
+__getattr__ = imported_when_used(
+    __name__,
+    {
+        "LOST_METADATA": "layout",
+        "BagEntry": "reader",
+        "BagError": "errors",
+        "BagReader": "reader",
+        "BagWriter": "writer",
+        "TopicInfo": "reader",
+        "cdr_codec": "types",
+        "codec": "types",
+        "has_common_definition": "types",
+        "typestore": "types",
+        "whole_bag": "writer",
+    },
+)

@@ -80,9 +80,10 @@ def nees_test(errors: Array) -> MeanTest | None:
 
     Errors of neighbouring epochs share the filter's memory. The bounds hold the mean NEES of a
     consistent filter whose errors have this shape (``mean_square_given_shape``); a common factor
-    of a column changes the mean, not the bounds. Columns count as independent. The same errors
-    give the same bounds, to the last bit. ``n_eff``: independent epochs with the same ratio of
-    upper to lower bound.
+    of a column changes the mean, not the bounds. Columns count as independent. What is expected
+    of any errors is never outside: a shape that says so is not one of those considered. The same
+    errors give the same bounds, to the last bit. ``n_eff``: independent epochs with the same ratio
+    of upper to lower bound.
     """
     n, dof = errors.shape
     if n == 0:
@@ -91,6 +92,7 @@ def nees_test(errors: Array) -> MeanTest | None:
     draws = sum(mean_square_given_shape(column, rng) for column in errors.T)
     tail = (1.0 - CONFIDENCE) / 2.0
     low, high = np.quantile(draws, [tail, 1.0 - tail]).tolist()
+    low, high = min(low, float(dof)), max(high, float(dof))
     mean = float(np.einsum("ni,ni->", errors, errors) / n)
     return MeanTest(mean=mean, bounds=(low, high), n_eff=_equivalent(dof, n, high / low))
 

@@ -6,8 +6,9 @@ parameters (``settings``) needs neither a simulator nor what that one imports.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from netpos.common.lazy import imported_when_used
 
 if TYPE_CHECKING:
     from netpos.scenario.load import ScenarioError, load_scenario, scenario_names
@@ -16,16 +17,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Scenario", "ScenarioError", "Simulation", "load_scenario", "scenario_names"]
 
-_MODULES = {
-    "Scenario": "schema",
-    "ScenarioError": "load",
-    "Simulation": "simulation",
-    "load_scenario": "load",
-    "scenario_names": "load",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+__getattr__ = imported_when_used(
+    __name__,
+    {
+        "Scenario": "schema",
+        "ScenarioError": "load",
+        "Simulation": "simulation",
+        "load_scenario": "load",
+        "scenario_names": "load",
+    },
+)

@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from netpos.bags import BagError, BagReader
-from netpos.bags.importers.own.rsus import read_rsus, rsus_of_text
-from netpos.bags.rsus_file import rsus_text
+from netpos.bags.errors import BagError
 from netpos.common.yaml_text import YamlError, dump_yaml, load_yaml
 from netpos.messages import topics
 from netpos.messages.values import RsuInfo
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.networks.config import FusionConfig
+
+if TYPE_CHECKING:
+    from netpos.bags import BagReader
 
 # Name of the fact with the parameters of the tracker, as YAML.
 TRACKER_FACT = "tracker"
@@ -52,7 +53,11 @@ class TrackerSettings:
     @property
     def rsu_list(self) -> list[RsuInfo]:
         """The RSUs of the list. Raises ``ValueError`` for one that cannot be understood."""
-        return rsus_of_text(self.rsus, "the list of RSUs") if self.rsus else []
+        if not self.rsus:
+            return []
+        from netpos.bags.importers.own.rsus import rsus_of_text  # noqa: PLC0415 - no file, no reader
+
+        return rsus_of_text(self.rsus, "the list of RSUs")
 
     def names_by(self, network: str) -> tuple[str, ...]:
         """What a network calls the devices to expect."""
@@ -105,7 +110,12 @@ def list_of(file: Path | str, datum: str = "") -> str:
 
     Raises ``BagError`` for a file that cannot be understood.
     """
-    return rsus_text(read_rsus(Path(file), datum)) if file else ""
+    if not file:
+        return ""
+    from netpos.bags.importers.own.rsus import read_rsus  # noqa: PLC0415 - no file, no reader
+    from netpos.bags.rsus_file import rsus_text  # noqa: PLC0415
+
+    return rsus_text(read_rsus(Path(file), datum))
 
 
 def not_usual(config: TrackerConfig) -> dict[str, Any]:
@@ -145,6 +155,8 @@ def settings_from(source: str) -> TrackerSettings:
     if not source:
         return DEFAULTS
     if Path(source).is_dir() or source.endswith(".mcap"):
+        from netpos.bags import BagReader  # noqa: PLC0415 - no bag, no reader
+
         with BagReader(Path(source)) as bag:
             vue_ids = sorted({topics.split(topic)[0] for topic in bag.topics} - {""})
             known = TRACKER_FACT in bag.facts or FUSION_FACT in bag.facts

@@ -65,11 +65,10 @@ class Track:
         shared: SharedErrors | None = None,
     ) -> None:
         self._vue_id = vue_id
-        self._config = config
+        self._take(config)
         self._rsus = rsus
         self._health = health or RsuHealth()
         self._shared = shared
-        self._gate = gate_thresholds(config.gate_probability)
         self._history: History = History(int(config.history_s * 1e9))
         self.refused: Counter[str] = Counter()
         """Measurements refused at the door, by reason."""
@@ -77,12 +76,16 @@ class Track:
         estimator = _estimator_of(vue_id, config, rsus, shared)
         self._state = TrackSnapshot(estimator, NlosRate.of(config))
 
+    def _take(self, config: TrackerConfig) -> None:
+        self._config = config
+        self._gate = gate_thresholds(config.gate_probability)
+        self._manoeuvre_sd_mps = config.manoeuvre_sd_mps
+
     def set_config(self, config: TrackerConfig) -> None:
         """Go on with other live parameters. Epochs that are over keep what they were applied with,
         unless a measurement comes late that is older than the change."""
         self._history.mark(self._state)
-        self._config = config
-        self._gate = gate_thresholds(config.gate_probability)
+        self._take(config)
         for state in (self._state, *self._history.states()):
             state.estimator.set_config(config)
 
@@ -408,7 +411,7 @@ class Track:
         inflation = max(state.rsus_scale.inflation(risk), state.device_scale.inflation(risk))
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
         level: float = level_of(
-            radius_m, inflation, state.undetected_m, self._config.manoeuvre_sd_mps, unheard_s
+            radius_m, inflation, state.undetected_m, self._manoeuvre_sd_mps, unheard_s
         )
         return level
 

@@ -169,3 +169,22 @@ def test_one_epoch_is_one_chi_square_value() -> None:
 
 def test_no_epoch_has_no_verdict() -> None:
     assert nees_test(np.zeros((0, 2))) is None
+
+
+def test_what_is_expected_is_never_outside() -> None:
+    """Errors that go round with a device on its rounds, or come in a few bumps, are like no
+    mixture of exponentials; their shape alone would have bounds beside the expected 2."""
+    t, rng = np.arange(8000) / 8000.0, np.random.default_rng(2)
+    rounds = np.stack([np.sin(2 * np.pi * 17 * t), np.cos(2 * np.pi * 17 * t)], axis=1)
+    bumps = np.zeros((t.size, 2))
+    for at, size in zip(rng.uniform(size=12), 5.0 * rng.normal(size=(12, 2)), strict=True):
+        bumps += size * np.exp(-0.5 * ((t - at) / 0.0075) ** 2)[:, None]
+    for series in (rounds, bumps):
+        errors = series + 0.05 * rng.normal(size=series.shape)
+        errors *= np.sqrt(2.0 / np.einsum("ni,ni->n", errors, errors).mean())
+        by_shape = sum(mean_square_given_shape(e, np.random.default_rng(0)) for e in errors.T)
+        low, high = np.quantile(by_shape, [0.025, 0.975])
+        assert not low <= 2.0 <= high
+        test = nees_test(errors)
+        assert test is not None
+        assert test.consistent
