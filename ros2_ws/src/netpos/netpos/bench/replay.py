@@ -90,7 +90,7 @@ def replay_rows(quick: bool) -> list[Result]:
             },
             2 if quick else 7,
         )
-        whole = _rewrite(source, Path(name), 1 if quick else 3)
+        whole = _rewrite(source, Path(name), 1 if quick else 7)
     track, decode = cost["track"], cost["decode"]
     what = "offline replay of a METIS bag" if not quick else "offline replay of a short bag"
     return [
