@@ -16,6 +16,7 @@ from netpos.bags.reader import BagReader
 from netpos.bags.types import codec
 from netpos.bags.writer import whole_bag
 from netpos.common.files import write_text
+from netpos.common.pair_errors import of_each_receiver
 from netpos.common.yaml_text import dump_yaml
 from netpos.messages.fields import bad_stamp, malformed_nanosec
 from netpos.messages.topics import RSU_INFO, RSU_LEARNED, is_tracker_output
@@ -58,8 +59,10 @@ def save_rsus(bag: Path, file: Path) -> list[RsuInfo]:
                 learned[errors.rsu_id] = errors
     if not infos:
         raise BagError(f"{bag} has no {RSU_INFO}: there is nothing to save")
+    of_differences = _of_differences(infos, learned)
     declared = [
-        _declaring(info, _quantities(name, infos, learned)) for name, info in sorted(infos.items())
+        _declaring(info, _biases(learned.get(name), of_differences.get(name)))
+        for name, info in sorted(infos.items())
     ]
     lines = [f"# RSUs of {bag.name}; m, rad, s, axes of map", "rsus:"]
     for info in declared:
@@ -122,24 +125,29 @@ def load_rsus(file: Path, bag: Path, out: Path) -> list[str]:
     return sorted(wanted)
 
 
-def _quantities(
-    name: str, others: Iterable[str], learned: Mapping[str, RsuErrors]
+def _of_differences(
+    names: Iterable[str], learned: Mapping[str, RsuErrors]
+) -> dict[str, tuple[float, float]]:
+    """Variance and correlation time of the bias of each RSU, by its learned differences."""
+    known = list(names)
+    pairs = {f"{one}-{other}": (one, other) for one in known for other in known}
+    return of_each_receiver(
+        (pairs[name], errors.bias_spread[0] ** 2, errors.correlation_time_s[0])
+        for name, errors in learned.items()
+        if name in pairs
+    )
+
+
+def _biases(
+    own: RsuErrors | None, of_differences: tuple[float, float] | None
 ) -> list[tuple[str, float, float]]:
-    """Quantity, sd and correlation time of the biases learned of an RSU. The bias of a difference
-    with one of ``others`` is that of two RSUs: half of its variance, on average over all of its
-    differences, is of this one."""
-    found = []
-    if name in learned:
-        own = learned[name]
-        found = list(zip(own.quantities, own.bias_spread, own.correlation_time_s, strict=True))
-    pairs = [pair for other in others for pair in (f"{name}-{other}", f"{other}-{name}")]
-    of_pairs = [learned[pair] for pair in pairs if pair in learned]
-    if of_pairs:
-        spreads, times = np.array(
-            [(e.bias_spread[0], e.correlation_time_s[0]) for e in of_pairs]
-        ).T
-        sd = math.sqrt(0.5 * float(np.mean(spreads**2)))
-        found.append((_DIFFERENCE, sd, float(np.mean(times))))
+    """Quantity, sd and correlation time of the biases learned of an RSU."""
+    found: list[tuple[str, float, float]] = []
+    if own is not None:
+        found += zip(own.quantities, own.bias_spread, own.correlation_time_s, strict=True)
+    if of_differences is not None:
+        variance, time_s = of_differences
+        found.append((_DIFFERENCE, math.sqrt(variance), time_s))
     return found
 
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from netpos.common.pair_errors import of_each_receiver
 from netpos.estimation.measurement import BIAS, GATE_VARIANCE, GROUP, REFERENCE, Kind
 from netpos.estimation.rows import UNCOUPLED, Coupling, rsu_axes, rsu_place, scalar_kinds
 from netpos.estimation.sensors.table import BY_KIND, SENSORS, readings
@@ -316,23 +317,12 @@ class BiasStates:
     def _take_learned(
         self, learned: LearnedErrors, concluded: Collection[Name], speed_mps: float
     ) -> list[PriorChange]:
-        """Give each bias state the sd and time learned of it; the states whose sd changed. Of
-        several pairs with an RSU the one counts that leaves least to it: where all of its pairs
-        err much, it does itself."""
-        least: dict[int, float] = {}  # half of the smallest variance of a pair with each state
-        for name, model in learned.models.items():
-            for state in self._ends[name].states:
-                half = 0.5 * model.bias_sd**2
-                least[state] = min(half, least.get(state, half))
-        said: dict[int, tuple[float, float]] = {}
-        changed = set()
-        for name, model in learned.models.items():
-            states = self._ends[name].states
-            for state in states:
-                others = sum(least[other] for other in states if other != state)
-                new = model.bias_sd**2 - others, model.time_s(speed_mps)
-                said[state] = min(new, said.get(state, new))
-                changed |= {state} if name in concluded else set()
+        """Give each bias state the sd and time learned of it; the states whose sd changed."""
+        said = of_each_receiver(
+            (self._ends[name].states, model.bias_sd**2, model.time_s(speed_mps))
+            for name, model in learned.models.items()
+        )
+        changed = {state for name in concluded for state in self._ends[name].states}
         self.sd, self.tau_s = self.sd.copy(), self.tau_s.copy()
         changes = []
         for state, (variance, time_s) in said.items():

@@ -117,7 +117,7 @@ def test_the_biases_of_differences_are_those_of_their_rsus(tmp_path: Path) -> No
         for errors in learned:
             bag.write(RSU_LEARNED, codec().rsu_errors_to_msg(errors), S)
     saved = {info.rsu_id: info for info in save_rsus(tmp_path / "bag", tmp_path / "rsus.yaml")}
-    expected = {"a0": (0.08, 10.0), "a1": (0.05, 20.0), "a2": (0.02, 30.0), "a3": (0.0, 0.0)}
+    expected = {"a0": (0.14, 10.0), "a1": (0.02, 30.0), "a2": (0.02, 30.0), "a3": (0.0, 0.0)}
     for name, (variance, time_s) in expected.items():
         assert saved[name].range_bias_sd_m ** 2 == pytest.approx(variance)
         assert saved[name].bias_correlation_time_s == pytest.approx(time_s)
