@@ -34,19 +34,4 @@ __all__ = [
     "whole_bag",
 ]
 
-__getattr__ = imported_when_used(
-    __name__,
-    {
-        "LOST_METADATA": "layout",
-        "BagEntry": "reader",
-        "BagError": "errors",
-        "BagReader": "reader",
-        "BagWriter": "writer",
-        "TopicInfo": "reader",
-        "cdr_codec": "types",
-        "codec": "types",
-        "has_common_definition": "types",
-        "typestore": "types",
-        "whole_bag": "writer",
-    },
-)
+__getattr__ = imported_when_used(__name__, "errors", "types", "layout", "reader", "writer")

@@ -17,13 +17,4 @@ if TYPE_CHECKING:
 
 __all__ = ["Scenario", "ScenarioError", "Simulation", "load_scenario", "scenario_names"]
 
-__getattr__ = imported_when_used(
-    __name__,
-    {
-        "Scenario": "schema",
-        "ScenarioError": "load",
-        "Simulation": "simulation",
-        "load_scenario": "load",
-        "scenario_names": "load",
-    },
-)
+__getattr__ = imported_when_used(__name__, "schema", "load", "simulation")
