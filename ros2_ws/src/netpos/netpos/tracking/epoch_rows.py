@@ -31,7 +31,7 @@ from netpos.estimation.rows import (
 )
 from netpos.estimation.state import KNOWN_HEIGHT, N_CORE, VELOCITY, HeightState, X
 from netpos.messages.values import Array, Field, GroundSpeed, RsuMeasurement, Velocity
-from netpos.tracking.rsus import REFERENCED, BiasStates, Rsu, bias_sd
+from netpos.tracking.rsus import REFERENCED, BiasStates, Rsu
 
 Source = RsuMeasurement | Velocity | GroundSpeed
 Sites = tuple[bool, Array, Array | None]
@@ -183,7 +183,7 @@ def widen(innovations: Array, rows: Array, rsu: Rsu, reference: Rsu | None) -> N
     """Let the sd in ``innovations`` (m, 2) of ``rows`` without bias states hold the biases of the
     RSU and of the ``reference`` of differences, in place."""
     for pair, row in zip(innovations, rows, strict=True):
-        pair[1] = math.hypot(pair[1], bias_sd(Kind(int(row[KIND])), rsu, reference))
+        pair[1] = math.hypot(pair[1], rsu.bias_sd(Kind(int(row[KIND])), reference))
 
 
 def fits(innovations: Array, gate: Array) -> bool:

@@ -55,10 +55,14 @@ class Rsu:
         cone = info.angle_convention is AngleConvention.CONE
         return cls(info, axes, rsu_place(info, axes), cone, not any(slow))
 
-    def bias_sd(self, kind: Kind) -> float:
-        """Standard deviation of the RSU's own bias in rows of a kind; 0 where it has none."""
+    def bias_sd(self, kind: Kind, reference: Rsu | None = None) -> float:
+        """Standard deviation of the biases in rows of a kind, 0 where there are none: of the RSU's
+        own, and in a difference that of the ``reference``, too (None: the RSU's own alone)."""
         name = BY_KIND[kind].bias_sd
-        return 0.0 if name is None else float(getattr(self.info, name))
+        own = 0.0 if name is None else float(getattr(self.info, name))
+        if reference is None or not is_difference(kind):
+            return own
+        return math.hypot(own, reference.bias_sd(kind))
 
     def common_bias_sd(self, kind: Kind) -> float:
         """Standard deviation of the bias that its network shares in rows of a kind; 0: none."""
@@ -98,20 +102,13 @@ def is_difference(kind: Kind) -> bool:
     return reading is not None and reading.has_reference
 
 
-def bias_sd(kind: Kind, rsu: Rsu, reference: Rsu | None) -> float:
-    """Standard deviation of the biases in a row of a kind: the RSU's own, and in a difference that
-    of the reference, too."""
-    own = rsu.bias_sd(kind)
-    return math.hypot(own, reference.bias_sd(kind)) if reference and is_difference(kind) else own
-
-
 def _name(m: RsuMeasurement, kind: Kind) -> Name:
     """Whose errors those of a measurement's row of a kind are: of an RSU, or of a pair."""
     of_pair = f"{m.rsu_id}-{m.reference_rsu_id}"
     return _RSU + (of_pair if is_difference(kind) else m.rsu_id), kind.name
 
 
-class _Ends(NamedTuple):
+class _Biases(NamedTuple):
     """The states of the biases in a row: the RSU's own, and the one that is subtracted (0:
     none)."""
 
@@ -155,7 +152,7 @@ class BiasStates:
     sd: list[float] = field(default_factory=list)
     tau_s: list[float] = field(default_factory=list)
     _slots: dict[Name, int] = field(default_factory=dict)
-    _ends: dict[Name, _Ends] = field(default_factory=dict)
+    _biases: dict[Name, _Biases] = field(default_factory=dict)
     """Of those learned."""
     _last_ns: dict[Name, int] = field(default_factory=dict)
     version: int = 0
@@ -172,7 +169,7 @@ class BiasStates:
             self.sd,
             self.tau_s,
             self._slots,
-            self._ends,
+            self._biases,
             last_ns,
             self.version,
         )
@@ -259,14 +256,14 @@ class BiasStates:
             if BY_KIND[kind].bias_sd is None:
                 continue
             name = _name(m, kind)
-            declared = bias_sd(kind, rsu, reference), info.bias_correlation_time_s
+            declared = rsu.bias_sd(kind, reference), info.bias_correlation_time_s
             model = learned.model(name, math.sqrt(var), *declared, m.stamp_ns)
             tau_s = info.noise_correlation_time_s or WINDOW_S
             correlated = self._inflation(m, tau_s, kind)
-            ends = self._learned_ends(name, m, kind, model)
-            bias[kind] = ends.own
-            if ends.reference:
-                subtracted[kind] = ends.reference
+            states = self._learned_biases(name, m, kind, model)
+            bias[kind] = states.own
+            if states.reference:
+                subtracted[kind] = states.reference
             inflation[kind] = model.scale * correlated
             gate[kind] = model.gate_scale
             if rsu.common_bias_sd(kind) > 0.0:
@@ -274,16 +271,18 @@ class BiasStates:
         learned_so = Coupling(bias, common, inflation, gate, subtracted)
         return self._with_shared_noise(rsu, m, learned_so) if shares else learned_so
 
-    def _learned_ends(self, name: Name, m: RsuMeasurement, kind: Kind, model: ErrorModel) -> _Ends:
+    def _learned_biases(
+        self, name: Name, m: RsuMeasurement, kind: Kind, model: ErrorModel
+    ) -> _Biases:
         """The states of the biases of what is learned under ``name``. Those of the two RSUs of a
         difference are alike until other pairs tell them apart."""
-        if name not in self._ends:
+        if name not in self._biases:
             two = is_difference(kind)
             sd, tau_s = model.bias_sd / math.sqrt(1.0 + two), model.time_s(0.0)
             own = self._slot((_RSU + m.rsu_id, kind.name), sd, tau_s)
             other = self._slot((_RSU + m.reference_rsu_id, kind.name), sd, tau_s) if two else 0
-            self._ends = {**self._ends, name: _Ends(own, other)}
-        return self._ends[name]
+            self._biases = {**self._biases, name: _Biases(own, other)}
+        return self._biases[name]
 
     def learn(
         self,
@@ -299,10 +298,10 @@ class BiasStates:
         if learned is None:
             return [], []
         (rows, accepted), (mean, cov) = fitted, posterior
-        names = {ends: name for name, ends in self._ends.items()}
+        names = {biases: name for name, biases in self._biases.items()}
         left = unexplained(mean, cov, rows, height_m).tolist()
         for row, said in zip(rows, left, strict=True):
-            name = names.get(_Ends(int(row[BIAS]), int(row[REFERENCE])))
+            name = names.get(_Biases(int(row[BIAS]), int(row[REFERENCE])))
             if name is None or not accepted[int(row[GROUP])]:
                 continue
             stated = float(row[GATE_VARIANCE]) / learned.models[name].gate_scale
@@ -319,10 +318,10 @@ class BiasStates:
     ) -> list[PriorChange]:
         """Give each bias state the sd and time learned of it; the states whose sd changed."""
         said = of_each_receiver(
-            (self._ends[name].states, model.bias_sd**2, model.time_s(speed_mps))
+            (self._biases[name].states, model.bias_sd**2, model.time_s(speed_mps))
             for name, model in learned.models.items()
         )
-        changed = {state for name in concluded for state in self._ends[name].states}
+        changed = {state for name in concluded for state in self._biases[name].states}
         self.sd, self.tau_s = self.sd.copy(), self.tau_s.copy()
         changes = []
         for state, (variance, time_s) in said.items():
@@ -364,7 +363,7 @@ class BiasStates:
 
     def _bias_of(self, name: Name, mean: Array, cov: Array) -> tuple[float, float]:
         """The bias of what is learned under ``name``, or the difference of two, and its sd."""
-        own, other = self._ends[name]
+        own, other = self._biases[name]
         h = np.zeros(mean.size)
         h[own] = 1.0
         if other:

@@ -58,6 +58,9 @@ def test_bias_sd_by_kind() -> None:
         Kind.UNWRAPPED_PHASE: 0.0,
         Kind.TDOA: 0.3,
     }
+    other = biased("b", range_bias_sd_m=0.4)
+    assert rsu.bias_sd(Kind.TDOA, other) == pytest.approx(0.5)
+    assert rsu.bias_sd(Kind.TOA, other) == 0.3
 
 
 def test_kinds_follow_the_convention() -> None:
