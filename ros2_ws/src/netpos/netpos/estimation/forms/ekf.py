@@ -42,6 +42,7 @@ from netpos.estimation.measurement import GATE_VARIANCE, GROUP, VARIANCE
 from netpos.estimation.motion import add_noise, is_straight, propagate, transition
 from netpos.estimation.predicted import predict_rows
 from netpos.estimation.sensors.row import group_end
+from netpos.estimation.slow_errors import follow_tangents
 from netpos.estimation.state import N_CORE, X
 from netpos.messages.values import Array
 
@@ -287,6 +288,7 @@ def update_predicted(
                 for b in range(mean.size):
                     cov[a, b] = work[W_COV + a, b]
             nis = _fuse_used(mean, cov, rows, work)
+    curved, wide = False, False
     if iterations > 1:
         curved, wide = is_curved(rows, mean, height_m, work), is_wide(rows, work)
         if curved or wide:
@@ -297,6 +299,8 @@ def update_predicted(
             refine_used(mean, cov, rows, height_m, work)
         if (curved or wide) and not is_definite(cov, work):
             fuse_by_factor(mean, cov, rows.shape[0], work)
+    if not (curved or wide):
+        follow_tangents(mean, cov, rows, height_m, work)
     return nis, used
 
 

@@ -69,6 +69,7 @@ from netpos.estimation.protection import (
     manoeuvre_level,
     mixture_radius,
 )
+from netpos.estimation.slow_errors import with_linearisation
 from netpos.messages.values import Array
 
 _MERGE_SHARE = 0.1  # of the integrity risk: what merging two components may cost
@@ -99,8 +100,11 @@ def a_component_each(mean: Array, cov: Array, dynamics: Dynamics) -> Mixture:
 
 
 @kernel
-def move(components: Mixture, dt_s: float, dynamics: Dynamics, options: FilterOptions) -> Mixture:
-    """The components moved by ``dt_s`` seconds; those of interacting models mix before."""
+def move(
+    components: Mixture, dt_s: float, rows: Array, dynamics: Dynamics, options: FilterOptions
+) -> Mixture:
+    """The components moved by ``dt_s`` seconds, to an epoch of ``rows`` or to none; those of
+    interacting models mix before."""
     means, covs = components.means.copy(), components.covs.copy()
     log_weights, models = components.log_weights, dynamics.motions.shape[0]
     if models > 1 and dt_s > 0.0:
@@ -108,10 +112,12 @@ def move(components: Mixture, dt_s: float, dynamics: Dynamics, options: FilterOp
         passing = mixing.transition_matrix(dynamics.sojourn_s, dt_s)
         mixing.mix(means, covs, weights, passing)
         log_weights = np.log(weights)
+    bias, height_m = np.empty_like(dynamics.bias), options.height_m
     for k in range(means.shape[0]):
+        with_linearisation(means[k], covs[k], rows, height_m, dynamics.bias, bias)
         cov_or_sqrt = cov_or_sqrt_of(covs[k], options)
         motion = dynamics.motions[k if models > 1 else 0]
-        predict(means[k], cov_or_sqrt, dt_s, motion, dynamics.bias, options)
+        predict(means[k], cov_or_sqrt, dt_s, motion, bias, options)
         covs[k] = cov_of(cov_or_sqrt, options)
     return Mixture(means, covs, log_weights)
 
@@ -122,7 +128,7 @@ def moved_to_epoch(
 ) -> Mixture:
     """The components moved to the epoch, the rows of which are re-weighted in place as the most
     probable component predicts them; what a blocked path may be follows in ``apply_epoch``."""
-    moved: Mixture = move(components, epoch.dt_s, dynamics, options)
+    moved: Mixture = move(components, epoch.dt_s, epoch.rows, dynamics, options)
     robust = options.robust
     if epoch.rows.shape[0] > 0 and robust.kind != Robust.NONE:
         weights = RobustOptions(robust.kind, robust.parameter, 0.0, robust.nlos_excess_m)
@@ -223,7 +229,7 @@ def is_too_wide(
     if epoch.dt_s <= options.coast_after_s or epoch.rows.shape[0] == 0:
         return False
     own = Dynamics(dynamics.motions.copy(), dynamics.sojourn_s, dynamics.bias)
-    moved = move(one_component(mean, cov), epoch.dt_s, own, options)
+    moved = move(one_component(mean, cov), epoch.dt_s, epoch.rows, own, options)
     return bool(any_splits(moved, epoch.rows, options))
 
 
