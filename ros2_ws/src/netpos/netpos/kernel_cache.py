@@ -15,7 +15,7 @@ _VARIABLE = "NUMBA_CACHE_DIR"
 _KEPT = 4
 _MARKS = (b"@kernel", b"@leaf", b"@inlined", b"@link", b"njit")
 # The tables of the estimator and the indices of states are compiled into kernels, too.
-_TABLES = ("sensors", "motion", "forms")
+_TABLES = ("sensors", "motion", "forms", "splits")
 _INDICES = ("state.py", "navigation_state.py")
 
 

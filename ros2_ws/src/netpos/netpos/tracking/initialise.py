@@ -41,9 +41,8 @@ from netpos.estimation.measurement import (
     wrap,
 )
 from netpos.estimation.mixture.gaussians import Mixture, mode_of
-from netpos.estimation.mixture.reduction import reduced
+from netpos.estimation.mixture.reduction import PART_MERGE_COST, reduced
 from netpos.estimation.mixture.ridge import Fit, components_of, inverse
-from netpos.estimation.mixture.ring import RING_MERGE_COST
 from netpos.estimation.mixture.window import Window, normal_equations
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.estimation.rows import drop_biases
@@ -102,7 +101,7 @@ class _Solution(NamedTuple):
 def joined(mixtures: Sequence[Mixture]) -> Mixture:
     """Several mixtures as one, normalised; what is alike is merged."""
     every = Mixture(*(np.concatenate(parts) for parts in zip(*mixtures, strict=True)))
-    reduced_: Mixture = reduced(every, RING_MERGE_COST)
+    reduced_: Mixture = reduced(every, PART_MERGE_COST)
     return reduced_
 
 

@@ -9,71 +9,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from library_copy import add_entry, code_of, copy_of_library, run, run_tests
+from library_copy import DRIVE, add_entry, code_of, copy_of_library, run, run_tests
 from scipy import stats
 from scipy.linalg import expm
 
 EPOCHS = 81
 
 _RUN = """
-import json
 from dataclasses import fields
-import numpy as np
 from netpos.estimation.motion import NO_BIAS, Model, motion_parameters, noise
-from netpos.messages.values import Beacon, InitialPose, Odometry
-from netpos.scenario import Scenario, Simulation
-from netpos.tracking import Tracker, TrackerConfig
-
-scenario = Scenario.model_validate(
-    {
-        "name": "toy", "description": "toy", "seed": 3,
-        "rsus": {"units": [
-            {"id": "a", "position": [0.0, -15.0, 4.0]},
-            {"id": "b", "position": [30.0, 20.0, 4.0]},
-            {"id": "c", "position": [60.0, -20.0, 4.0]},
-        ]},
-        "measurement": {
-            "quantities": ["range"], "nearest": 3,
-            "errors": {"model": "fixed", "range_sd_m": 1.0},
-        },
-        "devices": [{
-            "route": {"kind": "waypoints", "points": [[0.0, 0.0], [60.0, 0.0]]},
-            "speed_mps": 7.5, "beacon_interval_s": 0.1, "initial_pose_sd_m": 5.0,
-        }],
-    }
-)
 
 
-def drive(**settings):
-    simulation = Simulation(scenario)
-    tracker = Tracker(TrackerConfig(
-        hold_s=0.0, require_initial_pose=True, initial_speed_sd_mps=8.0,
-        accel_density_mps2_sqrthz=0.5, **settings,
-    ))
-    for info in simulation.rsus:
-        tracker.add_rsu(info)
-    truth, outputs = {}, []
-    for event in simulation.events():
-        if isinstance(event, Odometry):
-            truth[event.stamp_ns] = event.position
-        if isinstance(event, InitialPose):
-            tracker.add(event)
-        if isinstance(event, Beacon):
-            for m in simulation.measure(event):
-                assert tracker.add(m) is None, m
-        outputs += tracker.process()
-    outputs += tracker.flush()
-    told = [o for o in outputs if o.odometry is not None]
-    return {
-        "positions": [list(o.odometry.position[:2]) for o in told],
-        "errors": [
-            float(np.linalg.norm((o.odometry.position - truth[o.odometry.stamp_ns])[:2]))
-            for o in told
-        ],
-        "sds": [float(np.sqrt(np.diag(o.odometry.pose_cov)[:2].sum())) for o in told],
-        "nis": sum(o.status.nis for o in outputs),
-        "dof": sum(o.status.nis_dof for o in outputs),
-    }
+def follow(**settings):
+    simulation = street("range", range_sd_m=1.0)
+    return drive(simulation, accel_density_mps2_sqrthz=0.5, **settings)
 
 
 Q = np.empty((6, 6))
@@ -85,13 +34,13 @@ print(json.dumps({
     "Q": Q[:4, :4].tolist(),
     "texts": [described[name]["text"] for name in ("motion_model", "damping_time_s", "filter")],
     "defaults": [TrackerConfig().damping_time_s, TrackerConfig().information_loss],
-    "damped": drive(motion_model="damped", damping_time_s=30.0),
-    "damped_little": drive(motion_model="damped", damping_time_s=1e3, **plain),
-    "straight": drive(**plain),
-    "ekf": drive(filter="ekf"),
-    "information": drive(filter="information"),
-    "forgetful": drive(filter="information", information_loss=0.1),
-    "both": drive(filter="information", motion_model="damped", damping_time_s=30.0),
+    "damped": follow(motion_model="damped", damping_time_s=30.0),
+    "damped_little": follow(motion_model="damped", damping_time_s=1e3, **plain),
+    "straight": follow(**plain),
+    "ekf": follow(filter="ekf"),
+    "information": follow(filter="information"),
+    "forgetful": follow(filter="information", information_loss=0.1),
+    "both": follow(filter="information", motion_model="damped", damping_time_s=30.0),
 }))
 """
 
@@ -109,7 +58,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def found(library: Path) -> dict[str, Any]:
-    result: dict[str, Any] = json.loads(run(library, "-c", _RUN))
+    result: dict[str, Any] = json.loads(run(library, "-c", DRIVE + _RUN))
     return result
 
 

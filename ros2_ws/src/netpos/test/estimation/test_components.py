@@ -21,8 +21,8 @@ from netpos.estimation.mixture.gaussians import (
     moments,
     one_component,
 )
-from netpos.estimation.mixture.reduction import reduced
-from netpos.estimation.mixture.ring import RING_MERGE_COST, cut_along_ring, is_wide
+from netpos.estimation.mixture.reduction import PART_MERGE_COST, reduced
+from netpos.estimation.mixture.splits.ring import cut_along_ring, is_wide
 from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.rows import linear_rows
 from netpos.messages.values import Array
@@ -185,7 +185,7 @@ def test_merging_keeps_the_moments_and_what_is_alike_becomes_one() -> None:
     means = rng.normal(0.0, 0.01, (6, 6)) + np.repeat([[0.0] * 6, [50.0] * 6], 3, axis=0)
     covs = np.array([make_cov(rng, 6, 4.0)] * 6)
     logs = np.log(np.full(6, 1.0 / 6.0)) + 3.0  # not normalised
-    parts = reduced(Mixture(means, covs, logs), RING_MERGE_COST)
+    parts = reduced(Mixture(means, covs, logs), PART_MERGE_COST)
     assert parts[2].size == 2
     np.testing.assert_allclose(np.exp(parts[2]).sum(), 1.0)
     for ours, expected in zip(
@@ -199,7 +199,7 @@ def test_components_without_weight_go_and_never_too_many_stay() -> None:
     means = np.column_stack([100.0 * np.arange(100.0), *rng.normal(size=(5, 100))])
     covs, logs = np.tile(np.eye(6), (100, 1, 1)), np.zeros(100)
     logs[7] = -30.0
-    kept, _, weights = reduced(Mixture(means, covs, logs), RING_MERGE_COST)
+    kept, _, weights = reduced(Mixture(means, covs, logs), PART_MERGE_COST)
     assert weights.size == 64
     assert not (np.abs(kept[:, 0] - 700.0) < 1.0).any()
 

@@ -14,6 +14,62 @@ import netpos
 DOCS = Path(__file__).resolve().parents[5] / "docs"
 
 
+DRIVE = """
+import json
+import numpy as np
+from netpos.messages.values import Beacon, InitialPose, Odometry
+from netpos.scenario import Scenario, Simulation
+from netpos.tracking import Tracker, TrackerConfig
+
+
+def street(quantity, **errors):
+    return Simulation(Scenario.model_validate({
+        "name": "toy", "description": "toy", "seed": 3,
+        "rsus": {"units": [
+            {"id": "a", "position": [0.0, -15.0, 4.0]},
+            {"id": "b", "position": [30.0, 20.0, 4.0]},
+            {"id": "c", "position": [60.0, -20.0, 4.0]},
+        ]},
+        "measurement": {
+            "quantities": [quantity], "nearest": 3, "errors": {"model": "fixed", **errors},
+        },
+        "devices": [{
+            "route": {"kind": "waypoints", "points": [[0.0, 0.0], [60.0, 0.0]]},
+            "speed_mps": 7.5, "beacon_interval_s": 0.1, "initial_pose_sd_m": 5.0,
+        }],
+    }))
+
+
+def drive(simulation, heard=lambda tracker, measured: measured, **settings):
+    tracker = Tracker(TrackerConfig(
+        hold_s=0.0, require_initial_pose=True, initial_speed_sd_mps=8.0, **settings,
+    ))
+    for info in simulation.rsus:
+        tracker.add_rsu(info)
+    truth, outputs = {}, []
+    for event in simulation.events():
+        if isinstance(event, Odometry):
+            truth[event.stamp_ns] = event.position
+        if isinstance(event, InitialPose):
+            tracker.add(event)
+        if isinstance(event, Beacon):
+            for m in heard(tracker, simulation.measure(event)):
+                assert tracker.add(m) is None, m
+        outputs += tracker.process()
+    outputs += tracker.flush()
+    told = [o.odometry for o in outputs if o.odometry is not None]
+    return {
+        "positions": [list(o.position[:2]) for o in told],
+        "errors": [float(np.linalg.norm((o.position - truth[o.stamp_ns])[:2])) for o in told],
+        "sds": [float(np.sqrt(np.diag(o.pose_cov)[:2].sum())) for o in told],
+        "nis": sum(o.status.nis for o in outputs),
+        "dof": sum(o.status.nis_dof for o in outputs),
+        "modes": max(len(o.status.modes) for o in outputs),
+    }
+"""
+"""For ``run``: ``drive`` follows a device along a ``street`` with three RSUs."""
+
+
 def code_of(page: str) -> list[str]:
     """The Python blocks of a page, in order."""
     return re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)

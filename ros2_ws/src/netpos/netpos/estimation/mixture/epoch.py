@@ -42,9 +42,7 @@ from netpos.estimation.mixture.candidates import (
 )
 from netpos.estimation.mixture.gaussians import Mixture, leaders, moments, one_component
 from netpos.estimation.mixture.in_turn import in_turn
-from netpos.estimation.mixture.paths import paths_are_open, reweight_by_best
 from netpos.estimation.mixture.reduction import reduced
-from netpos.estimation.mixture.ring import any_splits
 from netpos.estimation.mixture.sectors import (
     add_turns_of_phase,
     ambiguous_phase,
@@ -52,6 +50,8 @@ from netpos.estimation.mixture.sectors import (
     most_turns,
     reduced_by_sector,
 )
+from netpos.estimation.mixture.splits.choice import any_begins, any_divides
+from netpos.estimation.mixture.splits.paths import reweight_by_best
 from netpos.estimation.mixture.turns import (
     TURNS_MAX,
     add_explanations,
@@ -221,19 +221,6 @@ def _at_once(
 
 
 @kernel
-def is_too_wide(
-    mean: Array, cov: Array, epoch: EpochInput, dynamics: Dynamics, options: FilterOptions
-) -> bool:
-    """Whether, after a silence, a range of the epoch splits the Gaussian mean (n,), cov (n, n)
-    once it is moved to the epoch; nothing is changed."""
-    if epoch.dt_s <= options.coast_after_s or epoch.rows.shape[0] == 0:
-        return False
-    own = Dynamics(dynamics.motions.copy(), dynamics.sojourn_s, dynamics.bias)
-    moved = move(one_component(mean, cov), epoch.dt_s, epoch.rows, own, options)
-    return bool(any_splits(moved, epoch.rows, options))
-
-
-@kernel
 def apply_epoch(
     components: Mixture,
     epoch: EpochInput,
@@ -245,7 +232,7 @@ def apply_epoch(
     0 or 1. ``open_s``: the last seconds of which no component says whether the device turned."""
     rows, blocked = epoch.rows, options.robust.nlos_probability > 0.0
     at = ambiguous_phase(rows, options)
-    if options.models == 1 and at < 0 and (blocked or any_splits(components, rows, options)):
+    if options.models == 1 and at < 0 and (blocked or any_divides(components, rows, options)):
         found: Update = in_turn(components, epoch, options, open_s, accepted)
         return found
     if blocked:
@@ -302,14 +289,14 @@ def _by_one(
     memory: Scratch,
 ) -> tuple[bool, float, int]:
     """One epoch of the one component ``x`` (n,), ``S`` (n, n), in place: whether that is enough,
-    NIS and number of the rows accepted. It is not where a late range has two paths, something is
+    NIS and number of the rows accepted. It is not where a measurement divides it, something is
     refused, or nothing tells that the device has not turned; the rows are as they were then."""
     rows, motion, n = epoch.rows, dynamics.motions[0], x.size
     groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
     predict_epoch(x, S, epoch, motion, dynamics.bias, options, memory)
     predicted = predicted_in(memory.work, n, rows.shape[0])
-    blocked = options.models == 1 and options.robust.nlos_probability > 0.0
-    if blocked and paths_are_open(rows, predicted, options):
+    blocked, met_cov = options.robust.nlos_probability > 0.0, memory.met_cov
+    if options.models == 1 and any_begins(x, met_cov, epoch, predicted, options):
         return False, 0.0, 0
     raw = rows.copy() if blocked else rows
     result = update_epoch(x, S, epoch, motion, options, memory)
@@ -384,11 +371,9 @@ def advance(
     """
     rows, several, step = epoch.rows, components.log_weights.size > 1, memory.step
     is_ambiguous = ambiguous_phase(rows, options) >= 0
-    if not several and (is_ambiguous or epoch.dt_s > options.coast_after_s):
-        P = cov_of(S, options)
-        several = is_ambiguous or is_too_wide(x, P, epoch, dynamics, options)
-        if several:
-            components = one_component(x, P)
+    if not several and is_ambiguous:
+        several = True
+        components = one_component(x, cov_of(S, options))
     if not several:
         if rows.shape[0] == 0:
             predict(x, S, epoch.dt_s, dynamics.motions[0], dynamics.bias, options)

@@ -13,6 +13,8 @@ from netpos.estimation.mixture.gaussians import Ints, Mixture, mode_of
 from netpos.messages.values import Array
 
 _VELOCITY_END = 4  # position and velocity come first
+PART_MERGE_COST = 2e-4
+"""Divergence (Runnalls' bound) that merging parts of a component may cost."""
 LEAST_WEIGHT = 1e-8
 _LEAST_PIVOT = 1e-300
 _COMPONENTS_MAX = 64

@@ -10,7 +10,7 @@ import numpy as np
 
 from netpos.estimation.compile import kernel
 from netpos.estimation.conditioning import RobustOptions, may_be_late, reweight
-from netpos.estimation.engine import FilterOptions, is_sound
+from netpos.estimation.engine import EpochInput, FilterOptions, is_sound
 from netpos.estimation.fusion import predicted_in, workspace
 from netpos.estimation.measurement import BLOCKED, VARIANCE
 from netpos.estimation.mixture.candidates import (
@@ -20,10 +20,10 @@ from netpos.estimation.mixture.candidates import (
     log_likelihood,
 )
 from netpos.estimation.mixture.gaussians import Mixture, fuse_value
-from netpos.estimation.mixture.ring import RING_MERGE_COST
+from netpos.estimation.mixture.reduction import PART_MERGE_COST
+from netpos.estimation.mixture.splits.split import Split
 from netpos.estimation.predicted import PredictedRows, predict_rows, predicted_rows
 from netpos.estimation.robust import blocked_excess, matching_cost, mixed_excess
-from netpos.estimation.sensors.row import group_end
 from netpos.messages.values import Array
 
 
@@ -112,39 +112,25 @@ def paths_in(i: int, rows: Array, predicted: PredictedRows, robust: RobustOption
 
 
 @kernel
-def paths_are_open(rows: Array, predicted: PredictedRows, options: FilterOptions) -> bool:
-    """Whether for a late range of ``rows``, as they are ``predicted``, a direct and a blocked path
-    make two components."""
-    start = 0
-    while start < rows.shape[0]:
-        stop = group_end(rows, start)
-        late = late_row(rows[start:stop])
-        cost = paths_in(start + late, rows, predicted, options.robust).cost if late >= 0 else 0.0
-        if cost > RING_MERGE_COST:
-            return True
-        start = stop
-    return False
+def divides(rows: Array, _mean: Array, _cov: Array, options: FilterOptions) -> bool:
+    """Whether one of the ``rows`` of one measurement may have come by a blocked path."""
+    return bool(options.robust.nlos_probability > 0.0 and late_row(rows) >= 0)
 
 
 @kernel
-def add_both_paths(
-    k: int,
-    end: int,
-    late: int,
-    prior: Mixture,
-    rows: Array,
-    options: FilterOptions,
-    found: Candidates,
+def add(
+    k: int, end: int, prior: Mixture, rows: Array, options: FilterOptions, found: Candidates
 ) -> int:
-    """Add the candidates of the component ``k``: the path of the row ``late`` of one measurement
-    is direct, and it is blocked, or both as one where that costs nothing; the number of candidates
+    """Add the candidates of the component ``k``: the path of the late row of one measurement is
+    direct, and it is blocked, or both as one where that costs nothing; the number of candidates
     then."""
+    late = late_row(rows)
     mean, cov, log_weight = prior.means[k], prior.covs[k], prior.log_weights[k]
     work = workspace(mean.size, rows.shape[0])
     predicted = predicted_in(work, mean.size, rows.shape[0])
     predict_rows(mean, cov, rows, options.height_m, predicted)
     paths = paths_in(late, rows, predicted, options.robust)
-    several = math.exp(log_weight) * paths.cost > RING_MERGE_COST
+    several = math.exp(log_weight) * paths.cost > PART_MERGE_COST
     found.means[end], found.covs[end] = mean, cov
     everything = np.ones(1)  # of the one measurement, whatever the gate says
     likelihood = log_weight + log_likelihood(
@@ -180,3 +166,27 @@ def add_both_paths(
     found.log_weights[end + 1] = likelihood + paths.blocked.log if sound else -math.inf
     found.blocked[end + 1] = 1.0
     return end + 2
+
+
+@kernel
+def begins(
+    start: int,
+    stop: int,
+    epoch: EpochInput,
+    predicted: PredictedRows,
+    _mean: Array,
+    _cov: Array,
+    options: FilterOptions,
+) -> bool:
+    """Whether for the late range in the rows ``start`` to ``stop`` of ``epoch``, as they are
+    ``predicted``, a direct and a blocked path make two components."""
+    if options.robust.nlos_probability <= 0.0:
+        return False
+    late = late_row(epoch.rows[start:stop])
+    if late < 0:
+        return False
+    cost = paths_in(start + late, epoch.rows, predicted, options.robust).cost
+    return bool(cost > PART_MERGE_COST)
+
+
+SPLIT = Split(name="paths", divides=divides, add=add, most=2, begins=begins)

@@ -10,26 +10,31 @@ from typing import NamedTuple
 import numpy as np
 
 from netpos.estimation.compile import kernel, leaf
-from netpos.estimation.engine import FilterOptions
+from netpos.estimation.engine import EpochInput, FilterOptions
 from netpos.estimation.measurement import (
     ORIGIN,
+    VALUE,
     VARIANCE,
     curvature_variance,
     innovation_row,
     is_range,
     offset_up,
 )
+from netpos.estimation.mixture.candidates import Candidates, outlier_log
 from netpos.estimation.mixture.gaussians import CURVATURE_SHARE, SPACING_SD, Mixture, fuse_value
-from netpos.estimation.sensors.row import group_end
+from netpos.estimation.mixture.reduction import PART_MERGE_COST
+from netpos.estimation.mixture.splits.paths import fuse_by, paths_in, paths_of
+from netpos.estimation.mixture.splits.split import Split
+from netpos.estimation.predicted import PredictedRows, predicted_rows
 from netpos.messages.values import Array
 
 _VELOCITY_END = 4  # position and velocity come first
 # A component is split where it is too long, or reaches the RSU within so many sd; narrower
 # components (m) never are.
 _REACH_SD, _NARROW_M = 3.0, 1.0
+_DIRECT, _BLOCKED, _EITHER = range(3)  # ways of a range
 _END_SD = 6.0  # where a component ends along a ring: what lies beyond is pruned
-_RING_MIN, RING_MAX = 12, 128
-RING_MERGE_COST = 2e-4  # divergence (Runnalls' bound) that merging parts of a ring may cost
+_RING_MIN, _RING_MAX = 12, 128
 
 
 @kernel
@@ -61,9 +66,9 @@ def is_wide(row: Array, mean: Array, cov: Array, options: FilterOptions) -> bool
 
 
 @kernel
-def splits(rows: Array, mean: Array, cov: Array, options: FilterOptions) -> bool:
-    """Whether the ``rows`` of one measurement split a component: a range alone that ``is_wide``.
-    An angle measured with it tells where on the ring the device is."""
+def divides(rows: Array, mean: Array, cov: Array, options: FilterOptions) -> bool:
+    """Whether the ``rows`` of one measurement are a range alone that ``is_wide``. An angle
+    measured with it tells where on the ring the device is."""
     return bool(rows.shape[0] == 1 and is_wide(rows[0], mean, cov, options))
 
 
@@ -100,7 +105,7 @@ def cut_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Piec
     towards, half = math.atan2(dy, dx), _half_angle(math.hypot(dx, dy), cov)
     sd = math.sqrt(radius * math.sqrt(2.0 * CURVATURE_SHARE * own))  # no longer than that
     wanted = math.ceil(2.0 * half * radius / (SPACING_SD * sd))
-    count = int(min(max(wanted, _RING_MIN), RING_MAX))
+    count = int(min(max(wanted, _RING_MIN), _RING_MAX))
     arc = 2.0 * half * radius / count
     sd = arc / SPACING_SD
     bend = 0.5 * sd * sd / math.hypot(radius, dz)
@@ -121,14 +126,75 @@ def cut_along_ring(mean: Array, cov: Array, row: Array, height_m: float) -> Piec
 
 
 @kernel
-def any_splits(components: Mixture, rows: Array, options: FilterOptions) -> bool:
-    """Whether a range of ``rows`` splits a component along its ring."""
-    start = 0
-    while start < rows.shape[0]:
-        stop = group_end(rows, start)
-        for k in range(components.log_weights.size):
-            mean, cov = components.means[k], components.covs[k]
-            if splits(rows[start:stop], mean, cov, options):
-                return True
-        start = stop
-    return False
+def _add_pieces(
+    prior: Mixture,
+    k: int,
+    row: Array,
+    way: int,
+    excess: float,
+    end: int,
+    options: FilterOptions,
+    found: Candidates,
+) -> int:
+    """Add the component ``k`` of ``prior``, cut along the ring of a range that is ``excess`` [m]
+    too long, with the range fused as one that came this ``way``; the number of candidates then."""
+    shorter, log_weight = row.copy(), prior.log_weights[k]
+    shorter[VALUE] -= excess
+    pieces = cut_along_ring(prior.means[k], prior.covs[k], shorter, options.height_m)
+    for i in range(pieces.innovation.size):
+        mean, cov, h = found.means[end], found.covs[end], pieces.H[i]
+        mean[:], cov[:] = pieces.components.means[i], pieces.components.covs[i]
+        innovation, known_var = pieces.innovation[i] + excess, float(h @ cov @ h)
+        paths = paths_of(row, innovation, known_var, options.robust)
+        path = paths.direct
+        if way != _DIRECT:
+            path = paths.blocked if way == _BLOCKED else paths.either
+        variance = known_var + row[VARIANCE]
+        fits = -0.5 * (innovation**2 / variance + math.log(2.0 * math.pi * variance))
+        own_log = log_weight + pieces.components.log_weights[i]
+        found.log_weights[end] = own_log + fits + path.log
+        found.nis[end] = fuse_by(path, mean, cov, h, innovation, row[VARIANCE])
+        found.accepted[end], found.used[end], found.blocked[end] = 1.0, 1.0, path.blocked
+        end += 1
+    return int(end)
+
+
+@kernel
+def add(
+    k: int, end: int, prior: Mixture, rows: Array, options: FilterOptions, found: Candidates
+) -> int:
+    """Add the candidates of the component ``k`` along the ring of a range, those along that of a
+    blocked path, or one for both where that costs nothing, and the component itself, to which the
+    range is an outlier; the number of candidates then."""
+    row, mean, cov, log_weight = rows[0], prior.means[k], prior.covs[k], prior.log_weights[k]
+    predicted = predicted_rows(mean, cov, rows, options.height_m)
+    paths = paths_in(0, rows, predicted, options.robust)
+    if math.exp(log_weight) * paths.cost > PART_MERGE_COST:
+        late_m = paths.blocked.excess
+        end = _add_pieces(prior, k, row, _DIRECT, 0.0, end, options, found)
+        end = _add_pieces(prior, k, row, _BLOCKED, late_m, end, options, found)
+    else:
+        end = _add_pieces(prior, k, row, _EITHER, 0.0, end, options, found)
+    found.means[end], found.covs[end] = mean, cov
+    found.log_weights[end] = log_weight + paths.direct.log + outlier_log(rows, predicted, 0, 1)
+    return int(end + 1)
+
+
+@kernel
+def begins(
+    start: int,
+    stop: int,
+    epoch: EpochInput,
+    _predicted: PredictedRows,
+    mean: Array,
+    cov: Array,
+    options: FilterOptions,
+) -> bool:
+    """Whether the track has been silent for long, and the measurement in the rows ``start`` to
+    ``stop`` of ``epoch`` divides it."""
+    if epoch.dt_s <= options.coast_after_s:
+        return False
+    return bool(divides(epoch.rows[start:stop], mean, cov, options))
+
+
+SPLIT = Split(name="ring", divides=divides, add=add, most=2 * _RING_MAX + 1, begins=begins)
