@@ -2,8 +2,8 @@
 
     python scripts/mutate_kernels.py [ROOM|ROOM.KERNEL ...]
 
-A room is a module of ``estimation``, or another with its folder before it, as ``tracking/output``
-(``TESTS_OF`` lists them; all where none is named). The kernels run as plain Python here
+A room is a module of the library, as ``estimation/update/bearing`` (``TESTS_OF`` lists them with
+their tests; all where none is named). The kernels run as plain Python here
 (NUMBA_DISABLE_JIT), so that a change needs no compiling. Exit code 1 where a change survives.
 """
 
@@ -29,60 +29,65 @@ ROOT = Path(__file__).resolve().parents[1]
 TESTS = ROOT / "ros2_ws/src/netpos/test"
 # Tests that have to notice; without what takes long in Python.
 TESTS_OF = {
-    "bearing": "test_bearing.py",
-    "conditioning": "test_conditioning.py",
-    "estimation/forms/ekf": "../test_motion.py ../test_ekf.py ../test_ekf_gate.py "
-    "../test_ekf_contradiction.py ../test_ekf_iteration.py ../test_ekf_bending.py "
-    "../test_bearing.py ../test_ekf_wide_prior.py",
-    "error_state": "test_error_state_rules.py test_error_state_chunks.py test_error_state.py",
-    "factor": "test_factor.py",
-    "fit": "test_fit.py test_gate.py test_mixing.py::test_likelihood_of_what_says_the_same_twice",
-    "fusion": "test_ekf.py",
-    "gate": "test_gate.py test_kf.py",
-    "iteration": "test_ekf_iteration.py test_ekf_bending.py test_ekf_wide_prior.py",
-    "estimation/forms/kf": "../test_kf.py ../test_gate.py",
-    "manoeuvre": "test_manoeuvre.py",
-    "measurement": "test_measurement.py test_measurement_curvature.py test_measurement_phase.py "
-    "test_measurement_rows.py test_step_velocity.py sensors/test_models.py",
+    "estimation/update/bearing": "test_bearing.py",
+    "estimation/update/conditioning": "test_conditioning.py",
+    "estimation/forms/ekf": "test_motion.py test_ekf.py test_ekf_gate.py "
+    "test_ekf_contradiction.py test_ekf_iteration.py test_ekf_bending.py "
+    "test_bearing.py test_ekf_wide_prior.py",
+    "estimation/spatial/error_state": "test_error_state_rules.py test_error_state_chunks.py "
+    "test_error_state.py",
+    "estimation/factor": "test_factor.py",
+    "estimation/update/fit": "test_fit.py test_gate.py "
+    "test_mixing.py::test_likelihood_of_what_says_the_same_twice",
+    "estimation/update/fusion": "test_ekf.py",
+    "estimation/update/gate": "test_gate.py test_kf.py",
+    "estimation/update/iteration": "test_ekf_iteration.py test_ekf_bending.py "
+    "test_ekf_wide_prior.py",
+    "estimation/forms/kf": "test_kf.py test_gate.py",
+    "estimation/level/manoeuvre": "test_manoeuvre.py",
+    "estimation/measurement": "test_measurement.py test_measurement_curvature.py "
+    "test_measurement_phase.py test_measurement_rows.py test_step_velocity.py "
+    "sensors/test_models.py",
     **{
-        f"estimation/motion/{name}": "../test_motion.py ../test_motion_models.py"
+        f"estimation/motion/{name}": "test_motion.py test_motion_models.py"
         for name in (
             *("constant_velocity", "constant_turn", "constant_acceleration", "stationary"),
             *("inertial", "rigid_body", "process", "process_noise"),
         )
     },
-    "position_fix": "test_position_fix.py",
-    "robust": "test_robust.py",
-    "rows": "test_measurement_rows.py test_measurement_phase.py",
-    "sigma": "test_ukf.py",
-    "smooth": "test_smooth.py",
-    "space": "test_space.py test_space_conditioning.py sensors/test_models.py",
-    "estimation/forms/srukf": "../test_ukf.py ../test_engine_parts.py -knot+ten_thousand",
+    "estimation/fixes/position_fix": "test_position_fix.py",
+    "estimation/update/slow_errors": "test_slow_errors.py",
+    "estimation/update/robust": "test_robust.py",
+    "estimation/rows": "test_measurement_rows.py test_measurement_phase.py",
+    "estimation/forms/sigma": "test_ukf.py",
+    "estimation/smooth": "test_smooth.py",
+    "estimation/spatial/space": "test_space.py test_space_conditioning.py sensors/test_models.py",
+    "estimation/forms/srukf": "test_ukf.py test_engine_parts.py -knot+ten_thousand",
     **{
-        f"estimation/sensors/{name}": "test_models.py ../test_measurement.py ../test_space.py "
-        "../test_measurement_curvature.py ../test_measurement_phase.py ../test_step_velocity.py"
+        f"estimation/sensors/{name}": "sensors/test_models.py test_measurement.py test_space.py "
+        "test_measurement_curvature.py test_measurement_phase.py test_step_velocity.py"
         for name in (
             *("azimuth", "elevation", "cone_angle", "range", "phase", "position"),
             *("ground_speed", "step_velocity", "body_motion", "geometry"),
         )
     },
-    "engine": "test_engine_parts.py test_engine.py -knot+equals_the_tracker",
-    "predicted": "test_manoeuvre.py test_fit.py test_protection.py",
-    "estimation/mixture/window": "../../tracking/test_initialise_fit.py",
+    "estimation/engine": "test_engine_parts.py test_engine.py -knot+equals_the_tracker",
+    "estimation/update/predicted": "test_manoeuvre.py test_fit.py test_protection.py",
+    "estimation/mixture/window": "../tracking/test_initialise_fit.py",
     "tracking/output": "test_output.py",
-    "phase_fix": "test_phase_fix.py",
-    "protection": "test_protection.py test_protection_epochs.py",
-    "report": "test_report.py",
-    "estimation/mixture/mixing": "../test_mixing.py -knot+stop_straight_turn",
+    "estimation/fixes/phase_fix": "test_phase_fix.py",
+    "estimation/level/protection": "test_protection.py test_protection_epochs.py",
+    "estimation/level/report": "test_report.py",
+    "estimation/mixture/mixing": "test_mixing.py -knot+stop_straight_turn",
     **{
-        f"estimation/mixture/{name}": "../test_components.py"
+        f"estimation/mixture/{name}": "test_components.py"
         for name in (
-            *("candidates", "epoch", "gaussians", "paths", "reduction"),
-            *("ring", "turns"),
+            *("candidates", "epoch", "gaussians", "reduction", "turns"),
+            *("splits/paths", "splits/ring"),
         )
     },
-    "estimation/mixture/sectors": "../test_phase_sectors.py",
-    "estimation/forms/ukf": "../test_ukf.py ../test_gate.py",
+    "estimation/mixture/sectors": "test_phase_sectors.py",
+    "estimation/forms/ukf": "test_ukf.py test_gate.py",
 }
 # Newton's method gets there from anywhere.
 _START = (
@@ -95,43 +100,74 @@ _START = (
 )
 # Changes that change nothing but time, or nothing at all.
 EQUIVALENT = {
-    ("bearing", "_moments", "left out: continue"),  # the sums begin anew
-    ("bearing", "fuse_bearing", "operator swapped: high - low"),  # nearer still than it has to be
-    ("bearing", "fuse_bearing", "operator swapped: reach - 0.5 * a[0]"),  # ends beyond all weight
-    ("measurement", "wrap", "operator swapped: angle + math.pi"),  # a whole turn away
+    ("estimation/update/bearing", "_moments", "left out: continue"),  # the sums begin anew
+    (
+        "estimation/update/bearing",
+        "fuse_bearing",
+        "operator swapped: high - low",
+    ),  # nearer still than it has to be
+    (
+        "estimation/update/bearing",
+        "fuse_bearing",
+        "operator swapped: reach - 0.5 * a[0]",
+    ),  # ends beyond all weight
+    ("estimation/measurement", "wrap", "operator swapped: angle + math.pi"),  # a whole turn away
     *(  # both are squared
         ("estimation/sensors/range", "exact", f"operator swapped: {sum_}")
         for sum_ in ("Pd += cov[i, j] * d[j]", "along += d[i] * Pd")
     ),
     ("estimation/forms/srukf", "_eliminate", "left out: continue"),
-    ("sigma", "_regress", "left out: E[i, n] *= _SHIFT_WEIGHT"),  # is 1
-    ("sigma", "_regress", "operator swapped: E[i, n] *= _SHIFT_WEIGHT"),
+    ("estimation/forms/sigma", "_regress", "left out: E[i, n] *= _SHIFT_WEIGHT"),  # is 1
+    ("estimation/forms/sigma", "_regress", "operator swapped: E[i, n] *= _SHIFT_WEIGHT"),
     ("estimation/forms/ekf", "_passes", "operator swapped: stop - start"),
     # its mirror
-    ("manoeuvre", "detection_delay_s", "operator swapped: xy += h[X.PX] * h[X.PY] / variance"),
-    ("error_state", "correct", "left out: posterior = cov"),  # set anew by the first iteration
+    (
+        "estimation/level/manoeuvre",
+        "detection_delay_s",
+        "operator swapped: xy += h[X.PX] * h[X.PY] / variance",
+    ),
+    (
+        "estimation/spatial/error_state",
+        "correct",
+        "left out: posterior = cov",
+    ),  # set anew by the first iteration
     *(  # starts lie symmetrically around
         (
-            "iteration",
+            "estimation/update/iteration",
             "refine_used",
             f"operator swapped: start[X.{a}] += 1.5 * math.sqrt"
             f"(prior_cov[X.{a}, X.{a}]) * math.{f}(2.0 * math.pi * k / _STARTS)",
         )
         for a, f in (("PX", "cos"), ("PY", "sin"))
     ),
-    ("iteration", "refine_used", "operator swapped: cost - 0.001"),  # the same place again
-    *(("protection", "gaussian_radius", f"operator swapped: {where}") for where in _START),
+    (
+        "estimation/update/iteration",
+        "refine_used",
+        "operator swapped: cost - 0.001",
+    ),  # the same place again
+    *(
+        ("estimation/level/protection", "gaussian_radius", f"operator swapped: {where}")
+        for where in _START
+    ),
     # one that converges as fast, and terms too small for the sum
-    ("protection", "gaussian_radius", "operator swapped: 1e-06 * u"),
-    ("protection", "gaussian_radius", "operator swapped: u + 2.0 * _NEGLIGIBLE"),
-    ("protection", "radius_of", "operator swapped: xx + yy"),  # finite where both are
+    ("estimation/level/protection", "gaussian_radius", "operator swapped: 1e-06 * u"),
+    ("estimation/level/protection", "gaussian_radius", "operator swapped: u + 2.0 * _NEGLIGIBLE"),
+    (
+        "estimation/level/protection",
+        "radius_of",
+        "operator swapped: xx + yy",
+    ),  # finite where both are
     # is 1
     ("estimation/mixture/sectors", "_take_turns", "operator swapped: _WIDE_RAD * _WIDE_RAD"),
     *(  # memory for more rows than there are
-        ("engine", "run_epochs", f"operator swapped: {size}")
+        ("estimation/engine", "run_epochs", f"operator swapped: {size}")
         for size in ("row_start[k + 1] - row_start[k] (2)", "k + 1 (3)")
     ),
-    ("iteration", "iterate_from", "left out: x, P = (mean.copy(), cov.copy())"),  # likewise
+    (
+        "estimation/update/iteration",
+        "iterate_from",
+        "left out: x, P = (mean.copy(), cov.copy())",
+    ),  # likewise
 }
 CPU_S = 30  # what takes longer does not end
 SWAPS: dict[type[ast.operator], type[ast.operator]] = {
@@ -208,13 +244,6 @@ def run(tests: list[str]) -> int:
     return int(pytest.main([*quiet, *tests]))
 
 
-def folder_and_module(room: str) -> tuple[str, ModuleType]:
-    """Where a room is."""
-    folder, _, name = room.rpartition("/")
-    folder = folder or "estimation"
-    return folder, import_module(f"netpos.{folder.replace('/', '.')}.{name}")
-
-
 def kernels(module: ModuleType) -> Iterator[ast.FunctionDef]:
     """What a module compiles."""
     source = Path(str(module.__file__))
@@ -254,9 +283,11 @@ def main(rooms: list[str]) -> int:
     unnoticed = total = 0
     for asked in rooms or list(TESTS_OF):
         room, _, only = asked.partition(".")
-        folder, module = folder_and_module(room)
+        module = import_module("netpos." + room.replace("/", "."))
         tests = [
-            name.replace("+", " ") if name.startswith("-") else str(TESTS / folder / name)
+            name.replace("+", " ")
+            if name.startswith("-")
+            else str(TESTS / room.split("/")[0] / name)
             for name in TESTS_OF[room].split()
         ]
         run([*tests, "--collect-only", "-qq"])  # imports what all children need

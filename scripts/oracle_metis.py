@@ -27,11 +27,12 @@ from scipy.constants import speed_of_light
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "ros2_ws/src/netpos/test/support"))
 
-from netpos.estimation.manoeuvre import (  # noqa: E402
+from netpos.estimation.level.manoeuvre import (  # noqa: E402
     TURN_ANGLE_SD,
     TURN_SIZES,
     TURN_SPEED_SD,
 )
+from netpos.estimation.level.protection import protection_level  # noqa: E402
 from netpos.estimation.measurement import (  # noqa: E402
     AXES,
     KIND,
@@ -42,7 +43,6 @@ from netpos.estimation.measurement import (  # noqa: E402
     Kind,
 )
 from netpos.estimation.mixture.turns import TURNS_HZ  # noqa: E402
-from netpos.estimation.protection import protection_level  # noqa: E402
 from netpos.estimation.state import N_CORE, POSITION  # noqa: E402
 from netpos.evaluation.metrics import SKIP_EPOCHS  # noqa: E402
 from netpos.messages.values import Array, InitialPose  # noqa: E402
@@ -84,7 +84,7 @@ class Route:
 
 
 def start_of(config: TrackerConfig, pose: InitialPose) -> Start:
-    """The tracker's start (``tracking.models.pose_state``) as the particle filter takes it."""
+    """The tracker's start (``pose_state``) as the particle filter takes it."""
     c = speed_of_light
     return Start(
         mean=np.array([*pose.position[:2], 0.0, 0.0]),

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 
 import numpy as np
-from netpos.estimation.error_state import Sensors
+from netpos.estimation.spatial.error_state import Sensors
 from netpos.reproduction.deng2022 import car_drive
 
 CONSTRAINTS_MPS = (0.1, 0.2, 0.4)

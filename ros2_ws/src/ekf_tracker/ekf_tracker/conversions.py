@@ -7,7 +7,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from netpos.messages.network_tracks import network_track_to_msg
-from netpos.tracking.diagnosis import Finding
+from netpos.tracking.health.diagnosis import Finding
 from netpos_node import CODEC
 
 __all__ = ["diagnostics_to_msg", "network_track_to_msg"]

@@ -13,7 +13,7 @@ from netpos.messages import topics
 from netpos.messages.values import RsuMeasurement as Measurement
 from netpos.scenario.settings import change_fact, tracker_fact
 from netpos.tracking import Tracker, TrackOutput
-from netpos.tracking.validation import explanation
+from netpos.tracking.door.validation import explanation
 from netpos.tracking.warm_up import warm_up, warm_up_anchors, warm_up_components
 from netpos.world.geodesy import Datum
 from netpos_msgs.msg import NetworkTrack, RsuErrors, RsuInfo, RsuMeasurement

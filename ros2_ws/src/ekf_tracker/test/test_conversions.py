@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from ekf_tracker.conversions import diagnostics_to_msg
-from netpos.tracking.diagnosis import Finding, Level
+from netpos.tracking.health.diagnosis import Finding, Level
 
 
 def test_a_finding_is_a_status() -> None:

@@ -30,8 +30,7 @@ from netpos.bench.problem import (
     variances,
 )
 from netpos.bench.yardstick import Yardstick
-from netpos.estimation import sigma
-from netpos.estimation.forms import ekf, srukf
+from netpos.estimation.forms import ekf, sigma, srukf
 from netpos.estimation.measurement import AXES, ORIGIN, VALUE, VARIANCE, linearise, predict_row
 from netpos.estimation.motion import NO_BIAS, propagate
 from netpos.estimation.state import POSITION, X

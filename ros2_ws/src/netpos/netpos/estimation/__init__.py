@@ -6,16 +6,15 @@ cached on disk.
 ``forms``        one module per form of the filter and the table of all: EKF and IEKF, UKF, its
                  square root, linear KF
 ``sensors``      one module per sensor and the table of all: h, H, second-order term, refusals
-``measurement``  rows of measurements in a planar filter, ``space`` in a spatial one; ``rows``
-                 makes them of messages
-``fusion``, ``iteration``  rows into the estimate; again where the model bends (``fit``)
-``sigma``        what unscented forms take from sigma points; ``dispatch``: the compiled choice
-``gate``         acceptance by group; ``conditioning``, ``robust``: what fits badly counts less
-``intersection``  two estimates of one state into one, whatever they have in common
-``engine``       one epoch of one component
-``mixture``      one epoch of several components, and a module for each reason to have them
-``protection``   the radius that holds the error
+``measurement``  rows of measurements in a planar filter; ``rows`` makes them of messages
+``update``       rows into the estimate: prediction, gate, fusion, iteration, slow errors
+``engine``       one epoch of one component; ``mixture`` of several, and the reasons to have them
+``level``        the radius that holds the error
+``fixes``        a position from measurements alone
+``spatial``      rows and filter of a strapdown track
 ``smooth``       Rauch-Tung-Striebel smoothing
+``intersection``  two estimates of one state into one, whatever they have in common
+``compile``, ``dispatch``  how kernels are compiled, and chosen among the entries of a table
 """
 
 from netpos.estimation.compile import tell_first_compilation

@@ -9,16 +9,16 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from netpos.estimation import conditioning, fusion, slow_errors
 from netpos.estimation.compile import kernel, leaf, spliced
-from netpos.estimation.conditioning import Robust, RobustOptions
 from netpos.estimation.forms import choice
 from netpos.estimation.forms.table import FORMS
-from netpos.estimation.manoeuvre import detection_delay_s
+from netpos.estimation.level.manoeuvre import detection_delay_s
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS, Parameter
-from netpos.estimation.predicted import PredictedRows, predict_rows
 from netpos.estimation.state import X
+from netpos.estimation.update import conditioning, fusion, slow_errors
+from netpos.estimation.update.conditioning import Robust, RobustOptions
+from netpos.estimation.update.predicted import PredictedRows, predict_rows
 from netpos.messages.values import Array
 
 Ints = npt.NDArray[np.int64]
@@ -67,7 +67,7 @@ class StepResult(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of ``predict_epoch`` and ``update_epoch``: of ``fusion.workspace``, groups
+    """Memory of ``predict_epoch`` and ``update_epoch``: of ``update.fusion.workspace``, groups
     accepted (groups,), the prediction (n,), (n, n), the covariance (n, n) that the rows met: that
     of the prediction with what ``open_velocity`` added; and the slow errors (2, n) of the step to
     it."""
@@ -275,7 +275,7 @@ def predict_epoch(
 
     After ``inflate_after`` epochs rejected in a row the velocity opens to its initial sd.
     ``scratch`` keeps the prediction without that, and the rows as the component sees them
-    (``fusion.predicted_in``).
+    (``update.fusion.predicted_in``).
     """
     widened = scratch.bias[:, : bias.shape[1]]
     if bias.shape[1] > 0:

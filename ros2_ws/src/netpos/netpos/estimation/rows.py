@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from functools import lru_cache
 from operator import attrgetter
 from typing import NamedTuple
@@ -70,20 +69,22 @@ def array_direction(axes: Array) -> Array:
     return -axes[3:6]
 
 
-@dataclass(frozen=True, slots=True)
-class Coupling:
-    """How the slow and coloured errors of one RSU enter its rows, by kind; what is absent is white
-    and unbiased."""
+class RowErrors(NamedTuple):
+    """How the slow and coloured errors of an RSU enter one of its rows."""
 
-    bias: Mapping[Kind, int]  # state index of the RSU's own bias
-    common: Mapping[Kind, int]  # state index of the bias its network shares
-    inflation: Mapping[Kind, float]  # variance factor of correlated noise
-    gate: Mapping[Kind, float] = field(default_factory=dict)  # variance factor of single values
-    reference: Mapping[Kind, int] = field(default_factory=dict)
-    """State index of the bias of the RSU that a difference counts from."""
+    bias: int = -1
+    """State index of the RSU's own bias; -1: it has none."""
+    common: int = -1
+    """State index of the bias its network shares; -1: there is none."""
+    reference: int = 0
+    """State index of the bias of the RSU that a difference counts from; 0: there is none."""
+    inflation: float = 1.0
+    """Variance factor of correlated noise."""
+    gate: float = 1.0
+    """Variance factor of single values."""
 
 
-UNCOUPLED = Coupling({}, {}, {})
+WHITE = RowErrors()
 
 
 class ScalarPlan(NamedTuple):
@@ -247,15 +248,12 @@ def _has_height(position: Array, cov: Array) -> bool:
     return bool(np.linalg.eigvalsh(cov / np.outer(sd, sd))[0] > _CORRELATION_MARGIN)
 
 
-def couple(rows: Array, kinds: tuple[Kind, ...], coupling: Coupling) -> None:
-    """Write the slow and coloured errors of an RSU into the first rows of its measurement, whose
-    ``kinds`` they are."""
-    for row, kind in zip(rows, kinds, strict=False):
-        row[VARIANCE] *= coupling.inflation.get(kind, 1.0)
-        row[GATE_VARIANCE] *= coupling.gate.get(kind, 1.0)
-        row[BIAS] = coupling.bias.get(kind, -1)
-        row[COMMON] = coupling.common.get(kind, -1)
-        row[REFERENCE] = coupling.reference.get(kind, 0)
+def couple(rows: Array, errors: Sequence[RowErrors]) -> None:
+    """Write the slow and coloured errors of an RSU into the first rows of its measurement."""
+    for row, own in zip(rows, errors, strict=False):
+        row[VARIANCE] *= own.inflation
+        row[GATE_VARIANCE] *= own.gate
+        row[BIAS], row[COMMON], row[REFERENCE] = own.bias, own.common, own.reference
 
 
 def drop_biases(rows: Array) -> None:
@@ -269,20 +267,21 @@ def rsu_rows(
     info: RsuInfo,
     axes: Array,
     group: int,
-    coupling: Coupling = UNCOUPLED,
+    errors: Sequence[RowErrors] = (),
     heading: int = -1,
     reference: Array | None = None,
     height: HeightState = KNOWN_HEIGHT,
 ) -> Array:
     """Rows (m, ROW_WIDTH) of one RSU measurement.
 
-    axes : (9,) of ``rsu_axes``; reference : ``rsu_place`` of the second RSU of a difference
+    axes : (9,) of ``rsu_axes``; errors : of its scalar rows
+    reference : ``rsu_place`` of the second RSU of a difference
     heading : state index of the device's heading, by which its lever arm turns; -1: none
     """
     rows = np.empty((ROWS_MAX, ROW_WIDTH))
     sites = info.angle_convention is _CONE, rsu_place(info, axes), reference
     end = put_measurement(rows, 0, m, sites, group, heading, height)
-    couple(rows, scalar_kinds(int(m.fields), info.angle_convention), coupling)
+    couple(rows, errors)
     return rows[:end]
 
 

@@ -39,8 +39,8 @@ from netpos.scenario.recorded_drive import import_car_drive
 from netpos.scenario.replay import reading_of, tracker_of
 from netpos.scenario.settings import TrackerSettings, bag_settings, settings_from
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.ordering.sequencer import Item
 from netpos.tracking.report import TrackOutput
-from netpos.tracking.sequencer import Item
 
 SEEDS = range(9001, 9061)
 FEWEST_RUNS = 8

@@ -14,9 +14,9 @@ from netpos.evaluation.bounds import bound_rmse, run_bound
 from netpos.evaluation.pairing import Stamps, Trajectory
 from netpos.messages.values import Array, InitialPose, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.epoch_rows import epoch_rows_of, planar_form
-from netpos.tracking.models import height_state, motions_of, pose_state, slow_states
-from netpos.tracking.rsus import Rsu
+from netpos.tracking.estimators.epoch_rows import epoch_rows_of, planar_form
+from netpos.tracking.estimators.models import height_state, motions_of, pose_state, slow_states
+from netpos.tracking.rsus.rsu import Rsu
 
 
 def recorded_bound_m(

@@ -22,7 +22,7 @@ from netpos.messages.values import (
     TrackState,
     TrackStatus,
 )
-from netpos.tracking.diagnosis import errors_in_words
+from netpos.tracking.health.diagnosis import errors_in_words
 
 _GAP_S = 1.0
 _BIASED, _FEW, _SEVERAL = 0.5, 20, 4

@@ -19,8 +19,8 @@ from netpos.reproduction.segments import Epochs, Flags, Followed, Follower, Ints
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.simulation import Beacons
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.models import height_state, pose_state
-from netpos.tracking.rsus import Rsu
+from netpos.tracking.estimators.models import height_state, pose_state
+from netpos.tracking.rsus.rsu import Rsu
 
 VUE = "vue_1"
 

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from netpos.estimation.compile import kernel
+from netpos.estimation.level.protection import gaussian_tail
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
-from netpos.estimation.protection import gaussian_tail
 from netpos.estimation.state import POSITION, X
 from netpos.evaluation.consistency import MeanTest, nees_over_runs
 from netpos.evaluation.metrics import MIN_SPEED_FOR_HEADING_MPS, NS, SKIP_EPOCHS

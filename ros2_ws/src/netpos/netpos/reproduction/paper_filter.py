@@ -24,7 +24,7 @@ from netpos.evaluation.metrics import SKIP_EPOCHS
 from netpos.messages.values import Array
 from netpos.reproduction.segments import Epochs, Followed
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.models import motions_of
+from netpos.tracking.estimators.models import motions_of
 
 Ints = npt.NDArray[np.int64]
 

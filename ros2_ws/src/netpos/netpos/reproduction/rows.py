@@ -22,7 +22,7 @@ from netpos.estimation.rows import rsu_axes, rsu_rows
 from netpos.estimation.sensors.table import readings
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.radio.measure import QUANTITIES, Observations
-from netpos.tracking.rsus import Rsu
+from netpos.tracking.rsus.rsu import Rsu
 
 Ints = npt.NDArray[np.int64]
 

@@ -9,19 +9,18 @@ import numpy.typing as npt
 
 from netpos.estimation import engine
 from netpos.estimation.engine import Run
+from netpos.estimation.level.report import run_levels
 from netpos.estimation.measurement import BIAS
 from netpos.estimation.mixture.epoch import run_epochs
 from netpos.estimation.mixture.gaussians import Mixture, one_component
 from netpos.estimation.motion import Parameter
-from netpos.estimation.report import run_levels
 from netpos.estimation.state import N_CORE
 from netpos.evaluation.metrics import NS
 from netpos.messages.values import Array, ImuSample
-from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.imu_buffer import ImuBuffer
-from netpos.tracking.initialise import Initialiser
-from netpos.tracking.models import (
+from netpos.tracking.estimators import estimates
+from netpos.tracking.estimators.imu_buffer import ImuBuffer
+from netpos.tracking.estimators.models import (
     augmented,
     dynamics_of,
     initial_extra_sd,
@@ -30,7 +29,8 @@ from netpos.tracking.models import (
     slow_states,
     start_state,
 )
-from netpos.tracking.rsus import Rsu, SlowErrors
+from netpos.tracking.first_fix.initialise import Initialiser
+from netpos.tracking.rsus.rsu import Rsu, SlowErrors
 
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]

@@ -37,8 +37,8 @@ from netpos.scenario.settings import (
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.networks.chain import Chain
 from netpos.tracking.networks.config import FusionConfig
+from netpos.tracking.ordering.sequencer import Item
 from netpos.tracking.report import TrackOutput
-from netpos.tracking.sequencer import Item
 from netpos.tracking.tracker import Tracker
 
 _ODOMETRY = "nav_msgs/msg/Odometry"

@@ -1,12 +1,14 @@
 """One track per device: order the measurements, initialise, gate, update, report.
 
 ``config``      every parameter of the tracker
-``validation``  what is refused at the door, and why
-``sequencer``   stamp order and epochs
-``initialise``  the first fix from whatever has been measured
-``track``       one device
-``output``      state to odometry, clock state and status
-``tracker``     all devices
+``door``        what is refused, and why
+``ordering``    stamp order and epochs
+``first_fix``   from whatever has been measured
+``estimators``  what a track estimates with
+``rsus``        the RSUs and what is learned of their errors
+``health``      which of them are to be believed
+``smoothing``   every epoch given what came after it
+``track``       one device; ``tracker`` all of them; ``output``, ``report``: what they say
 ``networks``    several networks, one track: a tracker each, their tracks fused
 """
 

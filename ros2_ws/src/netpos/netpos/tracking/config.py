@@ -15,7 +15,7 @@ from netpos.estimation.motion import table as motion
 from netpos.estimation.motion.model import MotionModel
 from netpos.messages.fields import Frames
 from netpos.tracking import shared_parameters as shared
-from netpos.tracking.rsus import StepErrors
+from netpos.tracking.rsus.rsu import StepErrors
 from netpos.world.geodesy import datum_of_text
 
 FILTERS = tuple(forms.words())

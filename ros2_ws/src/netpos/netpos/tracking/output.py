@@ -8,8 +8,8 @@ import numpy as np
 
 from netpos.estimation.compile import leaf
 from netpos.estimation.factor import eigenvalues
+from netpos.estimation.level.protection import radius_of
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
-from netpos.estimation.protection import radius_of
 from netpos.estimation.state import POSITION, HeightState, X
 from netpos.messages.values import Array, ClockState, Odometry, TrackState
 from netpos.tracking.config import TrackerConfig

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from netpos.estimation.report import LEVEL_MAX_M
+from netpos.estimation.level.report import LEVEL_MAX_M
 from netpos.messages.values import (
     ClockState,
     NetworkTrack,

@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from netpos.estimation.chi_square import chi_square_bound
+from netpos.estimation.level.report import level_of
 from netpos.estimation.mixture.gaussians import Mixture
-from netpos.estimation.report import level_of
 from netpos.messages.values import (
     Array,
     InitialPose,
@@ -23,7 +23,7 @@ from netpos.messages.values import (
     TrackStatus,
 )
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.epoch_rows import (
+from netpos.tracking.estimators.epoch_rows import (
     EpochRows,
     Source,
     fits,
@@ -31,15 +31,15 @@ from netpos.tracking.epoch_rows import (
     refused_groups,
     velocity_inflation,
 )
-from netpos.tracking.estimates import UpdateResult
-from netpos.tracking.estimator import RECENT, Estimator, Past
-from netpos.tracking.health import RsuHealth
-from netpos.tracking.history import History, TrackSnapshot, merge
-from netpos.tracking.imu_buffer import ImuBuffer
-from netpos.tracking.models import gate_thresholds
-from netpos.tracking.nlos_rate import NlosRate
-from netpos.tracking.observations import FittedEpoch
-from netpos.tracking.planar import PlanarEstimator
+from netpos.tracking.estimators.estimates import UpdateResult
+from netpos.tracking.estimators.estimator import RECENT, Estimator, Past
+from netpos.tracking.estimators.imu_buffer import ImuBuffer
+from netpos.tracking.estimators.models import gate_thresholds
+from netpos.tracking.estimators.planar import PlanarEstimator
+from netpos.tracking.health.health import RsuHealth
+from netpos.tracking.health.observations import FittedEpoch
+from netpos.tracking.ordering.history import History, TrackSnapshot, merge
+from netpos.tracking.ordering.sequencer import Epoch, Item
 from netpos.tracking.report import (
     EpochResult,
     EstimateStatus,
@@ -48,9 +48,9 @@ from netpos.tracking.report import (
     track_status,
     waiting_output,
 )
-from netpos.tracking.rsus import Rsu
-from netpos.tracking.sequencer import Epoch, Item
-from netpos.tracking.shared_errors import SharedErrors
+from netpos.tracking.rsus.nlos_rate import NlosRate
+from netpos.tracking.rsus.rsu import Rsu
+from netpos.tracking.rsus.shared_errors import SharedErrors
 
 
 class Track:
@@ -423,13 +423,13 @@ def _estimator_of(
     tracker does without."""
     if not config.is_strapdown:
         return PlanarEstimator(vue_id, config, rsus, shared)
-    from netpos.tracking.spatial import SpatialEstimator  # noqa: PLC0415
+    from netpos.tracking.estimators.spatial import SpatialEstimator  # noqa: PLC0415
 
     return SpatialEstimator(vue_id, config, rsus)
 
 
 def warm_up_strapdown(config: TrackerConfig) -> None:
     """Compile, or load, the kernels of strapdown tracks before the first measurement."""
-    from netpos.tracking.spatial import warm_up  # noqa: PLC0415
+    from netpos.tracking.estimators.spatial import warm_up  # noqa: PLC0415
 
     warm_up(config)

@@ -19,24 +19,25 @@ from netpos.messages.values import (
     TrackStatus,
     Velocity,
 )
-from netpos.tracking import diagnosis, validation
-from netpos.tracking.admission import Admission
-from netpos.tracking.clocks import Clocks, Stranger
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.diagnosis import Finding
-from netpos.tracking.health import HealthConfig, RsuHealth, RsuReport
+from netpos.tracking.door import validation
+from netpos.tracking.door.admission import Admission
+from netpos.tracking.door.rate_limit import RATE, RateLimit
+from netpos.tracking.door.refusals import Refusals
+from netpos.tracking.door.repeats import REPEATED, Repeats
+from netpos.tracking.door.voices import CONFLICT, Voices
+from netpos.tracking.health import diagnosis
+from netpos.tracking.health.diagnosis import Finding
+from netpos.tracking.health.health import HealthConfig, RsuHealth, RsuReport
 from netpos.tracking.live_parameters import check_change
-from netpos.tracking.rate_limit import RATE, RateLimit
-from netpos.tracking.refusals import Refusals
-from netpos.tracking.register import Register
-from netpos.tracking.repeats import REPEATED, Repeats
+from netpos.tracking.ordering.clocks import Clocks, Stranger
+from netpos.tracking.ordering.sequencer import IMU, Epoch, Item, Sequencer
 from netpos.tracking.report import TrackOutput
-from netpos.tracking.rsus import REFERENCED
-from netpos.tracking.sequencer import IMU, Epoch, Item, Sequencer
-from netpos.tracking.shared_errors import SharedErrors
-from netpos.tracking.smoothing import check_smoothable
+from netpos.tracking.rsus.register import Register
+from netpos.tracking.rsus.rsu import REFERENCED
+from netpos.tracking.rsus.shared_errors import SharedErrors
+from netpos.tracking.smoothing.planar import check_smoothable
 from netpos.tracking.track import Track, warm_up_strapdown
-from netpos.tracking.voices import CONFLICT, Voices
 
 _PHASE = int(Field.PHASE)  # a plain integer: arithmetic of flags costs ten times as much
 _OLD_POSE_NS = 1_000_000_000

@@ -12,8 +12,8 @@ from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.rows import linear_rows
 from netpos.messages.values import Field, GroundSpeed, InitialPose, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.estimates import Estimate
-from netpos.tracking.sequencer import Item
+from netpos.tracking.estimators.estimates import Estimate
+from netpos.tracking.ordering.sequencer import Item
 from netpos.tracking.tracker import Tracker
 
 _VUE = "warm_up"

@@ -8,9 +8,7 @@ import filter_rows
 import numpy as np
 import pytest
 from curved_rows import bends
-from netpos.estimation.bearing import fuse_around, fuse_bearing, is_plain_bearing, on_top
 from netpos.estimation.forms import ekf
-from netpos.estimation.fusion import W_COV, W_PRIOR, W_USE
 from netpos.estimation.measurement import (
     BIAS,
     HEADING,
@@ -21,6 +19,8 @@ from netpos.estimation.measurement import (
 )
 from netpos.estimation.rows import rsu_axes, rsu_rows
 from netpos.estimation.state import POSITION, X
+from netpos.estimation.update.bearing import fuse_around, fuse_bearing, is_plain_bearing, on_top
+from netpos.estimation.update.fusion import W_COV, W_PRIOR, W_USE
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 
 RSU = np.array([3.0, -2.0])

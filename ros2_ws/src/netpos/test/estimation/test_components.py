@@ -27,8 +27,8 @@ from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.rows import linear_rows
 from netpos.messages.values import Array
 from netpos.tracking import TrackerConfig
-from netpos.tracking.estimates import Estimate
-from netpos.tracking.models import dynamics_of, options_of
+from netpos.tracking.estimators.estimates import Estimate
+from netpos.tracking.estimators.models import dynamics_of, options_of
 from scipy.stats import exponnorm, multivariate_normal, norm
 
 OPTIONS = options_of(TrackerConfig(filter="ekf"))

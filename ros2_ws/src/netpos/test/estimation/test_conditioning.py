@@ -9,8 +9,6 @@ import filter_rows
 import numpy as np
 import pytest
 from filter_rows import NO_GATE, random_spd
-from netpos.estimation import robust
-from netpos.estimation.conditioning import Robust, RobustOptions, reweight
 from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import (
     AXES,
@@ -25,8 +23,10 @@ from netpos.estimation.measurement import (
     Kind,
     curvature_variance,
 )
-from netpos.estimation.predicted import predicted_rows
 from netpos.estimation.state import POSITION, X
+from netpos.estimation.update import robust
+from netpos.estimation.update.conditioning import Robust, RobustOptions, reweight
+from netpos.estimation.update.predicted import predicted_rows
 from netpos.messages.values import Array
 from scipy.integrate import quad
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from ekf_update import exact_fuse, fused, updated
 from filter_rows import NO_GATE, linear_row, random_spd
-from netpos.estimation import fusion
 from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import (
     GROUP,
     VALUE,
 )
 from netpos.estimation.state import X
+from netpos.estimation.update import fusion
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -9,7 +9,6 @@ import pytest
 from curved_rows import bends, log_posterior_cost, range_problem, two_variances
 from ekf_update import exact_fuse, fused, iterated, scratch, updated
 from filter_rows import NO_GATE, linear_row, row
-from netpos.estimation import fit, fusion
 from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import (
     GATE_VARIANCE,
@@ -19,8 +18,9 @@ from netpos.estimation.measurement import (
     Kind,
     linearise,
 )
-from netpos.estimation.predicted import predict_rows
 from netpos.estimation.state import X
+from netpos.estimation.update import fit, fusion
+from netpos.estimation.update.predicted import predict_rows
 from netpos.messages.values import Array
 from scipy.optimize import brentq
 from scipy.stats import chi2

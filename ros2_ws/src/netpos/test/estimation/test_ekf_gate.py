@@ -9,7 +9,6 @@ import pytest
 from ekf_update import fused, updated
 from filter_rows import NO_GATE, linear_row, random_spd
 from netpos.estimation.forms import ekf
-from netpos.estimation.fusion import predicted_in
 from netpos.estimation.measurement import (
     GATE_VARIANCE,
     GROUP,
@@ -17,8 +16,9 @@ from netpos.estimation.measurement import (
     VALUE,
     VARIANCE,
 )
-from netpos.estimation.predicted import predict_rows
 from netpos.estimation.state import X
+from netpos.estimation.update.fusion import predicted_in
+from netpos.estimation.update.predicted import predict_rows
 from netpos.messages.values import Array
 from scipy.stats import chi2
 

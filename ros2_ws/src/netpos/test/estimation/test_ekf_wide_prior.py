@@ -10,9 +10,7 @@ import pytest
 from curved_rows import bends, log_posterior_cost, two_variances
 from ekf_update import fused, iterated, scratch, updated
 from filter_rows import NO_GATE, row
-from netpos.estimation import fusion
 from netpos.estimation.forms import ekf
-from netpos.estimation.iteration import is_wide
 from netpos.estimation.measurement import (
     GROUP,
     VALUE,
@@ -22,6 +20,8 @@ from netpos.estimation.measurement import (
     linearise,
 )
 from netpos.estimation.state import POSITION, X
+from netpos.estimation.update import fusion
+from netpos.estimation.update.iteration import is_wide
 from netpos.messages.values import Array
 from scipy.optimize import brentq, least_squares
 

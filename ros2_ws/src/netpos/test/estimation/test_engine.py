@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from engine_cases import opened, start
-from netpos.estimation import conditioning, engine
+from netpos.estimation import engine
 from netpos.estimation.engine import EpochInput, Epochs, FilterOptions, Run
 from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import (
@@ -18,13 +18,14 @@ from netpos.estimation.measurement import (
 )
 from netpos.estimation.mixture.epoch import run_epochs
 from netpos.estimation.motion import NO_BIAS, SPEED_OF_LIGHT_MPS, Parameter, noise
-from netpos.estimation.predicted import predicted_rows
 from netpos.estimation.rows import rsu_axes, rsu_rows
 from netpos.estimation.state import POSITION, X
+from netpos.estimation.update import conditioning
+from netpos.estimation.update.predicted import predicted_rows
 from netpos.messages.values import Array, Field, InitialPose, RsuInfo, RsuMeasurement
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking import Tracker, TrackerConfig
-from netpos.tracking.models import dynamics_of, motions_of, options_of, pose_state
+from netpos.tracking.estimators.models import dynamics_of, motions_of, options_of, pose_state
 
 STATIONS = [
     RsuInfo(rsu_id=f"{i}", position=np.array([*xy, 4.0]))

@@ -12,15 +12,15 @@ from netpos.estimation import engine
 from netpos.estimation.engine import EpochInput
 from netpos.estimation.factor import factor
 from netpos.estimation.forms import ekf
-from netpos.estimation.fusion import predicted_in
-from netpos.estimation.manoeuvre import add_manoeuvre
+from netpos.estimation.level.manoeuvre import add_manoeuvre
 from netpos.estimation.measurement import GATE_VARIANCE, VARIANCE
 from netpos.estimation.motion import NO_BIAS, noise
-from netpos.estimation.predicted import predict_rows, predicted_rows
 from netpos.estimation.rows import linear_rows
 from netpos.estimation.state import POSITION
+from netpos.estimation.update.fusion import predicted_in
+from netpos.estimation.update.predicted import predict_rows, predicted_rows
 from netpos.tracking import TrackerConfig
-from netpos.tracking.models import motions_of, options_of
+from netpos.tracking.estimators.models import motions_of, options_of
 from scipy.stats import chi2
 
 H = np.eye(2, 6)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from error_states import LEVER_ARM, NOISE, OPEN, driven, linearised, moving
 from filter_rows import row
-from netpos.estimation.error_state import (
+from netpos.estimation.measurement import VARIANCE, Kind
+from netpos.estimation.spatial.error_state import (
     MEMORY,
     UNCONSTRAINED,
     Constraints,
@@ -17,8 +18,7 @@ from netpos.estimation.error_state import (
     correct,
     doubt_standstill,
 )
-from netpos.estimation.measurement import VARIANCE, Kind
-from netpos.estimation.space import bend_variance, direction_rows, place_rows
+from netpos.estimation.spatial.space import bend_variance, direction_rows, place_rows
 from netpos.estimation.state import (
     ERR_POSITION,
     NAV_POSITION,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from error_states import NOISE, driven, moving
-from netpos.estimation.error_state import (
+from netpos.estimation.spatial.error_state import (
     BLIND,
     LAST,
     MEMORY,

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from error_states import LEVER_ARM, NOISE, OPEN, linearised, vehicle
 from filter_rows import row
-from netpos.estimation.error_state import (
+from netpos.estimation.measurement import GATE_VARIANCE, GROUP, VALUE, VARIANCE, Kind
+from netpos.estimation.spatial.error_state import (
     MEMORY,
     QUIET,
     REST_FORCE,
@@ -16,8 +17,7 @@ from netpos.estimation.error_state import (
     correct,
     doubt_standstill,
 )
-from netpos.estimation.measurement import GATE_VARIANCE, GROUP, VALUE, VARIANCE, Kind
-from netpos.estimation.space import bend_mean, bend_variance, direction_rows, place_rows
+from netpos.estimation.spatial.space import bend_mean, bend_variance, direction_rows, place_rows
 from netpos.estimation.state import NAV_POSITION, NAV_VELOCITY
 from netpos.inertial.strapdown import ERR, GYRO_BIAS, NAV, inject, still_earth
 from netpos.messages.values import Array

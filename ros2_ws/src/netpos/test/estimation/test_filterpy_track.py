@@ -8,8 +8,7 @@ from collections.abc import Callable
 import filterpy_reference as reference
 import numpy as np
 import pytest
-from netpos.estimation import sigma
-from netpos.estimation.forms import ekf, ukf
+from netpos.estimation.forms import ekf, sigma, ukf
 from netpos.estimation.measurement import Kind
 from netpos.estimation.motion import Model, motion_parameters
 from netpos.estimation.state import X

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from curved_rows import bends, log_posterior_cost, range_problem
 from filter_rows import random_spd
-from netpos.estimation import fit
 from netpos.estimation.measurement import (
     AXES,
     BIAS,
@@ -25,8 +24,9 @@ from netpos.estimation.measurement import (
     linearise,
     second_order_variance,
 )
-from netpos.estimation.predicted import predicted_rows
 from netpos.estimation.state import POSITION
+from netpos.estimation.update import fit
+from netpos.estimation.update.predicted import predicted_rows
 from netpos.messages.values import Array
 
 

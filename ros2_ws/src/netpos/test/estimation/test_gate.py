@@ -8,10 +8,10 @@ from collections.abc import Callable
 import filterpy_reference
 import numpy as np
 import pytest
-from netpos.estimation import gate
 from netpos.estimation.forms import ekf, kf, srukf, ukf
 from netpos.estimation.measurement import GROUP, Kind
 from netpos.estimation.state import X
+from netpos.estimation.update import gate
 from netpos.messages.values import Array
 from scipy.stats import chi2
 

@@ -7,7 +7,7 @@ import math
 import filter_rows
 import numpy as np
 import pytest
-from netpos.estimation.manoeuvre import (
+from netpos.estimation.level.manoeuvre import (
     add_manoeuvre,
     detection_delay_s,
     measures_velocity,
@@ -15,8 +15,8 @@ from netpos.estimation.manoeuvre import (
     turn_to_side,
 )
 from netpos.estimation.measurement import GATE_VARIANCE, Kind, curvature_variance, linearise
-from netpos.estimation.predicted import predicted_rows
 from netpos.estimation.rows import linear_rows
+from netpos.estimation.update.predicted import predicted_rows
 from netpos.messages.values import Array
 
 MEAN = np.array([30.0, 20.0, 5.0, -1.0, 0.0, 0.0])

@@ -25,7 +25,8 @@ from netpos.estimation.measurement import (
     linearise,
 )
 from netpos.estimation.rows import (
-    Coupling,
+    WHITE,
+    RowErrors,
     linear_rows,
     put_measurement,
     rsu_axes,
@@ -185,11 +186,11 @@ def test_only_named_fields_become_rows(flag: Field, kind: Kind) -> None:
     assert len(rows) == (2 if kind is Kind.LINEAR else 1)
 
 
-def test_coupling_enters_the_rows_of_its_kind_only() -> None:
+def test_errors_enter_their_rows_only() -> None:
     info = random_info(np.random.default_rng(1), AngleConvention.SPHERICAL)
     m = full_measurement(info, np.array([30.0, 20.0, 1.0]), 7.0)
-    coupling = Coupling({Kind.AZIMUTH: 6}, {Kind.RANGE: 7}, {Kind.RANGE: 5.0, Kind.AZIMUTH: 3.0})
-    rows = rsu_rows(m, info, rsu_axes(info), 0, coupling)
+    azimuth, distance = RowErrors(bias=6, inflation=3.0), RowErrors(common=7, inflation=5.0)
+    rows = rsu_rows(m, info, rsu_axes(info), 0, [azimuth, WHITE, WHITE, distance])
     np.testing.assert_array_equal(rows[:, BIAS], [6, -1, -1, -1, -1, -1])
     np.testing.assert_array_equal(rows[:, COMMON], [-1, -1, -1, 7, -1, -1])
     np.testing.assert_allclose(

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from filterpy.kalman import IMMEstimator, KalmanFilter
 from netpos.estimation.engine import EpochInput, FilterOptions
-from netpos.estimation.fit import neg2_log_likelihood
 from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import ROW_WIDTH, Kind
 from netpos.estimation.mixture import epoch as epochs
@@ -26,11 +25,12 @@ from netpos.estimation.motion import (
     noise,
     transition,
 )
-from netpos.estimation.predicted import predicted_rows
 from netpos.estimation.state import POSITION, X
+from netpos.estimation.update.fit import neg2_log_likelihood
+from netpos.estimation.update.predicted import predicted_rows
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.models import options_of
+from netpos.tracking.estimators.models import options_of
 from scipy.linalg import expm
 from scipy.stats import multivariate_normal
 

@@ -6,6 +6,14 @@ import math
 
 import numpy as np
 import pytest
+from netpos.estimation.fixes.phase_fix import (
+    admissible,
+    init_hypothesis,
+    nearest_turns,
+    phase_scale,
+    place,
+    to_fix,
+)
 from netpos.estimation.measurement import (
     BIAS,
     COMMON,
@@ -19,14 +27,6 @@ from netpos.estimation.measurement import (
     predict_row,
 )
 from netpos.estimation.measurement import HEIGHT as ROW_HEIGHT
-from netpos.estimation.phase_fix import (
-    admissible,
-    init_hypothesis,
-    nearest_turns,
-    phase_scale,
-    place,
-    to_fix,
-)
 from netpos.estimation.rows import rsu_axes, rsu_rows
 from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement

@@ -20,17 +20,18 @@ from anchor_walk import (
     wrap,
 )
 from netpos.estimation.engine import EpochInput, FilterOptions
+from netpos.estimation.fixes.phase_fix import init_hypothesis, place
 from netpos.estimation.measurement import GROUP, KIND, VALUE, VARIANCE, Kind, predict_row
 from netpos.estimation.mixture.candidates import Update
 from netpos.estimation.mixture.epoch import apply_epoch
 from netpos.estimation.mixture.gaussians import Mixture, one_component
 from netpos.estimation.mixture.sectors import most_turns, phase_place, sectors_of_fix, turns_of
 from netpos.estimation.motion import NO_BIAS
-from netpos.estimation.phase_fix import init_hypothesis, place
 from netpos.messages.values import Array
-from netpos.tracking import TrackerConfig, estimates
-from netpos.tracking.models import options_of, pose_state
-from netpos.tracking.phase_start import PhaseStart
+from netpos.tracking import TrackerConfig
+from netpos.tracking.estimators import estimates
+from netpos.tracking.estimators.models import options_of, pose_state
+from netpos.tracking.first_fix.phase_start import PhaseStart
 from scipy import stats
 from scipy.special import logsumexp
 

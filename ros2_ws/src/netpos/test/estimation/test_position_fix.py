@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 import pytest
+from netpos.estimation.fixes.position_fix import FixStatus, _invert, fix_position, start_of
 from netpos.estimation.measurement import GROUP, KIND, ROW_WIDTH, VALUE, VARIANCE, Kind
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
-from netpos.estimation.position_fix import FixStatus, _invert, fix_position, start_of
 from netpos.estimation.rows import rsu_axes, rsu_rows
-from netpos.estimation.space import place_rows, value_at
+from netpos.estimation.spatial.space import place_rows, value_at
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation

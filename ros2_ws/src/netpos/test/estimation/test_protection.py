@@ -12,20 +12,8 @@ from engine_cases import opened
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from netpos.estimation.engine import FilterOptions
-from netpos.estimation.fit import innovations_with_sd
-from netpos.estimation.manoeuvre import detection_delay_s
-from netpos.estimation.measurement import (
-    GROUP,
-    VALUE,
-    VARIANCE,
-    Kind,
-    curvature_variance,
-    linearise,
-)
-from netpos.estimation.mixture.gaussians import Mixture
-from netpos.estimation.motion import NO_BIAS
-from netpos.estimation.predicted import predicted_rows
-from netpos.estimation.protection import (
+from netpos.estimation.level.manoeuvre import detection_delay_s
+from netpos.estimation.level.protection import (
     RISK_MIN,
     FusedEpoch,
     gaussian_radius,
@@ -36,11 +24,24 @@ from netpos.estimation.protection import (
     protection_level,
     radius_limit,
 )
+from netpos.estimation.measurement import (
+    GROUP,
+    VALUE,
+    VARIANCE,
+    Kind,
+    curvature_variance,
+    linearise,
+)
+from netpos.estimation.mixture.gaussians import Mixture
+from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.rows import linear_rows, rsu_axes, rsu_rows
 from netpos.estimation.state import POSITION, X
+from netpos.estimation.update.fit import innovations_with_sd
+from netpos.estimation.update.predicted import predicted_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
-from netpos.tracking import TrackerConfig, estimates
-from netpos.tracking.models import options_of
+from netpos.tracking import TrackerConfig
+from netpos.tracking.estimators import estimates
+from netpos.tracking.estimators.models import options_of
 from scipy import integrate, optimize, stats
 
 RISKS = [0.5, 0.1, 1e-2, 1e-4, 1e-7, 1e-12]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from netpos.estimation.report import LEVEL_MAX_M, level_of
+from netpos.estimation.level.report import LEVEL_MAX_M, level_of
 from netpos.estimation.state import POSITION
 from netpos.reproduction.experiment import Experiment, Setup
 from setup_tracker import tracker_outputs

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from netpos.estimation import robust
+from netpos.estimation.update import robust
 from netpos.messages.values import Array
 from scipy import integrate, optimize, special, stats
 

@@ -18,7 +18,7 @@ from netpos.estimation.measurement import (
     linearise,
     wrap,
 )
-from netpos.estimation.slow_errors import LASTS_S, with_linearisation
+from netpos.estimation.update.slow_errors import LASTS_S, with_linearisation
 from netpos.messages.values import Array
 
 PLACES = np.array([[0.0, 0.0, 3.0], [12.0, -2.0, 2.5], [9.0, 11.0, 3.0], [-1.0, 9.0, 2.0]])

@@ -20,7 +20,7 @@ from netpos.estimation.measurement import (
     Kind,
 )
 from netpos.estimation.rows import rsu_axes, rsu_place, rsu_rows
-from netpos.estimation.space import (
+from netpos.estimation.spatial.space import (
     bend_mean,
     bend_variance,
     direction_rows,

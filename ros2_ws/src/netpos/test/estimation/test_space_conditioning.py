@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from netpos.estimation.conditioning import Robust, RobustOptions, reweight
 from netpos.estimation.measurement import (
     AXES,
     BLOCKED,
@@ -15,9 +14,10 @@ from netpos.estimation.measurement import (
     VALUE,
     Kind,
 )
-from netpos.estimation.predicted import predicted_rows
-from netpos.estimation.space import reweight_3d
+from netpos.estimation.spatial.space import reweight_3d
 from netpos.estimation.state import ERR_BIASES, Err, Nav, X
+from netpos.estimation.update.conditioning import Robust, RobustOptions, reweight
+from netpos.estimation.update.predicted import predicted_rows
 from netpos.inertial.strapdown import NAV
 from netpos.messages.values import Array
 

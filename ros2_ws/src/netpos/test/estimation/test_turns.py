@@ -13,7 +13,7 @@ from netpos.estimation.mixture.turns import leaves_turns_open, may_have_turned
 from netpos.estimation.rows import linear_rows
 from netpos.messages.values import Array
 from netpos.tracking import TrackerConfig
-from netpos.tracking.estimates import Estimate
+from netpos.tracking.estimators.estimates import Estimate
 
 MEAN = np.array([3.0, -2.0, 1.0, 0.5, 0.0, 0.0])
 NO_BIAS = np.zeros((2, 0))

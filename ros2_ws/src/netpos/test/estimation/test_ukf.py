@@ -9,8 +9,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from netpos.estimation import sigma
-from netpos.estimation.forms import srukf, ukf
+from netpos.estimation.forms import sigma, srukf, ukf
 from netpos.estimation.measurement import BIAS, KIND, ORIGIN, VALUE, Kind
 from netpos.estimation.motion import (
     NO_BIAS,

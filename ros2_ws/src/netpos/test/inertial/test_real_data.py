@@ -27,7 +27,7 @@ from netpos.inertial.pdr import PedestrianDeadReckoning
 from netpos.inertial.pdr_config import PdrConfig, Placement
 from netpos.inertial.pdr_output import StepEvent
 from netpos.messages.values import Velocity
-from netpos.tracking.repeats import Repeats
+from netpos.tracking.door.repeats import Repeats
 from vqf import VQF
 
 Array = np.ndarray

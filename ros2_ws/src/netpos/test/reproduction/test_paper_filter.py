@@ -15,7 +15,7 @@ from netpos.reproduction.experiment import VUE, Experiment, Setup
 from netpos.reproduction.paper_filter import LOST_M, PaperNoise, run_paper_filter
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking import TrackerConfig
-from netpos.tracking.models import pose_state
+from netpos.tracking.estimators.models import pose_state
 
 C = 299_792_458.0
 CHANGES = {"max_duration_s": 60.0}

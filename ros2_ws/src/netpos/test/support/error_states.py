@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from netpos.estimation.error_state import MEMORY, UNCONSTRAINED, Constraints, Imu, Sensors, advance
-from netpos.estimation.space import innovation_at
+from netpos.estimation.spatial.error_state import (
+    MEMORY,
+    UNCONSTRAINED,
+    Constraints,
+    Imu,
+    Sensors,
+    advance,
+)
+from netpos.estimation.spatial.space import innovation_at
 from netpos.estimation.state import NAV_POSITION, NAV_QUATERNION, NAV_VELOCITY, Nav
 from netpos.inertial.strapdown import ERR, NAV, InertialNoise, rotation_of, still_earth
 from netpos.messages.values import Array

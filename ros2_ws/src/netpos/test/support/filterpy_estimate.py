@@ -8,14 +8,14 @@ import copy
 import filterpy_reference as reference
 import numpy as np
 from netpos.estimation import engine
-from netpos.estimation.fit import innovations_with_sd
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.motion import Parameter, add_velocity_step
-from netpos.estimation.slow_errors import with_linearisation
+from netpos.estimation.update.fit import innovations_with_sd
+from netpos.estimation.update.slow_errors import with_linearisation
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.estimates import UpdateResult
-from netpos.tracking.models import augmented, initial_extra_sd, motions_of, options_of
+from netpos.tracking.estimators.estimates import UpdateResult
+from netpos.tracking.estimators.models import augmented, initial_extra_sd, motions_of, options_of
 
 
 class FilterpyEstimate:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from filterpy import kalman
+from netpos.estimation.forms.sigma import ALPHA, BETA, kappa
 from netpos.estimation.measurement import (
     AXES,
     BIAS,
@@ -27,7 +28,6 @@ from netpos.estimation.measurement import (
     wrap,
 )
 from netpos.estimation.motion import noise, propagate, transition
-from netpos.estimation.sigma import ALPHA, BETA, kappa
 from netpos.messages.values import Array
 
 # A FilterPy filter holding mean, cov after fusing rows with given variances.

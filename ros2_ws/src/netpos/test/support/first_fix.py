@@ -8,8 +8,8 @@ import numpy as np
 from netpos.estimation.rows import rsu_rows
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.initialise import Initialiser
-from netpos.tracking.rsus import Rsu, SlowErrors
+from netpos.tracking.first_fix.initialise import Initialiser
+from netpos.tracking.rsus.rsu import Rsu, SlowErrors
 from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 from track_cases import T0

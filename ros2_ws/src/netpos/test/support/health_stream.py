@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from netpos.estimation.measurement import KIND, ROW_WIDTH, Kind
 from netpos.messages.values import RsuMeasurement
-from netpos.tracking.health import HealthConfig, RsuHealth
-from netpos.tracking.observations import FittedEpoch
+from netpos.tracking.health.health import HealthConfig, RsuHealth
+from netpos.tracking.health.observations import FittedEpoch
 
 GATE = 18.42  # chi2.ppf(0.9999, 2)
 SD = {"azimuth": math.radians(1.5), "toa": 0.6, "range": 0.5}

@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from netpos.estimation.level.protection import protection_level
 from netpos.estimation.mixture.gaussians import Mixture
-from netpos.estimation.protection import protection_level
 from netpos.evaluation.consistency import MeanTest, nees_over_runs
 from netpos.messages.values import Array
 from netpos.tracking import Tracker, TrackerConfig

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from netpos.messages.values import Velocity
-from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
 from netpos.tracking.config import TrackerConfig
+from netpos.tracking.estimators.adaptive_process_noise import AdaptiveProcessNoise
 
 NS = 1_000_000_000
 FREE, STEADY = 1.0, 0.1

@@ -10,8 +10,8 @@ import pytest
 from health_stream import observe
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement, TrackState
 from netpos.tracking import Tracker, TrackerConfig
-from netpos.tracking.health import RsuHealth, RsuReport, RsuState
-from netpos.tracking.rsus import Rsu
+from netpos.tracking.health.health import RsuHealth, RsuReport, RsuState
+from netpos.tracking.rsus.rsu import Rsu
 
 S = 1_000_000_000
 T0 = S

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pytest
 from netpos.messages.values import RsuErrors, StepCalibration, TrackMode, TrackState, TrackStatus
-from netpos.tracking.clocks import Stranger
-from netpos.tracking.diagnosis import Level, errors_in_words, of_device, of_network, of_rsus
-from netpos.tracking.health import RsuReport, RsuState
-from netpos.tracking.refusals import Refused
+from netpos.tracking.door.refusals import Refused
+from netpos.tracking.health.diagnosis import Level, errors_in_words, of_device, of_network, of_rsus
+from netpos.tracking.health.health import RsuReport, RsuState
+from netpos.tracking.ordering.clocks import Stranger
 
 STATUS = TrackStatus(
     stamp_ns=1_000_000_000,

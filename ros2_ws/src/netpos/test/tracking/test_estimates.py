@@ -15,8 +15,9 @@ from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.rows import linear_rows
 from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array, Field, GroundSpeed, ImuSample
-from netpos.tracking import TrackerConfig, TrackOutput, estimates
-from netpos.tracking.models import augmented, dynamics_of, initial_extra_sd, options_of
+from netpos.tracking import TrackerConfig, TrackOutput
+from netpos.tracking.estimators import estimates
+from netpos.tracking.estimators.models import augmented, dynamics_of, initial_extra_sd, options_of
 from scipy import stats
 
 T0 = 1_000_000_000

@@ -9,8 +9,8 @@ import pytest
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.estimates import cut_off_behind, start_from
-from netpos.tracking.rsus import Rsu
+from netpos.tracking.estimators.estimates import cut_off_behind, start_from
+from netpos.tracking.rsus.rsu import Rsu
 from netpos.tracking.tracker import Tracker
 from scipy.special import log_ndtr
 from scipy.stats import norm, truncnorm

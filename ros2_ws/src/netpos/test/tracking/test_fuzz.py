@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.estimation import conditioning
-from netpos.estimation.measurement import GATE_VARIANCE, VARIANCE, Kind
+from netpos.estimation.measurement import GATE_VARIANCE, VARIANCE
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
-from netpos.estimation.predicted import predicted_rows
-from netpos.estimation.rows import Coupling, rsu_axes, rsu_rows
+from netpos.estimation.rows import RowErrors, rsu_axes, rsu_rows
+from netpos.estimation.update import conditioning
+from netpos.estimation.update.predicted import predicted_rows
 from netpos.messages.values import (
     AngleConvention,
     Array,
@@ -393,8 +393,7 @@ def test_a_capped_variance_leaves_the_gate_variance_positive() -> None:
     info = RsuInfo(rsu_id="a", position=np.array([60.0, -5.0, 0.0]), noise_correlation_time_s=0.3)
     values = {"fields": Field.RANGE, "range_m": 40.0, "range_var": 1e6}
     m = RsuMeasurement(stamp_ns=T0, rsu_id="a", vue_id=VUE, **values)
-    coupling = Coupling({}, {}, {Kind.RANGE: 3e8})
-    rows = rsu_rows(m, info, rsu_axes(info), 0, coupling)
+    rows = rsu_rows(m, info, rsu_axes(info), 0, [RowErrors(inflation=3e8)])
     mean, cov = np.array([30.0, 0.0, 1.0, 1.0, 0.0, 0.0]), np.eye(6)
     options = conditioning.RobustOptions(0, 4.0, 0.2, 20.0)
     conditioning.reweight(cov, rows, predicted_rows(mean, cov, rows, 0.0), options)

@@ -21,7 +21,7 @@ from health_stream import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from netpos.tracking.health import HealthConfig, RsuHealth, RsuState
+from netpos.tracking.health.health import HealthConfig, RsuHealth, RsuState
 
 # honest RSUs
 

@@ -15,7 +15,7 @@ from health_stream import (
     ns,
     observe,
 )
-from netpos.tracking.health import RsuHealth
+from netpos.tracking.health.health import RsuHealth
 
 
 def test_an_rsu_that_is_consistent_again_is_readmitted() -> None:

@@ -12,7 +12,7 @@ import pytest
 from netpos.bags.recording import number_beacons
 from netpos.messages.values import Array, Field, InitialPose, Odometry, RsuInfo, RsuMeasurement
 from netpos.tracking import Tracker, TrackerConfig, TrackOutput
-from netpos.tracking.models import slow_states, start_state, state_of_fit
+from netpos.tracking.estimators.models import slow_states, start_state, state_of_fit
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 

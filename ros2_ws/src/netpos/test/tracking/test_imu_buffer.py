@@ -11,7 +11,7 @@ import pytest
 from netpos.messages.values import Array, ImuSample, InitialPose, Odometry
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking import Tracker, TrackerConfig
-from netpos.tracking.imu_buffer import ImuBuffer
+from netpos.tracking.estimators.imu_buffer import ImuBuffer
 
 MS = 1_000_000
 T0 = 1_000_000_000

@@ -12,7 +12,7 @@ from netpos.estimation.measurement import KIND, VALUE, Kind
 from netpos.estimation.rows import linear_rows, speed_row
 from netpos.messages.values import AngleConvention, Array, Field
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.initialise import (
+from netpos.tracking.first_fix.initialise import (
     Initialiser,
 )
 from scipy.constants import speed_of_light

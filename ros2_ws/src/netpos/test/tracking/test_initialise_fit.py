@@ -15,7 +15,7 @@ from netpos.estimation.rows import speed_row
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking import Tracker
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.initialise import (
+from netpos.tracking.first_fix.initialise import (
     Initialiser,
     Problem,
     _clock_at,
@@ -24,7 +24,7 @@ from netpos.tracking.initialise import (
     _starts,
     has_modes,
 )
-from netpos.tracking.rsus import Rsu, SlowErrors
+from netpos.tracking.rsus.rsu import Rsu, SlowErrors
 from scipy.stats import chi2
 from track_cases import KNOWN_CLOCK, T0
 

@@ -13,9 +13,9 @@ from netpos.estimation.mixture.epoch import run_epochs
 from netpos.estimation.motion import NO_BIAS, Parameter
 from netpos.estimation.rows import linear_rows
 from netpos.messages.values import Array
-from netpos.tracking import estimates
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.models import dynamics_of, options_of, pose_state
+from netpos.tracking.estimators import estimates
+from netpos.tracking.estimators.models import dynamics_of, options_of, pose_state
 
 T0, DT, SD = 1_000_000_000, 0.1, 0.3
 

@@ -10,8 +10,8 @@ import pytest
 from netpos.estimation.rows import linear_rows
 from netpos.messages.values import Array, Field, Odometry, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.learning import ErrorModel, LearnedErrors
 from netpos.tracking.report import TrackOutput
+from netpos.tracking.rsus.learning import ErrorModel, LearnedErrors
 from netpos.tracking.tracker import Tracker
 
 RSUS = np.array(

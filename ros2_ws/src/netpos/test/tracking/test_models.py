@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.estimation.conditioning import RobustOptions
 from netpos.estimation.engine import GATE_SIZE, FilterOptions
 from netpos.estimation.forms.table import FORMS
 from netpos.estimation.motion import Model, Parameter, ProcessNoise, own_index
 from netpos.estimation.state import POSITION
+from netpos.estimation.update.conditioning import RobustOptions
 from netpos.tracking.config import ROBUST, TrackerConfig
-from netpos.tracking.models import (
+from netpos.tracking.estimators.models import (
     augmented,
     gate_thresholds,
     initial_extra_sd,

@@ -11,8 +11,8 @@ from netpos.estimation.measurement import BLOCKED, KIND, Kind
 from netpos.estimation.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Field, RsuInfo, RsuMeasurement
 from netpos.tracking import TrackerConfig
-from netpos.tracking.epoch_rows import EpochRows
-from netpos.tracking.nlos_rate import NlosRate
+from netpos.tracking.estimators.epoch_rows import EpochRows
+from netpos.tracking.rsus.nlos_rate import NlosRate
 from scipy.constants import speed_of_light
 
 STANDING = np.array([40.0, 2.0, 0.0, 0.0, 0.0, 0.0])

@@ -10,8 +10,8 @@ import pytest
 from health_stream import observe
 from netpos.estimation.measurement import GROUP, KIND, ROW_WIDTH, Kind
 from netpos.messages.values import GroundSpeed, RsuMeasurement
-from netpos.tracking.health import HealthConfig, RsuHealth
-from netpos.tracking.observations import (
+from netpos.tracking.health.health import HealthConfig, RsuHealth
+from netpos.tracking.health.observations import (
     FittedEpoch,
     Observation,
     mean_nis,

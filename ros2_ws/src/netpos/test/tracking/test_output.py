@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from netpos.estimation.protection import protection_level
+from netpos.estimation.level.protection import protection_level
 from netpos.estimation.state import CLOCK_DRIFT, POSITION, VELOCITY, X
 from netpos.messages.values import Array, TrackState
 from netpos.tracking import TrackerConfig, output

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from netpos.messages.values import Field, RsuInfo, RsuMeasurement
 from netpos.tracking import Tracker, TrackerConfig
-from netpos.tracking.rate_limit import RateLimit
+from netpos.tracking.door.rate_limit import RateLimit
 
 NS = 1_000_000_000
 PLACES = {"a": (0.0, 0.0), "b": (60.0, 0.0), "c": (30.0, 50.0)}

@@ -19,7 +19,7 @@ from netpos.messages.values import (
     Velocity,
 )
 from netpos.tracking import Tracker, TrackerConfig
-from netpos.tracking.refusals import OTHERS, SOURCES_MAX, WINDOW, Refusals
+from netpos.tracking.door.refusals import OTHERS, SOURCES_MAX, WINDOW, Refusals
 
 S = 1_000_000_000
 T0 = 100 * S

@@ -15,8 +15,8 @@ from netpos.messages.values import (
     Velocity,
 )
 from netpos.tracking import Tracker, TrackerConfig
-from netpos.tracking.diagnosis import Level
-from netpos.tracking.repeats import Repeats
+from netpos.tracking.door.repeats import Repeats
+from netpos.tracking.health.diagnosis import Level
 from scipy.stats import norm
 
 NS = 1_000_000_000

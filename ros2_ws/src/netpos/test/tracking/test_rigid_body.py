@@ -21,7 +21,7 @@ from antenna_square import (
     yaw_of,
 )
 from netpos.estimation.measurement import HEADING, LEVER, linearise
-from netpos.estimation.rows import Coupling, rsu_axes, rsu_rows
+from netpos.estimation.rows import rsu_axes, rsu_rows
 from netpos.estimation.state import POSITION
 from netpos.messages.values import (
     AngleConvention,
@@ -77,7 +77,7 @@ def test_jacobian_in_the_heading_is_the_difference(
         range_var=0.01,
         lever_arm=(1.5, -0.7, 0.0),
     )
-    rows = rsu_rows(m, info, rsu_axes(info), 0, Coupling({}, {}, {}), heading=6)
+    rows = rsu_rows(m, info, rsu_axes(info), 0, heading=6)
     mean = np.array([6.0, 5.0, 0.0, 0.0, 3.0, 0.0, yaw, 0.0])
     _, H = linearise(rows, mean, 1.2)
     step = 1e-6 * np.eye(8)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from netpos.messages.values import Array, Field, RsuMeasurement, TrackState
 from netpos.tracking import Tracker, TrackOutput
-from netpos.tracking.health import RsuReport, RsuState
+from netpos.tracking.health.health import RsuReport, RsuState
 
 T0 = 1_000_000_000
 FIELDS = Field.AZIMUTH | Field.TOA | Field.RANGE

@@ -7,10 +7,11 @@ import math
 import numpy as np
 import pytest
 from netpos.estimation.measurement import ROW_WIDTH, Kind
+from netpos.estimation.rows import RowErrors
 from netpos.estimation.state import VELOCITY
 from netpos.messages.values import AngleConvention, Field, RsuInfo, RsuMeasurement
-from netpos.tracking.learning import LearnedErrors
-from netpos.tracking.rsus import BiasStates, Rsu
+from netpos.tracking.rsus.learning import LearnedErrors
+from netpos.tracking.rsus.rsu import BiasStates, Rsu
 from scipy.spatial.transform import Rotation
 
 ALL = Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE
@@ -91,65 +92,85 @@ def test_a_cone_array_sees_the_half_plane_before_it(yaw_deg: float) -> None:
     assert rsu.in_front(0.0, 0.0) is True
 
 
+def errors_of(states: BiasStates, rsu: Rsu, m: RsuMeasurement) -> dict[Kind, RowErrors]:
+    """Errors of the rows of a measurement, by kind."""
+    kinds = rsu.kinds(m)
+    return dict(zip(kinds, states.row_errors(rsu, m, np.ones(len(kinds))), strict=True))
+
+
 def test_unbiased_white_rsu_has_no_states() -> None:
     states = BiasStates()
-    coupling = states.coupling(Rsu.of(info()), measured())
-    assert (coupling.bias, coupling.common, coupling.inflation) == ({}, {}, {})
+    assert states.row_errors(Rsu.of(info()), measured(), np.ones(4)) == ()
     assert (states.sd, states.tau_s) == ([], [])
 
 
 def test_every_biased_quantity_has_its_own_state_once() -> None:
     states = BiasStates()
-    first = states.coupling(biased(), measured())
-    assert first.bias == {Kind.AZIMUTH: 6, Kind.ELEVATION: 7, Kind.TOA: 8, Kind.RANGE: 9}
+    first = errors_of(states, biased(), measured())
+    assert {kind: errors.bias for kind, errors in first.items()} == {
+        Kind.AZIMUTH: 6,
+        Kind.ELEVATION: 7,
+        Kind.TOA: 8,
+        Kind.RANGE: 9,
+    }
+    assert {errors.common for errors in first.values()} == {-1}
     assert states.sd == [0.01, 0.02, 0.3, 0.3]
     assert states.tau_s == [50.0] * 4
-    assert states.coupling(biased(), measured()).bias == first.bias
+    assert errors_of(states, biased(), measured()) == first
     b = biased("b", bias_correlation_time_s=9.0)
-    other = states.coupling(b, measured(Field.RANGE, rsu_id="b"))
-    assert other.bias == {Kind.RANGE: 10}
+    other = errors_of(states, b, measured(Field.RANGE, rsu_id="b"))
+    assert other[Kind.RANGE].bias == 10
     assert states.tau_s[4] == 9.0
-    assert first.common == {}
 
 
 def test_only_measured_quantities_get_states() -> None:
     states = BiasStates()
-    assert states.coupling(biased(azimuth_bias_sd_rad=0.0), measured(Field.AZIMUTH)).bias == {}
-    assert states.coupling(biased(), measured(Field.ELEVATION)).bias == {Kind.ELEVATION: 6}
+    unbiased = errors_of(states, biased(azimuth_bias_sd_rad=0.0), measured(Field.AZIMUTH))
+    assert unbiased[Kind.AZIMUTH].bias == -1
+    assert errors_of(states, biased(), measured(Field.ELEVATION))[Kind.ELEVATION].bias == 6
+    assert states.sd == [0.02]
 
 
 def test_common_bias_is_shared_by_the_ranges_of_a_network() -> None:
     states = BiasStates()
     common = {"common_range_bias_sd_m": 0.5, "common_bias_correlation_time_s": 70.0}
-    a = states.coupling(Rsu.of(info("a", network="n", **common)), measured())
-    b = states.coupling(Rsu.of(info("b", network="n", **common)), measured())
-    other = states.coupling(Rsu.of(info("c", network="m", **common)), measured())
-    assert a.common == b.common == {Kind.TOA: 6, Kind.RANGE: 6}
-    assert other.common == {Kind.TOA: 7, Kind.RANGE: 7}
+    found = [
+        errors_of(states, Rsu.of(info(name, network=network, **common)), measured())
+        for name, network in (("a", "n"), ("b", "n"), ("c", "m"))
+    ]
+    assert [[e[kind].common for kind in (Kind.TOA, Kind.RANGE)] for e in found] == [
+        [6, 6],
+        [6, 6],
+        [7, 7],
+    ]
+    assert {errors[Kind.AZIMUTH].common for errors in found} == {-1}
     assert (states.sd, states.tau_s) == ([0.5, 0.5], [70.0, 70.0])
 
 
 def test_an_rsu_named_like_a_network_has_its_own_state() -> None:
     states = BiasStates()
     rsu = biased("n", network="n", common_range_bias_sd_m=0.5, common_bias_correlation_time_s=7.0)
-    coupling = states.coupling(rsu, measured(Field.RANGE))
-    assert coupling.bias != coupling.common
+    errors = errors_of(states, rsu, measured(Field.RANGE))[Kind.RANGE]
+    assert errors.bias != errors.common
     assert len(states.sd) == 2
 
 
 def test_inflation_is_correlation_time_over_interval_since_the_last_accepted() -> None:
     states, rsu = BiasStates(), Rsu.of(info(noise_correlation_time_s=0.4))
-    assert states.coupling(rsu, measured(stamp_ns=10**9)).inflation[Kind.RANGE] == 1.0
-    # not accepted: still the first
-    assert states.coupling(rsu, measured(stamp_ns=2 * 10**9)).inflation[Kind.RANGE] == 1.0
+
+    def inflation(stamp_ns: int) -> dict[Kind, float]:
+        found = errors_of(states, rsu, measured(stamp_ns=stamp_ns))
+        return {kind: errors.inflation for kind, errors in found.items()}
+
+    assert inflation(10**9)[Kind.RANGE] == 1.0
+    assert inflation(2 * 10**9)[Kind.RANGE] == 1.0  # not accepted: still the first
     states.accepted(rsu, measured(Field.RANGE, stamp_ns=2 * 10**9))
-    soon = states.coupling(rsu, measured(stamp_ns=2_100_000_000)).inflation
+    soon = inflation(2_100_000_000)
     assert soon[Kind.RANGE] == pytest.approx(4.0)
     assert soon[Kind.AZIMUTH] == 1.0  # was not measured then
-    later = states.coupling(rsu, measured(stamp_ns=2_500_000_000)).inflation
-    assert later[Kind.RANGE] == 1.0  # never below 1
+    assert inflation(2_500_000_000)[Kind.RANGE] == 1.0  # never below 1
     for stamp in (2 * 10**9, 10**9):
-        assert states.coupling(rsu, measured(stamp_ns=stamp)).inflation[Kind.RANGE] == 1.0
+        assert inflation(stamp)[Kind.RANGE] == 1.0
 
 
 def test_inflated_mean_has_the_variance_of_the_mean_of_coloured_noise() -> None:
@@ -161,7 +182,8 @@ def test_inflated_mean_has_the_variance_of_the_mean_of_coloured_noise() -> None:
     of_mean = (n + 2 * np.sum((n - lags[1:]) * correlation[1:])) / n**2
     states, rsu = BiasStates(), Rsu.of(info(noise_correlation_time_s=2 * tau))
     states.accepted(rsu, measured(stamp_ns=10**9))
-    factor = states.coupling(rsu, measured(stamp_ns=10**9 + int(dt * 1e9))).inflation[Kind.RANGE]
+    m = measured(stamp_ns=10**9 + int(dt * 1e9))
+    factor = errors_of(states, rsu, m)[Kind.RANGE].inflation
     assert factor / n == pytest.approx(of_mean, rel=2e-3)
 
 
@@ -169,24 +191,25 @@ def test_a_copy_goes_its_own_way() -> None:
     """A track goes back to it: what is heard afterwards must not be in it, nor the reverse."""
     first, second = biased("a"), biased("b")
     states = BiasStates()
-    states.coupling(first, measured())
+    errors_of(states, first, measured())
     states.accepted(first, measured())
     twin = states.copy()
     kept = twin.arrays()
-    states.coupling(second, measured())
+    errors_of(states, second, measured())
     states.accepted(first, measured(stamp_ns=5))
     np.testing.assert_array_equal(twin.arrays(), kept)
-    assert twin.coupling(first, measured()).bias == states.coupling(first, measured()).bias
+    assert [e.bias for e in errors_of(twin, first, measured()).values()] == [6, 7, 8, 9]
     assert set(twin._last_ns.values()) == {1}
-    one = twin.coupling(second, measured())
-    assert one.bias == states.coupling(second, measured()).bias
+    one = errors_of(twin, second, measured())
+    assert one == errors_of(states, second, measured())
     assert len(twin.sd) == len(states.sd)
 
 
 def test_errors_last_while_a_device_stands() -> None:
     """An estimated speed within its noise is no way on which errors could have changed."""
     states, rsu = BiasStates(learned=LearnedErrors()), Rsu.of(info())
-    states.learned_coupling(rsu, measured(Field.RANGE), np.ones(1), states.learned)
+    assert states.learned is not None
+    errors_of(states, rsu, measured(Field.RANGE))
     nothing = np.zeros((0, ROW_WIDTH)), np.ones(0)
     lasts = []
     for k, speed in enumerate([0.2, 0.2, 2.0]):

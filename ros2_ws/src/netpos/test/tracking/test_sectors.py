@@ -34,7 +34,7 @@ from netpos.messages.values import (
     TrackState,
 )
 from netpos.tracking import Tracker, TrackerConfig, TrackOutput
-from netpos.tracking.phase_start import PhaseStart
+from netpos.tracking.first_fix.phase_start import PhaseStart
 
 
 def test_ambiguous_until_the_evidence_decides() -> None:

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from netpos.messages.values import Field, GroundSpeed, InitialPose, RsuMeasurement, Velocity
-from netpos.tracking.history import merge
-from netpos.tracking.sequencer import IMU, Epoch, Item, Sequencer, channel_and_source
+from netpos.tracking.ordering.history import merge
+from netpos.tracking.ordering.sequencer import IMU, Epoch, Item, Sequencer, channel_and_source
 
 MS = 1_000_000
 HOLD = 250 * MS

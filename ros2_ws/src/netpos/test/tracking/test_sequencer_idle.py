@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from netpos.messages.values import InitialPose, RsuMeasurement, Velocity
-from netpos.tracking.sequencer import IMU, Sequencer
+from netpos.tracking.ordering.sequencer import IMU, Sequencer
 
 MS = 1_000_000
 

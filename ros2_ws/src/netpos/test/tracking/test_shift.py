@@ -7,8 +7,8 @@ import pytest
 from netpos.estimation.measurement import ROW_WIDTH, VALUE, linearise
 from netpos.estimation.rows import put_measurement
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
-from netpos.tracking.rsus import Rsu
-from netpos.tracking.shift import unshifted
+from netpos.tracking.rsus.rsu import Rsu
+from netpos.tracking.rsus.shift import unshifted
 
 PLACE = np.array([2.4, 3.6, 0.0, 0.0, 0.0, 0.0])
 WALLS = [(0.0, 3.0, 0.0), (6.0, 0.0, 90.0), (12.0, 3.0, 180.0), (6.0, 6.0, -90.0)]

@@ -10,7 +10,7 @@ import pytest
 from netpos.estimation.state import POSITION, X
 from netpos.messages.values import Array, Odometry, RsuMeasurement
 from netpos.tracking import Tracker, TrackerConfig
-from netpos.tracking.smoothing import Posterior, PosteriorRecorder, Smoother
+from netpos.tracking.smoothing.planar import Posterior, PosteriorRecorder, Smoother
 from scipy.stats import chi2
 
 STEP_S = 0.1

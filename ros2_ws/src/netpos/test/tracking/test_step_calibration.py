@@ -12,8 +12,8 @@ from netpos.estimation.measurement import BIAS, COMMON, KIND, Kind
 from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import Array, Field, StepCalibration, Velocity
 from netpos.tracking import TrackerConfig
-from netpos.tracking.epoch_rows import epoch_rows_of
-from netpos.tracking.rsus import BiasStates, StepErrors
+from netpos.tracking.estimators.epoch_rows import epoch_rows_of
+from netpos.tracking.rsus.rsu import BiasStates, StepErrors
 from scipy.stats import chi2
 
 T0 = 1_000_000_000

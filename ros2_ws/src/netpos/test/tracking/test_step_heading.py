@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement, TrackState, Velocity
 from netpos.tracking import Tracker, TrackerConfig, TrackOutput
-from netpos.tracking.step_heading import choose_sector, sector_numbers, sector_tracks
+from netpos.tracking.first_fix.step_heading import choose_sector, sector_numbers, sector_tracks
 from scipy.spatial.transform import Rotation
 
 LAMBDA = 0.0462

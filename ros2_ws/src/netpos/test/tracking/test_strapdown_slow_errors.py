@@ -14,11 +14,11 @@ from netpos.messages.values import Array, Beacon, ClockState, ImuSample, RsuMeas
 from netpos.radio.noise import generator
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking import Tracker, TrackerConfig, TrackOutput
-from netpos.tracking.epoch_rows import epoch_rows_of
-from netpos.tracking.health import RsuState
-from netpos.tracking.rsus import Rsu
-from netpos.tracking.spatial import ROWS_3D
-from netpos.tracking.strapdown_start import sound_fix
+from netpos.tracking.estimators.epoch_rows import epoch_rows_of
+from netpos.tracking.estimators.spatial import ROWS_3D
+from netpos.tracking.first_fix.strapdown_start import sound_fix
+from netpos.tracking.health.health import RsuState
+from netpos.tracking.rsus.rsu import Rsu
 
 NS = 1_000_000_000
 VUE = "vue_1"

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from netpos.estimation.error_state import MEMORY
+from netpos.estimation.spatial.error_state import MEMORY
 from netpos.inertial.strapdown import ERR, NAV
 from netpos.messages.values import (
     Array,
@@ -27,7 +27,7 @@ from netpos.messages.values import (
 )
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking import Tracker, TrackerConfig, TrackOutput
-from netpos.tracking.spatial import odometry_of
+from netpos.tracking.estimators.spatial import odometry_of
 from scipy.spatial.transform import Rotation
 
 NS = 1_000_000_000

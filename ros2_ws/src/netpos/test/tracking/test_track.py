@@ -15,7 +15,7 @@ from netpos.messages.values import (
     TrackState,
 )
 from netpos.tracking import TrackOutput
-from netpos.tracking.models import gate_thresholds
+from netpos.tracking.estimators.models import gate_thresholds
 from scipy.constants import speed_of_light
 from scipy.stats import chi2
 from track_cases import T0, error, pose, standing, straight

@@ -184,7 +184,8 @@ def test_a_bias_state_starts_at_its_stationary_variance_and_stays_there(
     feed(tracker, [pose(0.0, 40.0, 2.0, 0.01)])
     track = tracker._tracks["vue_1"]
     estimator = track._state.estimator
-    estimator.biases.coupling(track._rsus["a"], world.measure(0.0, standing(), Field.RANGE)[0])
+    heard = world.measure(0.0, standing(), Field.RANGE)[0]
+    estimator.biases.row_errors(track._rsus["a"], heard, np.ones(1))
     estimator.bias = estimator.biases.arrays()
     for t_ns in (T0, T0 + 10**9, T0 + 50 * 10**9):
         estimate = estimator._prepared(t_ns)

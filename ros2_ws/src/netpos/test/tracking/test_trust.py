@@ -16,7 +16,7 @@ from netpos.messages.values import Field, RsuInfo, RsuMeasurement
 from netpos.scenario.replay import replay_bag
 from netpos.scenario.settings import TrackerSettings, bag_settings
 from netpos.tracking import Tracker, TrackerConfig
-from netpos.tracking.diagnosis import Level
+from netpos.tracking.health.diagnosis import Level
 
 T0 = 1_000_000_000
 TRUE = np.array([12.0, 31.0])

@@ -20,8 +20,7 @@ from netpos.messages.values import (
     RsuMeasurement,
     Velocity,
 )
-from netpos.tracking.networks.validation import network_track_fault
-from netpos.tracking.validation import (
+from netpos.tracking.door.validation import (
     explanation,
     imu_fault,
     measurement_fault,
@@ -30,6 +29,7 @@ from netpos.tracking.validation import (
     speed_fault,
     velocity_fault,
 )
+from netpos.tracking.networks.validation import network_track_fault
 
 NAN, INF = math.nan, math.inf
 C = 299_792_458.0

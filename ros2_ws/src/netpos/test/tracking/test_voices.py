@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from netpos.messages.values import Array, Field, InitialPose, RsuInfo, RsuMeasurement, TrackState
 from netpos.tracking import Tracker, TrackerConfig, TrackOutput
-from netpos.tracking.voices import Voices, bends
+from netpos.tracking.door.voices import Voices, bends
 
 NS = 1_000_000_000
 C = 299_792_458.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.messages.values import Array
-from netpos.tracking.estimates import with_prior
+from netpos.tracking.estimators.estimates import with_prior
 from scipy.stats import multivariate_normal
 
 BEFORE = 0.4

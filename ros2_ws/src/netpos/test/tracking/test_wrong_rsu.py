@@ -12,7 +12,7 @@ from first_fix import at, fix_of, measure, rsu
 from netpos.estimation.measurement import VALUE
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.initialise import Initialiser
+from netpos.tracking.first_fix.initialise import Initialiser
 from netpos.tracking.report import TrackOutput
 from netpos.tracking.tracker import Tracker
 from scipy.constants import speed_of_light

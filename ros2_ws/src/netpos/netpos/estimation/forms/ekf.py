@@ -8,11 +8,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from netpos.estimation.bearing import fuse_around, on_top
 from netpos.estimation.compile import inlined, kernel, leaf, local_array, spliced
-from netpos.estimation.fit import map_cost
 from netpos.estimation.forms.form import FilterForm
-from netpos.estimation.fusion import (
+from netpos.estimation.measurement import GATE_VARIANCE, GROUP, VARIANCE
+from netpos.estimation.motion import add_noise, is_straight, propagate, transition
+from netpos.estimation.sensors.row import group_end
+from netpos.estimation.state import N_CORE, X
+from netpos.estimation.update.bearing import fuse_around, on_top
+from netpos.estimation.update.fit import map_cost
+from netpos.estimation.update.fusion import (
     W_COV,
     W_GATE_VARIANCE,
     W_INNOVATION,
@@ -29,8 +33,8 @@ from netpos.estimation.fusion import (
     predicted_in,
     workspace,
 )
-from netpos.estimation.gate import leave_odd_out
-from netpos.estimation.iteration import (
+from netpos.estimation.update.gate import leave_odd_out
+from netpos.estimation.update.iteration import (
     is_curved,
     is_wide,
     iterate,
@@ -38,12 +42,8 @@ from netpos.estimation.iteration import (
     iterate_used,
     refine_used,
 )
-from netpos.estimation.measurement import GATE_VARIANCE, GROUP, VARIANCE
-from netpos.estimation.motion import add_noise, is_straight, propagate, transition
-from netpos.estimation.predicted import predict_rows
-from netpos.estimation.sensors.row import group_end
-from netpos.estimation.slow_errors import follow_tangents
-from netpos.estimation.state import N_CORE, X
+from netpos.estimation.update.predicted import predict_rows
+from netpos.estimation.update.slow_errors import follow_tangents
 from netpos.messages.values import Array
 
 if TYPE_CHECKING:

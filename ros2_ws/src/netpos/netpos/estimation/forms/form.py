@@ -32,7 +32,7 @@ class FilterForm:
     update : ``(mean, cov_or_sqrt, rows, options, gate_nis, accepted, work)`` gates each group of
         ``rows`` (m, ROW_WIDTH) by ``gate_nis``, fuses what passes and returns the NIS of the rows
         fused and their number. ``options`` is ``engine.FilterOptions``, ``accepted`` (groups,) is
-        filled with 0 or 1, ``work`` is of ``fusion.workspace``.
+        filled with 0 or 1, ``work`` is of ``update.fusion.workspace``.
 
     The three that follow are None where the form carries the covariance itself.
 

@@ -12,11 +12,11 @@ from netpos.estimation.compile import kernel, spliced
 from netpos.estimation.factor import factor
 from netpos.estimation.forms import ekf
 from netpos.estimation.forms.form import FilterForm
-from netpos.estimation.fusion import predicted_in
-from netpos.estimation.gate import gate_groups, select_rows
 from netpos.estimation.measurement import GATE_VARIANCE, GROUP, KIND, VARIANCE, Kind
-from netpos.estimation.predicted import PredictedRows, predicted_rows
 from netpos.estimation.state import X
+from netpos.estimation.update.fusion import predicted_in
+from netpos.estimation.update.gate import gate_groups, select_rows
+from netpos.estimation.update.predicted import PredictedRows, predicted_rows
 from netpos.messages.values import Array
 
 if TYPE_CHECKING:

@@ -22,11 +22,11 @@ import numpy as np
 from netpos.estimation.compile import inlined, kernel, leaf, spliced
 from netpos.estimation.factor import factor
 from netpos.estimation.forms.form import FilterForm
-from netpos.estimation.gate import gate_groups, select_rows
+from netpos.estimation.forms.sigma import innovation_cov, move, regress
 from netpos.estimation.measurement import GATE_VARIANCE, VARIANCE
 from netpos.estimation.motion import noise
-from netpos.estimation.sigma import innovation_cov, move, regress
 from netpos.estimation.state import X
+from netpos.estimation.update.gate import gate_groups, select_rows
 from netpos.messages.values import Array
 
 if TYPE_CHECKING:

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netpos.estimation import fusion
 from netpos.estimation.compile import kernel
 from netpos.estimation.engine import (
     FilterOptions,
@@ -17,12 +16,13 @@ from netpos.estimation.engine import (
     is_sound,
     update_with_gate,
 )
-from netpos.estimation.fit import neg2_log_likelihood
-from netpos.estimation.gate import accepted_rows
 from netpos.estimation.measurement import GATE_VARIANCE, GROUP
 from netpos.estimation.mixture.gaussians import Mixture
-from netpos.estimation.predicted import PredictedRows, predict_rows
 from netpos.estimation.sensors.row import group_end
+from netpos.estimation.update import fusion
+from netpos.estimation.update.fit import neg2_log_likelihood
+from netpos.estimation.update.gate import accepted_rows
+from netpos.estimation.update.predicted import PredictedRows, predict_rows
 from netpos.messages.values import Array
 
 _OUTLIERS = 1e-2  # of all values

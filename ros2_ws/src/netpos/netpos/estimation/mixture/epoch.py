@@ -11,7 +11,6 @@ import numpy as np
 from netpos.estimation.accel_density import density_of, learn, unknown_density
 from netpos.estimation.accel_density import move as move_density
 from netpos.estimation.compile import kernel
-from netpos.estimation.conditioning import Robust, RobustOptions
 from netpos.estimation.engine import (
     EpochInput,
     Epochs,
@@ -28,8 +27,14 @@ from netpos.estimation.engine import (
     update_epoch,
 )
 from netpos.estimation.forms.choice import write_cov, write_cov_or_sqrt
-from netpos.estimation.fusion import predicted_in, workspace
-from netpos.estimation.manoeuvre import detection_delay_s
+from netpos.estimation.level.manoeuvre import detection_delay_s
+from netpos.estimation.level.protection import (
+    FusedEpoch,
+    LevelScratch,
+    level_scratch,
+    manoeuvre_level,
+    mixture_radius,
+)
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.mixture import mixing
 from netpos.estimation.mixture.candidates import (
@@ -61,15 +66,10 @@ from netpos.estimation.mixture.turns import (
     may_turn,
 )
 from netpos.estimation.motion import Parameter, add_velocity_step
-from netpos.estimation.predicted import note_innovations, predict_rows
-from netpos.estimation.protection import (
-    FusedEpoch,
-    LevelScratch,
-    level_scratch,
-    manoeuvre_level,
-    mixture_radius,
-)
-from netpos.estimation.slow_errors import with_linearisation
+from netpos.estimation.update.conditioning import Robust, RobustOptions
+from netpos.estimation.update.fusion import predicted_in, workspace
+from netpos.estimation.update.predicted import note_innovations, predict_rows
+from netpos.estimation.update.slow_errors import with_linearisation
 from netpos.messages.values import Array
 
 _MERGE_SHARE = 0.1  # of the integrity risk: what merging two components may cost

@@ -9,7 +9,6 @@ import numpy as np
 
 from netpos.estimation.compile import kernel
 from netpos.estimation.engine import EpochInput, FilterOptions
-from netpos.estimation.fusion import predicted_in, workspace
 from netpos.estimation.measurement import BLOCKED, GROUP, linearise
 from netpos.estimation.mixture.candidates import (
     Candidates,
@@ -29,8 +28,9 @@ from netpos.estimation.mixture.splits.choice import (
 )
 from netpos.estimation.mixture.splits.paths import late_row, reweight_by_best
 from netpos.estimation.mixture.turns import TURNS_MAX, add_explanations, may_turn, turned
-from netpos.estimation.predicted import predict_rows
 from netpos.estimation.sensors.row import group_end
+from netpos.estimation.update.fusion import predicted_in, workspace
+from netpos.estimation.update.predicted import predict_rows
 from netpos.messages.values import Array
 
 _EXPLANATIONS = TURNS_MAX + 1  # of what a candidate refuses: turns, and an error

@@ -9,7 +9,14 @@ import numpy as np
 
 from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.engine import FilterOptions
-from netpos.estimation.fusion import predicted_in, workspace
+from netpos.estimation.fixes.phase_fix import (
+    TWO_PI,
+    admissible,
+    init_hypothesis,
+    nearest_turns,
+    phase_scale,
+    to_fix,
+)
 from netpos.estimation.measurement import (
     GROUP,
     KIND,
@@ -23,15 +30,8 @@ from netpos.estimation.measurement import (
 from netpos.estimation.mixture.candidates import Candidates, apply, apply_predicted
 from netpos.estimation.mixture.gaussians import Ints, Mixture
 from netpos.estimation.mixture.reduction import LEAST_WEIGHT, reduced
-from netpos.estimation.phase_fix import (
-    TWO_PI,
-    admissible,
-    init_hypothesis,
-    nearest_turns,
-    phase_scale,
-    to_fix,
-)
-from netpos.estimation.predicted import predict_rows
+from netpos.estimation.update.fusion import predicted_in, workspace
+from netpos.estimation.update.predicted import predict_rows
 from netpos.messages.values import Array
 
 _UNWRAPPED = float(Kind.UNWRAPPED_PHASE)

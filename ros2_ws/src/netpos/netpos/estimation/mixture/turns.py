@@ -8,8 +8,7 @@ import numpy as np
 
 from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.engine import EpochInput, FilterOptions, manoeuvre_s
-from netpos.estimation.fusion import predicted_in, workspace
-from netpos.estimation.manoeuvre import (
+from netpos.estimation.level.manoeuvre import (
     add_manoeuvre,
     measures_position,
     measures_velocity,
@@ -18,6 +17,7 @@ from netpos.estimation.manoeuvre import (
 )
 from netpos.estimation.mixture.candidates import Candidates, apply, apply_predicted
 from netpos.estimation.mixture.gaussians import Mixture, together
+from netpos.estimation.update.fusion import predicted_in, workspace
 from netpos.messages.values import Array
 
 TURN_PERIOD_S = 0.25  # a component "it has turned" begins so long after the last, with one RSU

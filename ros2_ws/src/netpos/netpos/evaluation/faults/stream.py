@@ -11,7 +11,7 @@ import numpy as np
 
 from netpos.evaluation.pairing import Trajectory
 from netpos.messages.values import Array, ImuSample, RsuInfo, RsuMeasurement
-from netpos.tracking.sequencer import Item
+from netpos.tracking.ordering.sequencer import Item
 
 NS = 1_000_000_000
 

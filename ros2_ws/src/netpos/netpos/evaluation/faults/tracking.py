@@ -11,10 +11,10 @@ from netpos.evaluation.faults.of_networks import of_bytes
 from netpos.evaluation.faults.stream import NS, Arrival, Order, Stream
 from netpos.messages.values import ImuSample, Odometry, RsuInfo, TrackStatus
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.diagnosis import Level
-from netpos.tracking.health import RsuState
+from netpos.tracking.health.diagnosis import Level
+from netpos.tracking.health.health import RsuState
+from netpos.tracking.ordering.sequencer import Item
 from netpos.tracking.report import TrackOutput
-from netpos.tracking.sequencer import Item
 from netpos.tracking.tracker import Tracker
 
 _STALE_NS = 3 * NS

@@ -10,11 +10,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from netpos.estimation.engine import Epochs
-from netpos.estimation.error_state import UNCONSTRAINED, Imu
+from netpos.estimation.fixes.position_fix import FixStatus
 from netpos.estimation.measurement import LEVER
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
-from netpos.estimation.position_fix import FixStatus
-from netpos.estimation.space import place_rows
+from netpos.estimation.spatial.error_state import UNCONSTRAINED, Imu
+from netpos.estimation.spatial.space import place_rows
 from netpos.estimation.state import ERR_ATTITUDE, ERR_POSITION, ERR_VELOCITY
 from netpos.evaluation.metrics import NS
 from netpos.evaluation.pairing import Mask
@@ -24,8 +24,8 @@ from netpos.reproduction.deng2022.drives import Drive, Fixes, drive, fix_each
 from netpos.reproduction.rows import RowTemplates, observation_rows
 from netpos.scenario import Simulation, load_scenario
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.models import gate_thresholds
-from netpos.tracking.strapdown_models import nav_of, sensors_of, start_sd, with_clock
+from netpos.tracking.estimators.models import gate_thresholds
+from netpos.tracking.estimators.strapdown_models import nav_of, sensors_of, start_sd, with_clock
 
 VUE = "vue_1"
 SCENARIO = "blocked_5g_drive"

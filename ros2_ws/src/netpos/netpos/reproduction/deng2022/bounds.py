@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from netpos.estimation.engine import Epochs
-from netpos.estimation.error_state import (
+from netpos.estimation.measurement import GROUP, ORIGIN, VALUE
+from netpos.estimation.spatial.error_state import (
     MEMORY,
     UNCONSTRAINED,
     Imu,
@@ -19,8 +20,7 @@ from netpos.estimation.error_state import (
     advance,
     correct,
 )
-from netpos.estimation.measurement import GROUP, ORIGIN, VALUE
-from netpos.estimation.space import linearise_in_space
+from netpos.estimation.spatial.space import linearise_in_space
 from netpos.estimation.state import NAV_POSITION
 from netpos.evaluation.work import Work
 from netpos.messages.values import Array
@@ -42,8 +42,8 @@ from netpos.reproduction.deng2022.blocked_drive import (
 )
 from netpos.reproduction.deng2022.drives import Drive, drive, smoothed_drive
 from netpos.scenario import Simulation, load_scenario
-from netpos.tracking.models import gate_thresholds
-from netpos.tracking.strapdown_models import nav_of, sensors_of, start_sd
+from netpos.tracking.estimators.models import gate_thresholds
+from netpos.tracking.estimators.strapdown_models import nav_of, sensors_of, start_sd
 
 BOUND_RUNS = 20
 """The bound depends on who hears the vehicle alone: it hardly varies."""

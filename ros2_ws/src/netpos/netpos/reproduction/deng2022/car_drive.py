@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from netpos.bags.importers.car_imu_rtk import MOUNT, CarDrive, imu_samples, load_car_drive
 from netpos.bags.importers.common import recordings
 from netpos.estimation.engine import Epochs
-from netpos.estimation.error_state import UNCONSTRAINED, Imu, Sensors
 from netpos.estimation.measurement import LEVER
-from netpos.estimation.space import place_rows
+from netpos.estimation.spatial.error_state import UNCONSTRAINED, Imu, Sensors
+from netpos.estimation.spatial.space import place_rows
 from netpos.estimation.state import NAV_POSITION, NAV_QUATERNION
 from netpos.evaluation.metrics import NS
 from netpos.messages.values import Array
@@ -36,10 +36,10 @@ from netpos.reproduction.rows import RowTemplates, observation_rows
 from netpos.scenario.along_path import FIELDS
 from netpos.scenario.recorded_drive import VUE, station_drive
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.imu_buffer import ImuBuffer
-from netpos.tracking.models import gate_thresholds
-from netpos.tracking.strapdown_models import sensors_of
-from netpos.tracking.strapdown_start import StrapdownStart
+from netpos.tracking.estimators.imu_buffer import ImuBuffer
+from netpos.tracking.estimators.models import gate_thresholds
+from netpos.tracking.estimators.strapdown_models import sensors_of
+from netpos.tracking.first_fix.strapdown_start import StrapdownStart
 
 RECORDING = "car_imu_rtk"
 SEEDS = 20

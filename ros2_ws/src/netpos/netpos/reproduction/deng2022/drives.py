@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from netpos.estimation.compile import kernel
 from netpos.estimation.engine import Epochs
-from netpos.estimation.error_state import (
+from netpos.estimation.fixes.position_fix import fix_position, start_of
+from netpos.estimation.measurement import GROUP, KIND, ORIGIN, ROW_WIDTH, VALUE, VARIANCE, Kind
+from netpos.estimation.spatial.error_state import (
     MEMORY,
     Imu,
     Sensors,
@@ -17,10 +19,8 @@ from netpos.estimation.error_state import (
     correct,
     doubt_standstill,
 )
-from netpos.estimation.measurement import GROUP, KIND, ORIGIN, ROW_WIDTH, VALUE, VARIANCE, Kind
-from netpos.estimation.position_fix import fix_position, start_of
 from netpos.messages.values import Array
-from netpos.tracking.strapdown_smoothing import Recorder
+from netpos.tracking.smoothing.strapdown import Recorder
 
 Ints = NDArray[np.int64]
 _PLACE = int(Kind.PLACE)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from netpos.estimation.position_fix import FixStatus
+from netpos.estimation.fixes.position_fix import FixStatus
 from netpos.estimation.state import NAV_POSITION
 from netpos.evaluation.metrics import NS
 from netpos.evaluation.pictures import TRACK_COLOURS

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from netpos.estimation.engine import Epochs
+from netpos.estimation.fixes.position_fix import FixStatus
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
-from netpos.estimation.position_fix import FixStatus
 from netpos.estimation.state import NAV_POSITION, NAV_QUATERNION, NAV_VELOCITY, Err, Nav
 from netpos.evaluation.consistency import MeanTest, nees, nees_over_runs
 from netpos.evaluation.work import Work

@@ -26,12 +26,12 @@ from netpos.reproduction.dvornikov2017.truth import START_NS
 from netpos.scenario.networks import fix_errors
 from netpos.scenario.schema import NS
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.epoch_rows import epoch_rows_of
-from netpos.tracking.estimates import Estimate
-from netpos.tracking.models import dynamics_of, options_of
+from netpos.tracking.estimators.epoch_rows import epoch_rows_of
+from netpos.tracking.estimators.estimates import Estimate
+from netpos.tracking.estimators.models import dynamics_of, options_of
 from netpos.tracking.networks.common_instant import TRACK_STATES, at_common_instant, step_matrices
 from netpos.tracking.networks.secondary import OwnNoise, Secondary
-from netpos.tracking.rsus import Rsu
+from netpos.tracking.rsus.rsu import Rsu
 
 Ints = npt.NDArray[np.int64]
 Truth = Callable[[int, Ints], Array]

@@ -15,7 +15,7 @@ from netpos.messages.values import Array
 from netpos.radio.anchor import uwb_wavelength_m
 from netpos.reproduction.petukhov.rectangle import Walked
 from netpos.reproduction.petukhov.sector_choice import Conditions, SectorShares
-from netpos.tracking.step_heading import choose_sector
+from netpos.tracking.first_fix.step_heading import choose_sector
 
 __all__ = ["errors", "residuals", "save", "success", "tracks"]
 

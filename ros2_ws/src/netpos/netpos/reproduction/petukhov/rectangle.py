@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from netpos.estimation.accel_density import START
+from netpos.estimation.fixes.phase_fix import TWO_PI, init_hypothesis
 from netpos.estimation.measurement import GROUP, VALUE, predict_row
 from netpos.estimation.motion import NO_BIAS
-from netpos.estimation.phase_fix import TWO_PI, init_hypothesis
 from netpos.estimation.state import POSITION
 from netpos.messages.values import Array
 from netpos.radio.noise import generator
@@ -33,10 +33,10 @@ from netpos.reproduction.petukhov.waist_chain import Settings, config_of
 from netpos.reproduction.rows import RowTemplates, observation_rows
 from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.schema import RectangleRoute
-from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.estimates import Estimate
-from netpos.tracking.phase_start import PhaseStart
+from netpos.tracking.estimators.adaptive_process_noise import AdaptiveProcessNoise
+from netpos.tracking.estimators.estimates import Estimate
+from netpos.tracking.first_fix.phase_start import PhaseStart
 
 Ints = npt.NDArray[np.int64]
 

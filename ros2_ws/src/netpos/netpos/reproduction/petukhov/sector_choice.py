@@ -28,10 +28,10 @@ from netpos.reproduction.petukhov.steps import (
 )
 from netpos.reproduction.petukhov.waist_chain import SCENARIO, config_of
 from netpos.scenario import load_scenario
-from netpos.tracking.adaptive_process_noise import AdaptiveProcessNoise
-from netpos.tracking.estimates import Estimate
-from netpos.tracking.phase_start import PhaseStart
-from netpos.tracking.step_heading import choose_sector
+from netpos.tracking.estimators.adaptive_process_noise import AdaptiveProcessNoise
+from netpos.tracking.estimators.estimates import Estimate
+from netpos.tracking.first_fix.phase_start import PhaseStart
+from netpos.tracking.first_fix.step_heading import choose_sector
 from netpos.world.frames import quaternion_from_yaw
 
 Bools = npt.NDArray[np.bool_]

@@ -12,7 +12,7 @@ from netpos.radio.noise import generator
 from netpos.reproduction.experiment import VUE
 from netpos.reproduction.petukhov.rectangle import ERRORS, Setup
 from netpos.reproduction.petukhov.steps import Steps, velocity_rows
-from netpos.tracking.models import pose_state
+from netpos.tracking.estimators.models import pose_state
 
 _ACCEL = 1e-6  # m/s^2/sqrt(Hz): between those instants the speed is kept
 _FREE_MPS = 10.0

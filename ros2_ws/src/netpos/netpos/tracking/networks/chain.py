@@ -10,8 +10,8 @@ from netpos.messages.values import ImuSample, Odometry, RsuInfo
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.networks.config import FusionConfig
 from netpos.tracking.networks.tertiary import TrackFusion
+from netpos.tracking.ordering.sequencer import Item
 from netpos.tracking.report import TrackOutput
-from netpos.tracking.sequencer import Item
 from netpos.tracking.tracker import Tracker
 
 

@@ -16,8 +16,8 @@ from netpos.estimation.forms.table import form_of
 from netpos.estimation.motion import Parameter, add_velocity_step, transition
 from netpos.messages.values import Array, NetworkTrack
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.estimates import Estimate
-from netpos.tracking.models import height_state, options_of
+from netpos.tracking.estimators.estimates import Estimate
+from netpos.tracking.estimators.models import height_state, options_of
 from netpos.tracking.networks.common_instant import TRACK_STATES
 
 _PLANAR = TRACK_STATES[:4]

@@ -15,7 +15,7 @@ from typing import cast
 import numpy as np
 
 from netpos.estimation.intersection import fuse_pair
-from netpos.estimation.protection import protection_level
+from netpos.estimation.level.protection import protection_level
 from netpos.estimation.state import POSITION
 from netpos.messages.values import Array, NetworkTrack, TrackState, TrackStatus
 from netpos.tracking import output
@@ -23,8 +23,8 @@ from netpos.tracking.networks.association import Association, Slots, by_name
 from netpos.tracking.networks.common_instant import Moved, at_common_instant
 from netpos.tracking.networks.config import FusionConfig
 from netpos.tracking.networks.validation import network_track_fault
+from netpos.tracking.ordering.sequencer import Epoch, Item, Sequencer
 from netpos.tracking.report import TrackOutput
-from netpos.tracking.sequencer import Epoch, Item, Sequencer
 
 
 class NetworkState(IntEnum):

@@ -15,7 +15,7 @@ EPOCHS = 81
 _RUN = """
 from dataclasses import replace
 from netpos.estimation.measurement import Kind
-from netpos.tracking.validation import explanation
+from netpos.tracking.door.validation import explanation
 
 refused = []
 

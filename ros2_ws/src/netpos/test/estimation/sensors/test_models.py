@@ -26,7 +26,7 @@ from netpos.estimation.measurement import (
 from netpos.estimation.sensors.model import Sensor, Wraps
 from netpos.estimation.sensors.row import ROW_WIDTH
 from netpos.estimation.sensors.table import BY_KIND, SENSORS
-from netpos.estimation.space import bend_variance, innovation_at, value_at
+from netpos.estimation.spatial.space import bend_variance, innovation_at, value_at
 from netpos.estimation.state import ERR_POSITION, NAV_POSITION, POSITION, Nav, X
 from netpos.inertial.navigation_state import ERR, NAV
 from netpos.messages.values import Array

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from netpos.estimation.engine import Epochs
+from netpos.estimation.fixes.position_fix import FixStatus
 from netpos.estimation.measurement import ORIGIN, ROW_WIDTH
-from netpos.estimation.position_fix import FixStatus
 from netpos.estimation.state import Err, Nav
 from netpos.evaluation.work import Work
 from netpos.reproduction.deng2022 import blocked_drive as drives
@@ -33,8 +33,8 @@ from netpos.reproduction.deng2022.blocked_drive import (
 )
 from netpos.reproduction.deng2022.drives import Drive, drive
 from netpos.reproduction.deng2022.tally import Tally, tally_seeds
-from netpos.tracking.models import gate_thresholds
-from netpos.tracking.strapdown_models import sensors_of
+from netpos.tracking.estimators.models import gate_thresholds
+from netpos.tracking.estimators.strapdown_models import sensors_of
 from scipy.spatial.transform import Rotation
 
 SEED = 5001

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from netpos.estimation.engine import Epochs
-from netpos.estimation.position_fix import FixStatus
+from netpos.estimation.fixes.position_fix import FixStatus
 from netpos.estimation.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.reproduction.deng2022.drives import fix_each

@@ -8,8 +8,8 @@ from netpos.estimation.engine import EpochInput, FilterOptions
 from netpos.estimation.mixture.candidates import Candidates
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.mixture.splits.table import SPLITS
-from netpos.estimation.predicted import PredictedRows
 from netpos.estimation.sensors.row import group_end
+from netpos.estimation.update.predicted import PredictedRows
 from netpos.messages.values import Array
 
 WHOLE = -1

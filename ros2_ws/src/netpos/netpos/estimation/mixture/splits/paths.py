@@ -9,9 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netpos.estimation.compile import kernel
-from netpos.estimation.conditioning import RobustOptions, may_be_late, reweight
 from netpos.estimation.engine import EpochInput, FilterOptions, is_sound
-from netpos.estimation.fusion import predicted_in, workspace
 from netpos.estimation.measurement import BLOCKED, VARIANCE
 from netpos.estimation.mixture.candidates import (
     Candidates,
@@ -22,8 +20,10 @@ from netpos.estimation.mixture.candidates import (
 from netpos.estimation.mixture.gaussians import Mixture, fuse_value
 from netpos.estimation.mixture.reduction import PART_MERGE_COST
 from netpos.estimation.mixture.splits.split import Split
-from netpos.estimation.predicted import PredictedRows, predict_rows, predicted_rows
-from netpos.estimation.robust import blocked_excess, matching_cost, mixed_excess
+from netpos.estimation.update.conditioning import RobustOptions, may_be_late, reweight
+from netpos.estimation.update.fusion import predicted_in, workspace
+from netpos.estimation.update.predicted import PredictedRows, predict_rows, predicted_rows
+from netpos.estimation.update.robust import blocked_excess, matching_cost, mixed_excess
 from netpos.messages.values import Array
 
 

@@ -25,7 +25,7 @@ from netpos.estimation.mixture.gaussians import CURVATURE_SHARE, SPACING_SD, Mix
 from netpos.estimation.mixture.reduction import PART_MERGE_COST
 from netpos.estimation.mixture.splits.paths import fuse_by, paths_in, paths_of
 from netpos.estimation.mixture.splits.split import Split
-from netpos.estimation.predicted import PredictedRows, predicted_rows
+from netpos.estimation.update.predicted import PredictedRows, predicted_rows
 from netpos.messages.values import Array
 
 _VELOCITY_END = 4  # position and velocity come first

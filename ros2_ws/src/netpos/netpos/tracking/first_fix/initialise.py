@@ -1,0 +1,460 @@
+"""The first fix: the most probable state behind the first measurements, with the covariance it
+deserves.
+
+A maximum a posteriori fit of [x, y, vx, vy, clock, drift], and of the slow errors in the
+measurements (the height too, where it is unknown), at the newest stamp to all measurements of a
+short window: Gauss-Newton from several starts, under a prior as wide as the coverage of the RSUs,
+the initial speed and the clock allow. It takes any mixture of angles, times, ranges and fixes, and
+it waits while the measurements leave the position open. The track goes on with the slow errors as
+the fit found them: what they have in common with the position is not heard twice.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from netpos.common.least_squares import minimise
+from netpos.estimation.chi_square import chi_square_bound
+from netpos.estimation.measurement import (
+    AXES,
+    BIAS,
+    BLOCKED,
+    COMMON,
+    GROUP,
+    HEADING,
+    HEIGHT,
+    KIND,
+    LEVER,
+    ORIGIN,
+    REFERENCE,
+    VALUE,
+    VARIANCE,
+    Kind,
+    wrap,
+)
+from netpos.estimation.mixture.gaussians import Mixture, mode_of
+from netpos.estimation.mixture.reduction import PART_MERGE_COST, reduced
+from netpos.estimation.mixture.ridge import Fit, components_of, inverse
+from netpos.estimation.mixture.window import Window, normal_equations
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
+from netpos.estimation.rows import drop_biases
+from netpos.estimation.sensors.table import BY_KIND
+from netpos.estimation.state import N_CORE
+from netpos.estimation.update.fit import map_cost
+from netpos.estimation.update.fusion import workspace
+from netpos.estimation.update.iteration import iterate_from
+from netpos.messages.values import Array
+from netpos.tracking.config import TrackerConfig
+from netpos.tracking.estimators.models import carries_modes, slow_states, state_of_fit
+from netpos.tracking.first_fix import wrong_rsu
+from netpos.tracking.rsus.rsu import Rsu, SlowErrors
+
+_REFINED = 12
+_ATTEMPT_NS = 100_000_000
+# Odds of another heading this much worse in cost (chi-square 0.99, 2 dof) rule it out; places that
+# cannot be told apart are waited for from the same share on, and carried along below it.
+_RIVAL_COST, _RIVAL_SHARE = 9.21, 0.01
+_ANY_CLOCK_S = 1.0
+_CONTRADICTS = 9.0  # mean squared residual over variance
+_NEAREST_M = 1.0
+_HEADINGS = 16
+_HEADING_SD_MAX = 0.5
+_LEAST_SD = 1e-9  # of a slow error
+_RAY_M = (2.0, 6.0, 15.0, 40.0, 100.0)
+_RAYS_REACH_M = 150.0  # where devices are farther from the RSUs, the rays are longer
+_CIRCLE = tuple(2.0 * math.pi * i / 12 for i in range(12))
+
+
+class Problem(NamedTuple):
+    """What ``normal_equations`` takes after the state."""
+
+    window: Window
+    prior: Array
+    prior_var: Array
+
+
+class _Solution(NamedTuple):
+    """A problem and its minima, best first. log_odds: of what it takes for granted, and the log
+    density of the states that it has more than others, where these are 0."""
+
+    problem: Problem
+    fits: list[Fit]
+    log_odds: float = 0.0
+
+    def mixture(self, misfit: float, is_possible: Callable[[Array], bool]) -> Mixture:
+        """The posterior of all states; a ``misfit`` above 1 enlarges all variances."""
+
+        def equations(state: Array) -> tuple[float, Array, Array]:
+            cost, b, A = normal_equations(state, *self.problem)
+            return cost / misfit, b / misfit, A / misfit
+
+        fits = [(cost / misfit, mean, cov * misfit) for cost, mean, cov in self.fits]
+        means, covs, log_weights = components_of(equations, fits, is_possible)
+        return Mixture(means, covs, log_weights + self.log_odds)
+
+
+def joined(mixtures: Sequence[Mixture]) -> Mixture:
+    """Several mixtures as one, normalised; what is alike is merged."""
+    every = Mixture(*(np.concatenate(parts) for parts in zip(*mixtures, strict=True)))
+    reduced_: Mixture = reduced(every, PART_MERGE_COST)
+    return reduced_
+
+
+def has_modes(mixture: Mixture, share: float) -> bool:
+    """Whether more than one mode carries more than ``share``."""
+    sums = np.bincount(mode_of(mixture), np.exp(mixture.log_weights))
+    return bool((sums > share).sum() > 1)
+
+
+def _solve(state: Array, problem: Problem) -> Fit:
+    """Levenberg-Marquardt from one start: cost, state, covariance of the fit."""
+    cost, state, A = minimise(
+        lambda x: normal_equations(x, *problem), state, lambda A, b: inverse(A) @ b
+    )
+    return cost, state, inverse(A)
+
+
+class Initialiser:
+    """Collects rows until they determine a position."""
+
+    def __init__(self, config: TrackerConfig) -> None:
+        self._config = config
+        self._window: deque[tuple[int, Array, tuple[Rsu, ...]]] = deque()
+        self._own = slow_states(config).slow_errors
+        self._next_attempt_ns = 0
+        self.missing = ""
+        """What a first fix lacks, for people; empty before the first attempt."""
+
+    def copy(self) -> Initialiser:
+        """An independent copy."""
+        twin = Initialiser(self._config)
+        twin._window = self._window.copy()
+        twin._next_attempt_ns = self._next_attempt_ns
+        twin.missing = self.missing
+        return twin
+
+    def add(self, stamp_ns: int, rows: Array, rsus: tuple[Rsu, ...]) -> None:
+        """Take the rows (m, ROW_WIDTH) of one epoch, which name their slow errors as a track
+        does."""
+        rows = rows.copy()
+        rows[:, HEADING] = -1
+        self._window.append((stamp_ns, rows, rsus))
+        oldest = stamp_ns - int(self._config.initial_window_s * 1e9)
+        while self._window[0][0] < oldest:
+            self._window.popleft()
+
+    def solve(self, slow: SlowErrors | None = None) -> Mixture | None:
+        """State (n,) of a track at the newest stamp, with the ``slow`` errors that rows name
+        (None: those of the device alone), as a mixture: a place that is a thin arc is a row of
+        components, and places that cannot be told apart are modes. None while the position is
+        open, or for most of the window while there are several modes.
+
+        Of three or more RSUs one may err grossly: what the others say is a part of the posterior.
+        Where the measurements contradict each other and leaving out one RSU makes them agree, the
+        fix is that of the others. Otherwise another clock offset may make them agree: the declared
+        one is that of a device just switched on.
+        """
+        newest = self._window[-1][0]
+        if newest < self._next_attempt_ns:
+            return None
+        self._next_attempt_ns = newest + _ATTEMPT_NS
+        slow = slow or self._own
+        rows, ages, errors_sd = self._stacked(slow)
+        agreed = self._solution(rows, ages, errors_sd)
+        if not agreed.fits:
+            self.missing = f"no place in front of the RSUs fits {self._heard(rows)}"
+            return None
+        solutions, agrees = [agreed], self._consistent(agreed.fits[0], len(rows))
+        if not agrees:
+            solutions = (
+                self._without_one(rows, ages, errors_sd)
+                or self._any_clock(rows, ages, errors_sd)
+                or solutions
+            )
+        cost, _, cov = solutions[0].fits[0]
+        misfit = max(1.0, cost / len(rows))
+        lacks = self._lacks(rows, cov, misfit)
+        if lacks:
+            self.missing = lacks
+            return None
+        if agrees and self._config.isolate_rsus:
+            solutions += self._one_errs(rows, agreed.problem)
+        mixture = joined(
+            [self._of_track(s.mixture(misfit, self._plausible), slow) for s in solutions]
+        )
+        waited_s = (newest - self._window[0][0]) * 1e-9
+        waits = waited_s < 0.8 * self._config.initial_window_s or not carries_modes(self._config)
+        if waits and has_modes(mixture, _RIVAL_SHARE):
+            self.missing = f"more than one place fits {self._heard(rows)}; waiting for more"
+            return None
+        return mixture
+
+    def _of_track(self, mixture: Mixture, slow: SlowErrors) -> Mixture:
+        """The states of a track, of the components of a fit."""
+        n = N_CORE + int(slow.lasts.sum())
+        states = [
+            state_of_fit(self._config, mean[:n], cov[:n, :n], slow)
+            for mean, cov in zip(mixture.means, mixture.covs, strict=True)
+        ]
+        means, covs = np.array([mean for mean, _ in states]), np.array([cov for _, cov in states])
+        return Mixture(means, covs, mixture.log_weights)
+
+    def _lacks(self, rows: Array, cov: Array, misfit: float) -> str:
+        """What a fit of the covariance ``cov`` lacks, for people; empty where it lacks nothing."""
+        sd_m = math.sqrt(float(np.linalg.eigvalsh(cov[:2, :2])[-1]))
+        limit_m = self._config.initial_position_sd_max_m
+        if sd_m > limit_m and misfit < _CONTRADICTS:
+            return (
+                f"{self._heard(rows)} leave a position sd of {sd_m:.1f} m "
+                f"(initial_position_sd_max_m: {limit_m:g}); another RSU or quantity is needed"
+            )
+        if sd_m * math.sqrt(misfit) > limit_m:
+            return (
+                f"{self._heard(rows)} contradict each other by {math.sqrt(misfit):.3g} sd; are"
+                " they in m, rad and s, and the RSUs where RsuInfo says?"
+            )
+        return ""
+
+    def excess_cost(self, stamp_ns: int, mean: Array, var: Array, slow: SlowErrors) -> float:
+        """How much worse the window fits where the device is at ``mean`` (6,), with variances
+        ``var`` (6,), at ``stamp_ns`` than where it fits best: chi-square with 2 degrees of freedom
+        for the true position. 0 without measurements of the time."""
+        age_s = (stamp_ns - self._window[-1][0]) * 1e-9 if self._window else math.inf
+        if age_s > self._config.initial_window_s:
+            return 0.0
+        rows, ages, errors_sd = self._stacked(slow)
+        problem = self._problem(rows, ages, errors_sd)
+        fits = self._fits(rows, problem)
+        if not fits:
+            return 0.0
+        var = var.copy()
+        var[:2] += age_s**2 * var[2:4]
+        var = np.append(var, problem.prior_var[len(var) :])
+        start = mean = np.append(mean, problem.prior[len(mean) :])
+        start = start.copy()
+        start[4] = _clock_at(start, rows, self._config.device_height_m)
+        cost = _solve(start, problem._replace(prior=mean, prior_var=var))[0]
+        return max(0.0, cost - fits[0][0])
+
+    def _stacked(self, slow: SlowErrors) -> tuple[Array, Array, Array]:
+        """The rows of the window, their ages [s], <= 0, against the newest, and the sd of the slow
+        errors that are states of the fit."""
+        newest = self._window[-1][0]
+        rows = np.vstack([entry[1] for entry in self._window])
+        ages = np.concatenate(
+            [np.full(len(entry[1]), (entry[0] - newest) * 1e-9) for entry in self._window]
+        )
+        return rows, ages, _name_states_of_fit(rows, ages, slow)
+
+    def _heard(self, rows: Array) -> str:
+        """What was measured, by whom."""
+        kinds = sorted({BY_KIND[int(kind)].name for kind in rows[:, KIND]})
+        rsus = sorted({rsu.info.rsu_id for entry in self._window for rsu in entry[2]})
+        return f"{', '.join(kinds)} of {', '.join(rsus) or 'no RSU'}"
+
+    def _consistent(self, fit: Fit, rows: int) -> bool:
+        """Whether the cost of a fit is one that true measurements have."""
+        return bool(fit[0] <= chi_square_bound(rows, 1.0 - self._config.gate_probability))
+
+    def _solution(self, rows: Array, ages: Array, errors_sd: Array) -> _Solution:
+        problem = self._problem(rows, ages, errors_sd)
+        return _Solution(problem, self._fits(rows, problem))
+
+    def _without_one(self, rows: Array, ages: Array, errors_sd: Array) -> list[_Solution]:
+        """Solutions with a consistent fit without one of the RSUs, best first; none of fewer than
+        three RSUs."""
+        placed = wrong_rsu.placed(rows)
+        origins = np.unique(rows[placed, ORIGIN:AXES], axis=0)
+        if len(origins) < wrong_rsu.FEWEST:
+            return []
+        solutions = []
+        for origin in origins:
+            keep = ~placed | (rows[:, ORIGIN:AXES] != origin).any(axis=1)
+            others = self._solution(rows[keep], ages[keep], errors_sd)
+            fits = [fit for fit in others.fits if self._consistent(fit, int(keep.sum()))]
+            if fits:
+                solutions.append(others._replace(fits=fits))
+        return sorted(solutions, key=lambda solution: solution.fits[0][0])
+
+    def _any_clock(self, rows: Array, ages: Array, errors_sd: Array) -> list[_Solution]:
+        """The solution with a consistent fit whatever the clock offset is, if there is one."""
+        if not any(BY_KIND[int(kind)].has_clock for kind in np.unique(rows[:, KIND])):
+            return []
+        problem = self._problem(rows, ages, errors_sd)
+        problem.prior_var[4] = (SPEED_OF_LIGHT_MPS * _ANY_CLOCK_S) ** 2
+        fits = [fit for fit in self._fits(rows, problem) if self._consistent(fit, len(rows))]
+        return [_Solution(problem, fits)] if fits else []
+
+    def _one_errs(self, rows: Array, problem: Problem) -> list[_Solution]:
+        """Solutions in which one of the RSUs errs grossly, of at least three."""
+        found = []
+        for case in wrong_rsu.cases(*problem):
+            changed = Problem(case.window, case.prior, case.prior_var)
+            found.append(_Solution(changed, self._fits(rows, changed), case.log_odds))
+        return [solution for solution in found if solution.fits]
+
+    def _problem(self, rows: Array, ages: Array, errors_sd: Array) -> Problem:
+        cfg = self._config
+        c = SPEED_OF_LIGHT_MPS
+        origins = np.array([r.info.position[:2] for e in self._window for r in e[2]])
+        fixes = rows[rows[:, KIND] == Kind.LINEAR]
+        centre = origins.mean(axis=0) if len(origins) else np.zeros(2)
+        reach = cfg.coverage_radius_m if len(origins) or not len(fixes) else 1e6
+        if len(origins):
+            reach = max(reach, float(np.linalg.norm(origins - centre, axis=1).max()))
+        prior = np.array([*centre, 0.0, 0.0, 0.0, c * cfg.clock_drift_mean])
+        sd = np.array([reach, reach, *([cfg.initial_speed_sd_mps] * 2)])
+        clock_sd = c * np.array([cfg.clock_offset_sd_s, max(cfg.clock_drift_sd, 1e-15)])
+        errors_sd = np.maximum(errors_sd, _LEAST_SD)
+        prior_var = np.concatenate([sd, np.maximum(clock_sd, 1e-6), errors_sd]) ** 2
+        prior = np.append(prior, np.zeros(errors_sd.size))
+        return Problem(Window(ages, rows, cfg.device_height_m), prior, prior_var)
+
+    def _fits(self, rows: Array, problem: Problem) -> list[Fit]:
+        """Solutions from the most promising starts, best first."""
+        scored: list[tuple[float, int, Array]] = []
+        for xy in _starts(rows, problem.prior[:2], math.sqrt(problem.prior_var[0])):
+            state = problem.prior.copy()
+            state[:2] = xy
+            state[4] = _clock_at(state, rows, self._config.device_height_m)
+            scored.append((normal_equations(state, *problem)[0], len(scored), state))
+        fits = [_solve(state, problem) for _, _, state in sorted(scored)[:_REFINED]]
+        fits = [fit for fit in fits if _is_sound(fit) and self._plausible(fit[1])]
+        return sorted(fits, key=lambda fit: fit[0])
+
+    def _plausible(self, state: Array) -> bool:
+        """Not behind an array without a back, and not on top of an RSU that measures angles only,
+        where an angle fits anything."""
+        heard = {r.info.rsu_id: r for e in self._window for r in e[2]}
+        ranged = {
+            tuple(row[ORIGIN:AXES])
+            for e in self._window
+            for row in e[1]
+            if BY_KIND[int(row[KIND])].is_range
+        }
+        for rsu in heard.values():
+            dx, dy = state[:2] - rsu.info.position[:2]
+            up = state[N_CORE : N_CORE + self._own.sd.size].sum()
+            dz = self._config.device_height_m + up - rsu.info.position[2]
+            near = dx * dx + dy * dy + dz * dz < _NEAREST_M**2
+            if not rsu.in_front(dx, dy) or (near and tuple(rsu.info.position) not in ranged):
+                return False
+        return True
+
+
+def with_heading(
+    mean: Array, cov: Array, rows: Array, height_m: float
+) -> tuple[Array, Array] | None:
+    """A fix mean (6,), cov (6, 6) that ignored the lever arms of ``rows`` (m, ROW_WIDTH), and the
+    heading they speak for: mean (7,), cov (7, 7); None where they leave it open."""
+    levers = rows[rows[:, HEADING] >= 0, LEVER:BLOCKED]
+    if not levers.any():
+        return None
+    rows = rows.copy()
+    drop_biases(rows)
+    rows[rows[:, HEADING] >= 0, HEADING] = 6
+    rows[:, GROUP] = 0
+    reach = 30.0 * float(np.hypot(levers[:, 0], levers[:, 1]).max())  # the fix tells no heading
+    prior = np.zeros((7, 7))
+    prior[:6, :6] = cov + reach**2 * np.diag([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+    prior[6, 6] = math.pi**2
+    variance, work = rows[:, VARIANCE].copy(), workspace(7, len(rows))
+    candidates = []
+    for k in range(_HEADINGS):
+        start = np.append(mean, 2.0 * math.pi * k / _HEADINGS)
+        x, P = iterate_from(start, start, prior, rows, variance, height_m, 30, work)
+        candidates.append((map_cost(x, P, rows, variance, height_m, x), k, x, P))
+    candidates.sort(key=lambda c: c[:2])
+    cost, _, x, P = candidates[0]
+    far = 5.0 * math.sqrt(P[6, 6])
+    if P[6, 6] > _HEADING_SD_MAX**2 or any(
+        c[0] < cost + _RIVAL_COST and abs(wrap(c[2][6] - x[6])) > far for c in candidates
+    ):
+        return None
+    x[6] = wrap(float(x[6]))
+    return x, P
+
+
+def _is_sound(fit: Fit) -> bool:
+    """Whether the fit is finite and its position covariance survived rounding."""
+    cost, _, cov = fit
+    return bool(math.isfinite(cost) and np.linalg.eigvalsh(cov[:2, :2])[0] > 0.0)
+
+
+def _name_states_of_fit(rows: Array, ages_s: Array, slow: SlowErrors) -> Array:
+    """Let ``rows`` (m, ROW_WIDTH) name the ``slow`` errors as states of the fit, in place: behind
+    those of the device first those that last, then the others, of every epoch its own. Their
+    sd."""
+    sd, rank = slow.sd[slow.lasts], np.cumsum(slow.lasts) - 1
+    for column in (BIAS, COMMON, REFERENCE, HEIGHT):
+        named = np.flatnonzero(rows[:, column] >= slow.first)
+        error = rows[named, column].astype(int) - slow.first
+        lasts = slow.lasts[error]
+        rows[named[lasts], column] = N_CORE + rank[error[lasts]]
+        new, error = named[~lasts], error[~lasts]
+        if new.size:
+            epochs = np.column_stack([error, ages_s[new]])
+            _, first, which = np.unique(epochs, axis=0, return_index=True, return_inverse=True)
+            rows[new, column] = N_CORE + sd.size + which.reshape(-1)
+            sd = np.append(sd, slow.sd[error[first]])
+    return sd
+
+
+def _starts(rows: Array, centre: Array, reach_m: float) -> list[Array]:
+    """Positions to start from: along measured bearings, around measured ranges, the centre of the
+    RSUs, from which a device is about ``reach_m`` away."""
+    starts, rays_m = [centre], [r * max(1.0, reach_m / _RAYS_REACH_M) for r in _RAY_M]
+    seen = set()
+    for row in rows:
+        kind = Kind(int(row[KIND]))
+        key = (kind, *row[ORIGIN:AXES])
+        if key in seen or kind is Kind.SPEED:
+            continue
+        seen.add(key)
+        origin = row[ORIGIN : ORIGIN + 2]
+        if kind in (Kind.AZIMUTH, Kind.COSINE_Y):
+            A = row[AXES : AXES + 9].reshape(3, 3)
+            angle = row[VALUE] if kind is Kind.AZIMUTH else math.asin(np.clip(row[VALUE], -1, 1))
+            ray = A.T @ np.array([math.cos(angle), math.sin(angle), 0.0])
+            starts += [origin + r * ray[:2] for r in rays_m]
+        elif kind is Kind.TDOA:
+            starts += _on_hyperbola(row, rays_m[-1])
+        elif BY_KIND[kind].is_range and not BY_KIND[kind].has_clock:
+            starts += [origin + row[VALUE] * np.array([math.cos(a), math.sin(a)]) for a in _CIRCLE]
+        elif BY_KIND[kind].is_range:
+            starts += [origin + 30.0 * np.array([math.cos(a), math.sin(a)]) for a in _CIRCLE[::3]]
+    fix = rows[rows[:, KIND] == Kind.LINEAR]
+    if len(fix) >= 2:
+        H = fix[:, ORIGIN : ORIGIN + 2]
+        starts.append(np.linalg.lstsq(H, fix[:, VALUE], rcond=None)[0])
+    return starts
+
+
+def _on_hyperbola(row: Array, farthest_m: float) -> list[Array]:
+    """Horizontal positions, nearer than ``farthest_m`` to the RSU, from which a time difference of
+    arrival would read as it does: in polar coordinates around the RSU, in the direction e,
+    r = (D^2 - v^2) / (2 (e b - v)), with the reference at b, D away, and the value v."""
+    between, value = row[AXES : AXES + 2], float(row[VALUE])
+    excess = float(between @ between) - value * value
+    found = []
+    for angle in _CIRCLE:
+        direction = np.array([math.cos(angle), math.sin(angle)])
+        slope = 2.0 * (float(direction @ between) - value)
+        if abs(slope) > 1e-9 and 0.0 < excess / slope < farthest_m:
+            found.append(row[ORIGIN : ORIGIN + 2] + excess / slope * direction)
+    return found
+
+
+def _clock_at(state: Array, rows: Array, height_m: float) -> float:
+    """Clock offset [m] that fits the TOA rows best at the position of ``state``."""
+    toa = rows[rows[:, KIND] == Kind.TOA]
+    if not len(toa):
+        return 0.0
+    d = np.column_stack([state[0] - toa[:, ORIGIN], state[1] - toa[:, ORIGIN + 1]])
+    distance = np.hypot(np.hypot(d[:, 0], d[:, 1]), height_m - toa[:, ORIGIN + 2])
+    return float(np.average(toa[:, VALUE] - distance, weights=1.0 / toa[:, VARIANCE]))

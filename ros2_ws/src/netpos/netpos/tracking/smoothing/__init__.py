@@ -1,0 +1,1 @@
+"""Every epoch given the measurements after it: ``planar`` and ``strapdown`` tracks."""
