@@ -147,8 +147,9 @@ def test_nodes_do_not_import_one_another(package: str) -> None:
         assert not others & {name.split(".")[0] for name in imports(path)}, path.name
 
 
-CORE = ("estimation/engine", "estimation/mixture/epoch", "tracking/estimates", "tracking/models")
-CORE += ("tracking/config", "tracking/smoothing", "estimation/mixture/sectors")
+CORE = ("estimation/engine", "estimation/mixture/epoch", "tracking/estimators/estimates")
+CORE += ("tracking/estimators/models", "tracking/config", "tracking/smoothing/planar")
+CORE += ("estimation/mixture/sectors",)
 
 
 @pytest.mark.parametrize("name", CORE)

@@ -16,7 +16,7 @@ from netpos.estimation.level.manoeuvre import detection_delay_s
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS, Parameter
 from netpos.estimation.state import X
-from netpos.estimation.update import conditioning, fusion, slow_errors
+from netpos.estimation.update import conditioning, fusion
 from netpos.estimation.update.conditioning import Robust, RobustOptions
 from netpos.estimation.update.predicted import PredictedRows, predict_rows
 from netpos.messages.values import Array
@@ -68,9 +68,8 @@ class StepResult(NamedTuple):
 
 class Scratch(NamedTuple):
     """Memory of ``predict_epoch`` and ``update_epoch``: of ``update.fusion.workspace``, groups
-    accepted (groups,), the prediction (n,), (n, n), the covariance (n, n) that the rows met: that
-    of the prediction with what ``open_velocity`` added; and the slow errors (2, n) of the step to
-    it."""
+    accepted (groups,), the prediction (n,), (n, n), and the covariance (n, n) that the rows met:
+    that of the prediction with what ``open_velocity`` added."""
 
     work: Array
     accepted: Array
@@ -78,7 +77,6 @@ class Scratch(NamedTuple):
     prior_cov_or_sqrt: Array
     prior_cov: Array
     met_cov: Array
-    bias: Array
 
 
 class Epochs(NamedTuple):
@@ -109,8 +107,8 @@ class Run(NamedTuple):
 @kernel
 def scratch(n: int, m: int) -> Scratch:
     """Memory for one component with ``n`` states and up to ``m`` rows."""
-    work, square, bias = fusion.workspace(n, m), np.zeros((3, n, n)), np.zeros((2, n))
-    return Scratch(work, np.zeros(m), np.zeros(n), square[0], square[1], square[2], bias)
+    work, square = fusion.workspace(n, m), np.zeros((3, n, n))
+    return Scratch(work, np.zeros(m), np.zeros(n), square[0], square[1], square[2])
 
 
 def to_cov_or_sqrt(cov: Array, options: FilterOptions) -> Array:
@@ -277,13 +275,7 @@ def predict_epoch(
     ``scratch`` keeps the prediction without that, and the rows as the component sees them
     (``update.fusion.predicted_in``).
     """
-    widened = scratch.bias[:, : bias.shape[1]]
-    if bias.shape[1] > 0:
-        choice.write_cov(options.filter, cov_or_sqrt, scratch.prior_cov)
-        slow_errors.with_linearisation(
-            mean, scratch.prior_cov, epoch.rows, options.height_m, bias, widened
-        )
-    predict(mean, cov_or_sqrt, epoch.dt_s, motion, widened, options)
+    predict(mean, cov_or_sqrt, epoch.dt_s, motion, bias, options)
     _copy(mean, cov_or_sqrt, scratch.prior_mean, scratch.prior_cov_or_sqrt)
     choice.write_cov(options.filter, cov_or_sqrt, scratch.prior_cov)
     if epoch.rejected_in_row >= options.inflate_after:

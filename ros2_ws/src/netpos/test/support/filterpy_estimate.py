@@ -11,7 +11,6 @@ from netpos.estimation import engine
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.motion import Parameter, add_velocity_step
 from netpos.estimation.update.fit import innovations_with_sd
-from netpos.estimation.update.slow_errors import with_linearisation
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimators.estimates import UpdateResult
@@ -60,16 +59,14 @@ class FilterpyEstimate:
     def step(
         self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
     ) -> UpdateResult:
-        height_m, widened = self._options.height_m, np.empty_like(bias)
-        with_linearisation(self.mean, self.cov, rows, height_m, bias, widened)
-        self.predict(stamp_ns, widened)
+        self.predict(stamp_ns, bias)
         self.prior = self.mean, self.cov
         mean, cov = self.mean.copy(), self.cov.copy()
         opened = rejected_in_row >= self._options.inflate_after
         sd = self._options.initial_speed_sd if opened else 0.0
         add_velocity_step(sd, unheard_s, 0.0, cov)
         accepted = np.zeros(int(rows[-1, GROUP]) + 1)
-        gate = self._options.gate_nis
+        gate, height_m = self._options.gate_nis, self._options.height_m
         innovations = innovations_with_sd(mean, cov, rows, height_m)
         nis, used = self._update(mean, cov, rows, height_m, gate, accepted)
         if used:

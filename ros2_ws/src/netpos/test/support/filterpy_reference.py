@@ -10,16 +10,10 @@ import numpy as np
 from filterpy import kalman
 from netpos.estimation.forms.sigma import ALPHA, BETA, kappa
 from netpos.estimation.measurement import (
-    AXES,
-    BIAS,
     GATE_VARIANCE,
     GROUP,
-    KIND,
-    ORIGIN,
-    REFERENCE,
     VALUE,
     VARIANCE,
-    Kind,
     curvature_mean,
     curvature_variance,
     is_cyclic,
@@ -95,39 +89,7 @@ def ekf_update(
     mean: Array, cov: Array, rows: Array, height_m: float, gate_nis: Array, accepted: Array
 ) -> tuple[float, int]:
     """``ekf.update`` with one iteration on FilterPy's ``ExtendedKalmanFilter``."""
-    prior = mean.copy(), cov.copy()
-    nis, used = _update(_ekf, mean, cov, rows, height_m, gate_nis, accepted)
-    if used:
-        _take_anew(prior, mean, cov, rows[accepted[rows[:, GROUP].astype(int)] == 1.0], height_m)
-    return nis, used
-
-
-def _take_anew(
-    prior: tuple[Array, Array], mean: Array, cov: Array, rows: Array, height_m: float
-) -> None:
-    """``slow_errors.follow_tangents`` of the rows used, by one matrix."""
-    parts: dict[int, Array] = {}
-    for row in rows[rows[:, KIND] != Kind.STEP_VELOCITY]:
-        if row[BIAS] >= 0.0:
-            part = row.copy()
-            part[KIND] = Kind.RANGE if row[KIND] == Kind.TDOA else row[KIND]
-            parts.setdefault(int(row[BIAS]), part)
-            if row[REFERENCE] > 0.0:
-                part = part.copy()
-                part[ORIGIN : ORIGIN + 3] += row[AXES : AXES + 3]
-                parts.setdefault(int(row[REFERENCE]), part)
-    if not parts:
-        return
-    some = np.array(list(parts.values()))
-    moments = [prior, (mean, cov)]
-    values = [_values(some, x, height_m) for x, _ in moments]
-    bends = [[curvature_mean(row, x, P, height_m) for row in some] for x, P in moments]
-    before, after = (linearise(some, x, height_m)[1] for x, _ in moments)
-    rise = _difference(some)(values[1], values[0]) + bends[1] - bends[0]
-    turn = np.eye(mean.size)
-    turn[list(parts)] += before - after
-    mean[list(parts)] += before @ (mean - prior[0]) - rise
-    cov[:] = turn @ cov @ turn.T
+    return _update(_ekf, mean, cov, rows, height_m, gate_nis, accepted)
 
 
 def _points(n: int) -> Any:

@@ -43,7 +43,6 @@ from netpos.estimation.update.iteration import (
     refine_used,
 )
 from netpos.estimation.update.predicted import predict_rows
-from netpos.estimation.update.slow_errors import follow_tangents
 from netpos.messages.values import Array
 
 if TYPE_CHECKING:
@@ -288,7 +287,6 @@ def update_predicted(
                 for b in range(mean.size):
                     cov[a, b] = work[W_COV + a, b]
             nis = _fuse_used(mean, cov, rows, work)
-    curved, wide = False, False
     if iterations > 1:
         curved, wide = is_curved(rows, mean, height_m, work), is_wide(rows, work)
         if curved or wide:
@@ -299,8 +297,6 @@ def update_predicted(
             refine_used(mean, cov, rows, height_m, work)
         if (curved or wide) and not is_definite(cov, work):
             fuse_by_factor(mean, cov, rows.shape[0], work)
-    if not (curved or wide):
-        follow_tangents(mean, cov, rows, height_m, work)
     return nis, used
 
 

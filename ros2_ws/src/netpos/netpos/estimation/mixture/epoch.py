@@ -69,7 +69,6 @@ from netpos.estimation.motion import Parameter, add_velocity_step
 from netpos.estimation.update.conditioning import Robust, RobustOptions
 from netpos.estimation.update.fusion import predicted_in, workspace
 from netpos.estimation.update.predicted import note_innovations, predict_rows
-from netpos.estimation.update.slow_errors import with_linearisation
 from netpos.messages.values import Array
 
 _MERGE_SHARE = 0.1  # of the integrity risk: what merging two components may cost
@@ -100,11 +99,8 @@ def a_component_each(mean: Array, cov: Array, dynamics: Dynamics) -> Mixture:
 
 
 @kernel
-def move(
-    components: Mixture, dt_s: float, rows: Array, dynamics: Dynamics, options: FilterOptions
-) -> Mixture:
-    """The components moved by ``dt_s`` seconds, to an epoch of ``rows`` or to none; those of
-    interacting models mix before."""
+def move(components: Mixture, dt_s: float, dynamics: Dynamics, options: FilterOptions) -> Mixture:
+    """The components moved by ``dt_s`` seconds; those of interacting models mix before."""
     means, covs = components.means.copy(), components.covs.copy()
     log_weights, models = components.log_weights, dynamics.motions.shape[0]
     if models > 1 and dt_s > 0.0:
@@ -112,12 +108,10 @@ def move(
         passing = mixing.transition_matrix(dynamics.sojourn_s, dt_s)
         mixing.mix(means, covs, weights, passing)
         log_weights = np.log(weights)
-    bias, height_m = np.empty_like(dynamics.bias), options.height_m
     for k in range(means.shape[0]):
-        with_linearisation(means[k], covs[k], rows, height_m, dynamics.bias, bias)
         cov_or_sqrt = cov_or_sqrt_of(covs[k], options)
         motion = dynamics.motions[k if models > 1 else 0]
-        predict(means[k], cov_or_sqrt, dt_s, motion, bias, options)
+        predict(means[k], cov_or_sqrt, dt_s, motion, dynamics.bias, options)
         covs[k] = cov_of(cov_or_sqrt, options)
     return Mixture(means, covs, log_weights)
 
@@ -128,7 +122,7 @@ def moved_to_epoch(
 ) -> Mixture:
     """The components moved to the epoch, the rows of which are re-weighted in place as the most
     probable component predicts them; what a blocked path may be follows in ``apply_epoch``."""
-    moved: Mixture = move(components, epoch.dt_s, epoch.rows, dynamics, options)
+    moved: Mixture = move(components, epoch.dt_s, dynamics, options)
     robust = options.robust
     if epoch.rows.shape[0] > 0 and robust.kind != Robust.NONE:
         weights = RobustOptions(robust.kind, robust.parameter, 0.0, robust.nlos_excess_m)
