@@ -520,6 +520,32 @@ def test_rows_are_reweighted_by_the_most_probable_component(name: str) -> None:
     np.testing.assert_allclose(rows[:, VARIANCE] / variance, distance / 1.5, rtol=1e-9)
 
 
+@pytest.mark.parametrize("since_s", [0.1, 60.0])
+def test_an_epoch_says_the_same_to_a_component_and_to_its_two_halves(since_s: float) -> None:
+    """With robust weights and blocked paths, also after a silence: rows are re-weighted once."""
+    config = TrackerConfig(
+        filter="ekf",
+        robust="student_t",
+        robust_parameter=4.0,
+        nlos_probability=0.2,
+        manoeuvre_speed_sd_mps=0.0,
+        gate_probability=1.0,
+    )
+    options, dynamics = options_of(config), dynamics_of(config, NO_BIAS)
+    x, P = prior((14.0, 0.0), (1.5, 1.5))
+    halves = Mixture(np.array([x, x]), np.array([P, P]), np.log(np.array([0.5, 0.5])))
+    found = []
+    for parts in (one_component(x, P), halves):
+        mean, cov = x.copy(), P.copy()
+        measured = [row(Kind.RANGE, 17.0, 0.3**2, 0), row(Kind.AZIMUTH, 0.4, 0.05**2, 1)]
+        epoch = EpochInput(since_s, since_s, 0, np.array(measured))
+        memory = epochs.memory_of(6, 2)
+        epochs.advance(mean, cov, parts, epoch, 0.0, dynamics, options, memory)
+        found.append((mean, cov, epoch.rows))
+    for one, two in zip(*found, strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-3, atol=1e-3)
+
+
 def blocked_on_grid(
     x: Array, P: Array, rows: list[Array], share: float, excess_m: float
 ) -> tuple[Array, Array]:

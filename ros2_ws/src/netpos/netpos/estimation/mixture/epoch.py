@@ -66,7 +66,7 @@ from netpos.estimation.mixture.turns import (
     may_turn,
 )
 from netpos.estimation.motion import Parameter, add_velocity_step
-from netpos.estimation.update.conditioning import Robust, RobustOptions
+from netpos.estimation.update.conditioning import Robust, by_fit, by_path
 from netpos.estimation.update.fusion import predicted_in, workspace
 from netpos.estimation.update.predicted import note_innovations, predict_rows
 from netpos.messages.values import Array
@@ -117,16 +117,20 @@ def move(components: Mixture, dt_s: float, dynamics: Dynamics, options: FilterOp
 
 
 @kernel
+def reweighted(components: Mixture, rows: Array, options: FilterOptions) -> None:
+    """Re-weight the rows of an epoch in place by how they fit the most probable component, which
+    predicts them; what a blocked path may be follows in ``apply_epoch``."""
+    if rows.shape[0] > 0 and options.robust.kind != Robust.NONE:
+        reweight_by_best(components, rows, options.height_m, by_fit(options.robust))
+
+
+@kernel
 def moved_to_epoch(
     components: Mixture, epoch: EpochInput, dynamics: Dynamics, options: FilterOptions
 ) -> Mixture:
-    """The components moved to the epoch, the rows of which are re-weighted in place as the most
-    probable component predicts them; what a blocked path may be follows in ``apply_epoch``."""
+    """The components moved to the epoch, the rows of which are ``reweighted``."""
     moved: Mixture = move(components, epoch.dt_s, dynamics, options)
-    robust = options.robust
-    if epoch.rows.shape[0] > 0 and robust.kind != Robust.NONE:
-        weights = RobustOptions(robust.kind, robust.parameter, 0.0, robust.nlos_excess_m)
-        reweight_by_best(moved, epoch.rows, options.height_m, weights)
+    reweighted(moved, epoch.rows, options)
     return moved
 
 
@@ -230,7 +234,7 @@ def apply_epoch(
         found: Update = in_turn(components, epoch, options, open_s, accepted)
         return found
     if blocked:
-        reweight_by_best(components, rows, options.height_m, options.robust)
+        reweight_by_best(components, rows, options.height_m, by_path(options.robust))
     at_once: Update = _at_once(components, epoch, at, options, open_s, accepted)
     return at_once
 
@@ -289,15 +293,15 @@ def _by_one(
     groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
     predict_epoch(x, S, epoch, motion, dynamics.bias, options, memory)
     predicted = predicted_in(memory.work, n, rows.shape[0])
-    blocked, met_cov = options.robust.nlos_probability > 0.0, memory.met_cov
-    if options.models == 1 and any_begins(x, met_cov, epoch, predicted, options):
+    if options.models == 1 and any_begins(x, memory.met_cov, epoch, predicted, options):
         return False, 0.0, 0
-    raw = rows.copy() if blocked else rows
+    changes = options.robust.kind != Robust.NONE or options.robust.nlos_probability > 0.0
+    raw = rows.copy() if changes else rows
     result = update_epoch(x, S, epoch, motion, options, memory)
     if options.manoeuvre_speed_sd > 0.0:
         refused = result.groups < groups
         if refused or may_turn(predicted.H, groups, open_s, options):
-            if blocked:
+            if changes:
                 rows[:] = raw
             return False, 0.0, 0
     return True, result.nis, result.used
@@ -377,6 +381,7 @@ def advance(
             undetected_m, open_s = _finish(x, S, components, epoch, open_s, options, memory)
             return Outcome(components, nis, used, undetected_m, 0.0, open_s)
         components = one_component(step.prior_mean, step.prior_cov)
+        reweighted(components, rows, options)
     else:
         components = moved_to_epoch(components, epoch, dynamics, options)
     if rows.shape[0] == 0:

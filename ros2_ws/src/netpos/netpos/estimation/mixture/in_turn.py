@@ -29,6 +29,7 @@ from netpos.estimation.mixture.splits.choice import (
 from netpos.estimation.mixture.splits.paths import late_row, reweight_by_best
 from netpos.estimation.mixture.turns import TURNS_MAX, add_explanations, may_turn, turned
 from netpos.estimation.sensors.row import group_end
+from netpos.estimation.update.conditioning import by_path
 from netpos.estimation.update.fusion import predicted_in, workspace
 from netpos.estimation.update.predicted import predict_rows
 from netpos.messages.values import Array
@@ -100,7 +101,7 @@ def in_turn(
     raw, nis, used, start = epoch.rows.copy(), 0.0, 0, 0
     has_turned, longest_s, may_be_blocked = 0.0, 0.0, options.robust.nlos_probability > 0.0
     if may_be_blocked:
-        reweight_by_best(components, epoch.rows, options.height_m, options.robust)
+        reweight_by_best(components, epoch.rows, options.height_m, by_path(options.robust))
     best, groups = int(np.argmax(components.log_weights)), int(raw[raw.shape[0] - 1, GROUP]) + 1
     _, H = linearise(raw, components.means[best], options.height_m)
     begins, within_s = may_turn(H, groups, open_s, options), max(open_s, epoch.unheard_s)

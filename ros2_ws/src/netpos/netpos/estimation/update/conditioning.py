@@ -7,7 +7,7 @@ import math
 from enum import IntEnum
 from typing import NamedTuple
 
-from netpos.estimation.compile import kernel, leaf
+from netpos.estimation.compile import inlined, kernel, leaf
 from netpos.estimation.measurement import BLOCKED, GATE_VARIANCE, VALUE, VARIANCE, is_range
 from netpos.estimation.sensors.row import group_end
 from netpos.estimation.update.fusion import group_nis
@@ -31,6 +31,9 @@ class Robust(IntEnum):
     STUDENT_T = 2
 
 
+_NONE = int(Robust.NONE)
+
+
 class RobustOptions(NamedTuple):
     """How rows are re-weighted: kind and parameter of the weighting, probability of a blocked path
     and its mean excess [m]."""
@@ -39,6 +42,19 @@ class RobustOptions(NamedTuple):
     parameter: float
     nlos_probability: float
     nlos_excess_m: float
+
+
+@inlined
+def by_fit(options: RobustOptions) -> RobustOptions:
+    """The options without those of blocked paths."""
+    return RobustOptions(options.kind, options.parameter, 0.0, options.nlos_excess_m)
+
+
+@inlined
+def by_path(options: RobustOptions) -> RobustOptions:
+    """The options of blocked paths alone."""
+    blocked, excess_m = options.nlos_probability, options.nlos_excess_m
+    return RobustOptions(_NONE, options.parameter, blocked, excess_m)
 
 
 @leaf

@@ -20,7 +20,7 @@ from netpos.estimation.mixture.candidates import (
 from netpos.estimation.mixture.gaussians import Mixture, fuse_value
 from netpos.estimation.mixture.reduction import PART_MERGE_COST
 from netpos.estimation.mixture.splits.split import Split
-from netpos.estimation.update.conditioning import RobustOptions, may_be_late, reweight
+from netpos.estimation.update.conditioning import RobustOptions, by_path, may_be_late, reweight
 from netpos.estimation.update.fusion import predicted_in, workspace
 from netpos.estimation.update.predicted import PredictedRows, predict_rows, predicted_rows
 from netpos.estimation.update.robust import blocked_excess, matching_cost, mixed_excess
@@ -138,7 +138,7 @@ def add(
     )
     if not several:
         read = rows.copy()
-        reweight(cov, read, predicted, options.robust)
+        reweight(cov, read, predicted, by_path(options.robust))
         apply_predicted(end, log_weight, read, options, options.gate_nis, found, work)
         if found.accepted[end, 0] == 1.0 and math.isfinite(found.log_weights[end]):
             found.log_weights[end] = likelihood + paths.either.log
