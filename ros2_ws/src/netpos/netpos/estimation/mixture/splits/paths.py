@@ -189,4 +189,4 @@ def begins(
     return bool(cost > PART_MERGE_COST)
 
 
-SPLIT = Split(name="paths", divides=divides, add=add, most=2, begins=begins)
+SPLIT = Split(divides=divides, add=add, most=2, begins=begins)

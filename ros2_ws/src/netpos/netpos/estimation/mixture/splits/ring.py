@@ -197,4 +197,4 @@ def begins(
     return bool(divides(epoch.rows[start:stop], mean, cov, options))
 
 
-SPLIT = Split(name="ring", divides=divides, add=add, most=2 * _RING_MAX + 1, begins=begins)
+SPLIT = Split(divides=divides, add=add, most=2 * _RING_MAX + 1, begins=begins)

@@ -23,7 +23,6 @@ class Split:
         for more than ``divides``: for every epoch it is part of what the one component costs.
     """
 
-    name: str
     divides: Kernel
     add: Kernel
     most: int
