@@ -47,9 +47,9 @@ def test_its_track_converges(found: dict[str, Any]) -> None:
     assert sum(ratio[-40:]) / 40 < 3.0
 
 
-def test_without_it_the_mirrored_azimuths_are_refused_and_missed(
-    found: dict[str, Any], tmp_path: Path
-) -> None:
+def test_without_it_the_mirrored_azimuths_are_lost(found: dict[str, Any], tmp_path: Path) -> None:
+    """Three in ten are refused, which the split uses."""
     copy_of_library(tmp_path)
     plain = drives(tmp_path)
-    assert sum(plain["errors"]) > 1.2 * sum(found["errors"])
+    assert plain["dof"] < 0.8 * found["dof"]
+    assert sum(plain["errors"]) > sum(found["errors"])
