@@ -537,7 +537,7 @@ def test_an_epoch_says_the_same_to_a_component_and_to_its_two_halves(since_s: fl
     found = []
     for parts in (one_component(x, P), halves):
         mean, cov = x.copy(), P.copy()
-        measured = [row(Kind.RANGE, 17.0, 0.3**2, 0), row(Kind.AZIMUTH, 0.4, 0.05**2, 1)]
+        measured = [row(Kind.AZIMUTH, 0.4, 0.05**2, 0), row(Kind.RANGE, 17.0, 0.3**2, 1)]
         epoch = EpochInput(since_s, since_s, 0, np.array(measured))
         memory = epochs.memory_of(6, 2)
         epochs.advance(mean, cov, parts, epoch, 0.0, dynamics, options, memory)
