@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import pydoc
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -180,6 +181,21 @@ def test_pages_use_public_names_and_each_is_used() -> None:
                     assert not module.startswith("netpos."), page
                     used |= {alias.name for alias in names if module == "netpos"}
     assert used == set(netpos.__all__)
+
+
+def test_modules_and_files_that_pages_name_exist() -> None:
+    """Decisions keep the names of their day."""
+    named, source = 0, ROOT / "ros2_ws/src/netpos/netpos"
+    for path in [ROOT / "README.md", *DOCS.glob("*.md"), *DOCS.glob("tutorials/*.md")]:
+        text = path.read_text(encoding="utf-8")
+        for name in re.findall(r"`(netpos(?:\.\w+)+)`", text):
+            if not name.endswith((".json", ".rviz")):
+                named += 1
+                assert pydoc.locate(name) is not None, f"{path.name}: {name}"
+        for name in re.findall(r"`((?:estimation|tracking|messages|bags)/[\w/]+\.py)`", text):
+            named += 1
+            assert (source / name).exists(), f"{path.name}: {name}"
+    assert named > 40
 
 
 def test_public_names_are_decided_and_described() -> None:
