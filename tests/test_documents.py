@@ -22,7 +22,9 @@ from netpos.tracking.door import refusals
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
-TRACKING = ROOT / "ros2_ws/src/netpos/netpos/tracking"
+LIBRARY = ROOT / "ros2_ws/src/netpos/netpos"
+TRACKING = LIBRARY / "tracking"
+PAGES = [ROOT / "README.md", *DOCS.glob("*.md"), *DOCS.glob("tutorials/*.md")]
 README_LINES = 120
 # Parameters of tracker, fusion and dead reckoning are described on another page.
 FREE = ("tracker", "fusion", "pdr")
@@ -154,7 +156,7 @@ INSIDE = {
 
 def python_of_pages() -> Iterator[tuple[str, str]]:
     """Python that a user is shown, with the name of its page."""
-    for path in [ROOT / "README.md", *DOCS.glob("*.md"), *DOCS.glob("tutorials/*.md")]:
+    for path in PAGES:
         text = path.read_text(encoding="utf-8")
         for block in re.findall(r"```python[^\n]*\n(.*?)```", text, re.DOTALL):
             if path.name not in INSIDE:
@@ -183,19 +185,16 @@ def test_pages_use_public_names_and_each_is_used() -> None:
     assert used == set(netpos.__all__)
 
 
-def test_modules_and_files_that_pages_name_exist() -> None:
+@pytest.mark.parametrize("path", [*PAGES, *DOCS.glob("results/*.md")], ids=lambda path: path.stem)
+def test_modules_and_files_that_a_page_names_exist(path: Path) -> None:
     """Decisions keep the names of their day."""
-    named, source = 0, ROOT / "ros2_ws/src/netpos/netpos"
-    for path in [ROOT / "README.md", *DOCS.glob("*.md"), *DOCS.glob("tutorials/*.md")]:
-        text = path.read_text(encoding="utf-8")
-        for name in re.findall(r"`(netpos(?:\.\w+)+)`", text):
-            if not name.endswith((".json", ".rviz")):
-                named += 1
-                assert pydoc.locate(name) is not None, f"{path.name}: {name}"
-        for name in re.findall(r"`((?:estimation|tracking|messages|bags)/[\w/]+\.py)`", text):
-            named += 1
-            assert (source / name).exists(), f"{path.name}: {name}"
-    assert named > 40
+    text = path.read_text(encoding="utf-8")
+    for name in re.findall(r"`(netpos(?:\.\w+)+)`", text):
+        if not name.endswith((".json", ".rviz")):
+            assert pydoc.locate(name) is not None, name
+    rooms = "|".join(folder.name for folder in LIBRARY.iterdir() if folder.is_dir())
+    for name in re.findall(rf"`((?:{rooms})/[\w/.]*)`", text):
+        assert (LIBRARY / name).exists(), name
 
 
 def test_public_names_are_decided_and_described() -> None:
