@@ -50,6 +50,9 @@ def normal_equations(
         h[5] += age * h[4]
         w = 1.0 / rows[i, VARIANCE]
         cost += w * residual * residual
-        b += w * residual * h
-        A += w * np.outer(h, h)
+        for a in range(n):
+            if h[a] != 0.0:  # few are not: a row names one or two of the slow errors
+                b[a] += w * residual * h[a]
+                for c in range(n):
+                    A[a, c] += w * (h[a] * h[c])
     return cost, b, A
