@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections import defaultdict
 from collections.abc import Iterator
@@ -152,6 +153,23 @@ def test_play_and_record_keep_every_byte_at_ten_times_real_time(
     inputs = payloads(tmp_path / "inputs")
     assert "/vue_1/clock_state" not in inputs
     assert inputs["/rsu/measurements"] == wanted["/rsu/measurements"]
+
+
+def test_play_waits_for_a_subscriber_that_is_behind(graph: Graph, tmp_path: Path) -> None:
+    source, copy = source_bag(tmp_path / "run"), tmp_path / "copy"
+    recorder = record(graph, copy)
+    player = graph.run("netpos_bag", "play", str(source), "--rate", "10")
+    heard = graph.collect("/rsu/measurements", RsuMeasurement)
+    heard.wait_for(100)
+    recorder.signal(signal.SIGSTOP)
+    heard.wait_for(1300)  # of 1334
+    time.sleep(8.0)
+    recorder.signal(signal.SIGCONT)
+    assert player.wait() == 0, player.describe()
+    assert recorder.interrupt() == 0
+    found = payloads(copy)
+    for topic, messages in payloads(source).items():
+        assert found[topic] == messages, topic
 
 
 @pytest.mark.parametrize("seconds", [1.3, 2.1])

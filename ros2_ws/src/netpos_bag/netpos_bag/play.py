@@ -25,6 +25,7 @@ from netpos_bag.playback import Plan
 
 _NOT_OF_THE_INPUT = (TRACKER_FACT, FUSION_FACT, "netpos_version")
 ACK_S = 5.0  # Fast DDS asks its readers every 3 s
+CATCH_UP_S = 60.0  # what a subscriber has that is behind at the end
 LINGER_S = 0.5  # latched messages stay available for so long after the end
 
 
@@ -110,12 +111,14 @@ class PlayNode(Node):
         return 0.0
 
     def finish(self) -> None:
-        """Leave when all is acknowledged."""
-        end = time.monotonic() + ACK_S
+        """Leave when all is acknowledged, which a tracker that is behind may take a while for."""
+        end = time.monotonic() + CATCH_UP_S
+        asks = Duration(seconds=0.5)  # a signal is heard in between
         for topic, outlet in self.outlets.items():
-            left = Duration(seconds=max(0.1, end - time.monotonic()))
-            if not outlet.wait_for_all_acked(left):
-                self.get_logger().warning(f"{topic}: a subscriber did not acknowledge everything")
+            while not outlet.wait_for_all_acked(asks):
+                if time.monotonic() > end:
+                    self.get_logger().warning(f"{topic}: a subscriber did not acknowledge all")
+                    break
         time.sleep(LINGER_S)
 
     def report(self) -> str:
