@@ -56,6 +56,7 @@ TESTS_OF = {
         )
     },
     "estimation/fixes/position_fix": "test_position_fix.py",
+    "estimation/update/slow_errors": "test_slow_errors.py",
     "estimation/update/robust": "test_robust.py",
     "estimation/rows": "test_measurement_rows.py test_measurement_phase.py",
     "estimation/forms/sigma": "test_ukf.py",

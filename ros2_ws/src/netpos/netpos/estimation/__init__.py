@@ -7,7 +7,7 @@ cached on disk.
                  square root, linear KF
 ``sensors``      one module per sensor and the table of all: h, H, second-order term, refusals
 ``measurement``  rows of measurements in a planar filter; ``rows`` makes them of messages
-``update``       rows into the estimate: prediction, gate, fusion, iteration
+``update``       rows into the estimate: prediction, gate, fusion, iteration, slow errors
 ``engine``       one epoch of one component; ``mixture`` of several, and the reasons to have them
 ``level``        the radius that holds the error
 ``fixes``        a position from measurements alone

@@ -16,7 +16,7 @@ from netpos.estimation.level.manoeuvre import detection_delay_s
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS, Parameter
 from netpos.estimation.state import X
-from netpos.estimation.update import conditioning, fusion
+from netpos.estimation.update import conditioning, fusion, slow_errors
 from netpos.estimation.update.conditioning import Robust, RobustOptions
 from netpos.estimation.update.predicted import PredictedRows, predict_rows
 from netpos.messages.values import Array
@@ -42,6 +42,7 @@ class FilterOptions(NamedTuple):
     integrity_risk: float  # share of errors that may exceed the protection level
     robust: RobustOptions
     models: int  # motion models that interact; 1: none
+    first_slow_error: int  # index of the state from which on the form follows slow errors
     sector_slip: float  # least probability of a sector of a phase; 0: they are no components
     learns_density: bool  # of the white acceleration (``accel_density``)
     of_form: Array  # what the form has of its own (``FilterForm.parameters``)
@@ -68,8 +69,9 @@ class StepResult(NamedTuple):
 
 class Scratch(NamedTuple):
     """Memory of ``predict_epoch`` and ``update_epoch``: of ``update.fusion.workspace``, groups
-    accepted (groups,), the prediction (n,), (n, n), and the covariance (n, n) that the rows met:
-    that of the prediction with what ``open_velocity`` added."""
+    accepted (groups,), the prediction (n,), (n, n), the covariance (n, n) that the rows met: that
+    of the prediction with what ``open_velocity`` added; and the slow errors (2, n) of the step to
+    it."""
 
     work: Array
     accepted: Array
@@ -153,6 +155,31 @@ def predict(
     0. A velocity step noted in ``motion`` is over."""
     motion[Parameter.VELOCITY_STEP_SD] = 0.0
     choice.predict(options.filter, mean, cov_or_sqrt, dt, motion, bias)
+
+
+@kernel
+def predict_to(
+    mean: Array,
+    cov_or_sqrt: Array,
+    dt: float,
+    rows: Array,
+    motion: Array,
+    bias: Array,
+    options: FilterOptions,
+) -> None:
+    """``predict`` to an epoch of ``rows`` (m, ROW_WIDTH), which say where slow errors bend
+    (``slow_errors``)."""
+    if bias.shape[1] == 0:
+        predict(mean, cov_or_sqrt, dt, motion, bias, options)
+        return
+    height_m, first = options.height_m, options.first_slow_error
+    cov, widened = cov_of(cov_or_sqrt, options), np.empty_like(bias)
+    slow_errors.with_linearisation(mean, cov, rows, height_m, bias, widened)
+    predict(mean, cov_or_sqrt, dt, motion, widened, options)
+    if mean.size > first:
+        choice.write_cov(options.filter, cov_or_sqrt, cov)
+        slow_errors.follow_prediction(mean, cov, first, rows, dt, height_m)
+        choice.write_cov_or_sqrt(options.filter, cov, cov_or_sqrt)
 
 
 @spliced
@@ -275,7 +302,7 @@ def predict_epoch(
     ``scratch`` keeps the prediction without that, and the rows as the component sees them
     (``update.fusion.predicted_in``).
     """
-    predict(mean, cov_or_sqrt, epoch.dt_s, motion, bias, options)
+    predict_to(mean, cov_or_sqrt, epoch.dt_s, epoch.rows, motion, bias, options)
     _copy(mean, cov_or_sqrt, scratch.prior_mean, scratch.prior_cov_or_sqrt)
     choice.write_cov(options.filter, cov_or_sqrt, scratch.prior_cov)
     if epoch.rejected_in_row >= options.inflate_after:

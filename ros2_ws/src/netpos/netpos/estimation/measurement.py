@@ -13,8 +13,8 @@ import math
 
 import numpy as np
 
-from netpos.estimation.compile import inlined, kernel, leaf, local_array
-from netpos.estimation.dispatch import choose, is_one_of
+from netpos.estimation.compile import inlined, kernel, leaf, link, local_array
+from netpos.estimation.dispatch import Kernel, choose, is_one_of
 from netpos.estimation.sensors.geometry import turned_lever
 from netpos.estimation.sensors.model import Wraps
 from netpos.estimation.sensors.row import (
@@ -66,10 +66,12 @@ __all__ = [
     "linearise",
     "of_offset",
     "offset_up",
+    "part_kind",
     "predict_row",
     "second_order_mean_of_offset",
     "second_order_of_offset",
     "second_order_variance",
+    "slow_error_of",
     "wrap",
 ]
 
@@ -123,6 +125,21 @@ _has_clock = is_one_of(s.kind for s in SENSORS if s.has_clock)
 _is_angle = is_one_of(s.kind for s in SENSORS if s.wraps == Wraps.ALWAYS)
 _is_cyclic = is_one_of(s.kind for s in SENSORS if s.wraps != Wraps.NEVER)
 _is_range = is_one_of(s.kind for s in SENSORS if s.is_range)
+
+
+def _always(kind: int) -> Kernel:
+    @link
+    def constant() -> int:
+        return kind
+
+    return constant  # type: ignore[no-any-return]
+
+
+part_kind = choose(
+    [(s.kind, _always(s.difference_of)) for s in SENSORS if s.difference_of >= 0], _always(-1)
+)
+"""``(kind)``: kind of the quantity of which a row is the difference between two RSUs; -1: of
+none."""
 
 
 @inlined
@@ -225,6 +242,12 @@ def predict_row(row: Array, mean: Array, height_m: float, h: Array) -> float:
             h[reference] = -1.0
             value -= mean[reference]
     return value
+
+
+@inlined
+def slow_error_of(row: Array) -> int:
+    """Index of the state that is the RSU's own slow error in the row; -1: it has none."""
+    return int(row[BIAS]) if _adds_biases(int(row[KIND])) else -1
 
 
 @inlined

@@ -118,7 +118,7 @@ def scalar_plan(fields: int, cone: bool) -> ScalarPlan:
         tuple(Kind(sensor.kind) for sensor, _ in chosen),
         attrgetter(*names) if names else None,
         np.array(sources, dtype=np.int64).reshape(-1, 3),
-        tuple(k for k, (_, reading) in enumerate(chosen) if reading.has_reference),
+        tuple(k for k, (sensor, _) in enumerate(chosen) if sensor.difference_of >= 0),
     )
 
 

@@ -11,7 +11,7 @@ import pytest
 from filterpy.kalman import IMMEstimator, KalmanFilter
 from netpos.estimation.engine import EpochInput, FilterOptions
 from netpos.estimation.forms import ekf
-from netpos.estimation.measurement import Kind
+from netpos.estimation.measurement import ROW_WIDTH, Kind
 from netpos.estimation.mixture import epoch as epochs
 from netpos.estimation.mixture import mixing
 from netpos.estimation.mixture.candidates import Update
@@ -36,6 +36,7 @@ from scipy.stats import multivariate_normal
 
 Maker = Callable[..., Array]
 OPEN = np.array([np.inf])
+NO_ROWS = np.empty((0, ROW_WIDTH))
 
 
 def options_for(models: int, gate_nis: Array = OPEN) -> FilterOptions:
@@ -62,7 +63,7 @@ def moved_and_updated(
 ) -> Mixture:
     """One step without a gate."""
     options = options_for(len(motions))
-    moved = epochs.move(before, dt, Dynamics(motions, sojourn_s, NO_BIAS), options)
+    moved = epochs.move(before, dt, NO_ROWS, Dynamics(motions, sojourn_s, NO_BIAS), options)
     return after_epoch(moved, rows, options, np.zeros(1)).components
 
 
@@ -269,7 +270,7 @@ def test_a_model_that_is_no_longer_sound_begins_anew(row: Maker) -> None:
 def test_models_do_not_mix_without_time() -> None:
     before = two_places()
     dynamics = Dynamics(np.zeros((2, 16)), np.ones(2), NO_BIAS)
-    moved = epochs.move(before, 0.0, dynamics, options_for(2))
+    moved = epochs.move(before, 0.0, NO_ROWS, dynamics, options_for(2))
     for got, want in zip(moved, before, strict=True):
         np.testing.assert_array_equal(got, want)
 

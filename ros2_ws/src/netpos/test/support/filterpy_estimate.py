@@ -11,6 +11,7 @@ from netpos.estimation import engine
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.motion import Parameter, add_velocity_step
 from netpos.estimation.update.fit import innovations_with_sd
+from netpos.estimation.update.slow_errors import with_linearisation
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimators.estimates import UpdateResult
@@ -59,16 +60,24 @@ class FilterpyEstimate:
     def step(
         self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
     ) -> UpdateResult:
-        self.predict(stamp_ns, bias)
+        height_m, widened = self._options.height_m, np.empty_like(bias)
+        with_linearisation(self.mean, self.cov, rows, height_m, bias, widened)
+        dt, first = (stamp_ns - self.stamp_ns) * 1e-9, self._options.first_slow_error
+        self.predict(stamp_ns, widened)
+        if dt > 0.0 and self.mean.size > first:
+            reference.follow_prediction(self.mean, self.cov, first, rows, dt, height_m)
         self.prior = self.mean, self.cov
         mean, cov = self.mean.copy(), self.cov.copy()
         opened = rejected_in_row >= self._options.inflate_after
         sd = self._options.initial_speed_sd if opened else 0.0
         add_velocity_step(sd, unheard_s, 0.0, cov)
         accepted = np.zeros(int(rows[-1, GROUP]) + 1)
-        gate, height_m = self._options.gate_nis, self._options.height_m
+        gate = self._options.gate_nis
         innovations = innovations_with_sd(mean, cov, rows, height_m)
         nis, used = self._update(mean, cov, rows, height_m, gate, accepted)
+        if used and self._update is reference.ekf_update and mean.size > first:
+            passed = rows[accepted[rows[:, GROUP].astype(int)] == 1.0]
+            reference.follow_tangents(self.prior[0], mean, cov, first, passed, height_m)
         if used:
             self.mean, self.cov = mean, cov
             engine.set_velocity_step_noise(self.motion, sd, unheard_s, 0.0, 0.0)

@@ -10,10 +10,17 @@ import numpy as np
 from filterpy import kalman
 from netpos.estimation.forms.sigma import ALPHA, BETA, kappa
 from netpos.estimation.measurement import (
+    AXES,
+    BIAS,
+    COMMON,
     GATE_VARIANCE,
     GROUP,
+    KIND,
+    ORIGIN,
+    REFERENCE,
     VALUE,
     VARIANCE,
+    Kind,
     curvature_mean,
     curvature_variance,
     is_cyclic,
@@ -90,6 +97,43 @@ def ekf_update(
 ) -> tuple[float, int]:
     """``ekf.update`` with one iteration on FilterPy's ``ExtendedKalmanFilter``."""
     return _update(_ekf, mean, cov, rows, height_m, gate_nis, accepted)
+
+
+def follow_tangents(
+    before: Array, mean: Array, cov: Array, first: int, rows: Array, height_m: float
+) -> None:
+    """``slow_errors.follow_tangents`` of ``rows``, by one matrix."""
+    parts: dict[int, Array] = {}
+    for row in rows[rows[:, KIND] != Kind.STEP_VELOCITY]:
+        if row[BIAS] >= 0.0:
+            part = row.copy()
+            if row[KIND] == Kind.TDOA:
+                part[[KIND, COMMON, REFERENCE]] = Kind.RANGE, -1.0, 0.0
+            parts[int(row[BIAS])] = part
+            if row[REFERENCE] > 0.0:
+                part = part.copy()
+                part[ORIGIN : ORIGIN + 3] += row[AXES : AXES + 3]
+                part[BIAS] = row[REFERENCE]
+                parts[int(row[REFERENCE])] = part
+    if not parts:
+        return
+    explained = cov[:, first:] @ np.linalg.inv(cov[first:, first:])
+    turn = np.eye(mean.size)
+    for error, part in parts.items():
+        old, new = (linearise(part[None], x, height_m)[1][0] for x in (before, mean))
+        if old @ explained @ cov[first:, first:] @ explained.T @ old < cov[error, error]:
+            turn[error, first:] += (old - new)[:first] @ explained[:first]
+    cov[:] = turn @ cov @ turn.T
+
+
+def follow_prediction(
+    mean: Array, cov: Array, first: int, rows: Array, dt: float, height_m: float
+) -> None:
+    """``slow_errors.follow_prediction``."""
+    unknown, known = np.trace(cov[2:4, 2:4]), float(mean[2:4] @ mean[2:4])
+    before = mean.copy()
+    before[:2] -= unknown / (unknown + known) * dt * mean[2:4]
+    follow_tangents(before, mean, cov, first, rows, height_m)
 
 
 def _points(n: int) -> Any:

@@ -71,6 +71,7 @@ def test_options_hold_what_the_parameters_say() -> None:
         coast_after_s=0.7,
         robust=RobustOptions(ROBUST.index("student_t"), 5.5, 0.1, 33.0),
         models=1,
+        first_slow_error=options.first_slow_error,
         sector_slip=1e-6,
         learns_density=True,
         of_form=options.of_form,
@@ -94,6 +95,23 @@ def test_options_have_one_signature_whatever_the_user_writes() -> None:
     kinds = [[type(value) for value in o] for o in map(options_of, (whole, TrackerConfig()))]
     assert kinds[0] == kinds[1]
     assert [type(v) for v in options_of(whole).robust] == [int, float, float, float]
+
+
+@pytest.mark.parametrize(
+    ("parameters", "states"),
+    [
+        ({"filter": "ekf"}, 6),
+        ({"filter": "iekf", "motion_model": "constant_acceleration"}, 8),
+        ({"filter": "ekf", "device_height_sd_m": 2.0}, 7),
+    ],
+)
+def test_extended_forms_follow_slow_errors(parameters: dict[str, Any], states: int) -> None:
+    assert options_of(TrackerConfig(**parameters)).first_slow_error == states
+
+
+@pytest.mark.parametrize("form", ["ukf", "srukf", "kf"])
+def test_other_forms_do_not_follow_slow_errors(form: str) -> None:
+    assert options_of(TrackerConfig(filter=form)).first_slow_error > 1_000_000
 
 
 @pytest.mark.parametrize("probability", [0.5, 0.95, 0.9999])

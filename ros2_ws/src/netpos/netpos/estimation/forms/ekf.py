@@ -43,6 +43,7 @@ from netpos.estimation.update.iteration import (
     refine_used,
 )
 from netpos.estimation.update.predicted import predict_rows
+from netpos.estimation.update.slow_errors import follow_tangents
 from netpos.messages.values import Array
 
 if TYPE_CHECKING:
@@ -258,7 +259,9 @@ def update(
     Returns the NIS of the accepted rows together and their number.
     """
     predict_rows(mean, cov, rows, height_m, predicted_in(work, mean.size, rows.shape[0]))
-    nis, used = update_predicted(mean, cov, rows, height_m, gate_nis, iterations, accepted, work)
+    nis, used, _ = update_predicted(
+        mean, cov, rows, height_m, gate_nis, iterations, accepted, work
+    )
     return nis, used
 
 
@@ -272,11 +275,12 @@ def update_predicted(
     iterations: int,
     accepted: Array,
     work: Array,
-) -> tuple[float, int]:
-    """``update`` with rows that are predicted in the workspace already."""
+) -> tuple[float, int, bool]:
+    """``update`` with rows that are predicted in the workspace already; also whether it linearised
+    them there only."""
     used = gate(mean, cov, rows, height_m, gate_nis, iterations, accepted, work)
     if used == 0:
-        return 0.0, 0
+        return 0.0, 0, False
     nis = _fuse_used(mean, cov, rows, work)
     if used < gate_nis.size and nis > gate_nis[used]:
         dropped = _odd_one_out(rows, mean.size, gate_nis, accepted, work)
@@ -287,6 +291,7 @@ def update_predicted(
                 for b in range(mean.size):
                     cov[a, b] = work[W_COV + a, b]
             nis = _fuse_used(mean, cov, rows, work)
+    curved, wide = False, False
     if iterations > 1:
         curved, wide = is_curved(rows, mean, height_m, work), is_wide(rows, work)
         if curved or wide:
@@ -297,7 +302,7 @@ def update_predicted(
             refine_used(mean, cov, rows, height_m, work)
         if (curved or wide) and not is_definite(cov, work):
             fuse_by_factor(mean, cov, rows.shape[0], work)
-    return nis, used
+    return nis, used, not (curved or wide)
 
 
 @leaf
@@ -360,7 +365,13 @@ def _update_form(
     work: Array,
 ) -> tuple[float, int]:
     height_m, iterations = options.height_m, options.iterations
-    nis, used = update_predicted(mean, cov, rows, height_m, gate_nis, iterations, accepted, work)
+    nis, used, at_prior = update_predicted(
+        mean, cov, rows, height_m, gate_nis, iterations, accepted, work
+    )
+    if at_prior and mean.size > options.first_slow_error:
+        used_rows, before = work[W_USE, : rows.shape[0]], work[W_PRIOR, : mean.size]
+        first = options.first_slow_error
+        follow_tangents(mean, cov, first, rows, used_rows, before, height_m)
     return nis, used
 
 

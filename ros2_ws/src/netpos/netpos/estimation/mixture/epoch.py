@@ -22,6 +22,7 @@ from netpos.estimation.engine import (
     is_sound,
     predict,
     predict_epoch,
+    predict_to,
     scratch,
     set_velocity_step_noise,
     update_epoch,
@@ -99,8 +100,11 @@ def a_component_each(mean: Array, cov: Array, dynamics: Dynamics) -> Mixture:
 
 
 @kernel
-def move(components: Mixture, dt_s: float, dynamics: Dynamics, options: FilterOptions) -> Mixture:
-    """The components moved by ``dt_s`` seconds; those of interacting models mix before."""
+def move(
+    components: Mixture, dt_s: float, rows: Array, dynamics: Dynamics, options: FilterOptions
+) -> Mixture:
+    """The components moved by ``dt_s`` seconds, to an epoch of ``rows`` or to none; those of
+    interacting models mix before."""
     means, covs = components.means.copy(), components.covs.copy()
     log_weights, models = components.log_weights, dynamics.motions.shape[0]
     if models > 1 and dt_s > 0.0:
@@ -111,7 +115,7 @@ def move(components: Mixture, dt_s: float, dynamics: Dynamics, options: FilterOp
     for k in range(means.shape[0]):
         cov_or_sqrt = cov_or_sqrt_of(covs[k], options)
         motion = dynamics.motions[k if models > 1 else 0]
-        predict(means[k], cov_or_sqrt, dt_s, motion, dynamics.bias, options)
+        predict_to(means[k], cov_or_sqrt, dt_s, rows, motion, dynamics.bias, options)
         covs[k] = cov_of(cov_or_sqrt, options)
     return Mixture(means, covs, log_weights)
 
@@ -129,7 +133,7 @@ def moved_to_epoch(
     components: Mixture, epoch: EpochInput, dynamics: Dynamics, options: FilterOptions
 ) -> Mixture:
     """The components moved to the epoch, the rows of which are ``reweighted``."""
-    moved: Mixture = move(components, epoch.dt_s, dynamics, options)
+    moved: Mixture = move(components, epoch.dt_s, epoch.rows, dynamics, options)
     reweighted(moved, epoch.rows, options)
     return moved
 

@@ -49,9 +49,6 @@ class Reading:
     """(value, variance) of the message, after ``scale``, to those of the row; None: the same."""
     from_master: bool = False
     """The RSU's position in the row is that of its master antenna."""
-    has_reference: bool = False
-    """It compares the RSU with a second one, ``reference_rsu_id``; where that is from the first is
-    in the first three of AXES."""
     along_array: bool = False
     """The first axis in the row is that of the two antennas, in radians (``rows.rsu_place``)."""
     refusals: tuple[Refusal, ...] = ()
@@ -120,6 +117,10 @@ class Sensor:
     adds_biases: bool = True
     """The states BIAS and COMMON of the row are added to the value, and REFERENCE is subtracted;
     False: the model uses them."""
+    difference_of: int = -1
+    """Kind of the quantity that it compares between the RSU and a second one,
+    ``reference_rsu_id``; where that is from the first is in the first three of AXES. -1: it
+    compares none."""
     is_range: bool = False
     """A distance, so that a blocked path makes it late and one epoch leaves a ring."""
     in_strapdown: bool = False

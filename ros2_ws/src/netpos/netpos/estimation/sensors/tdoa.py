@@ -10,6 +10,7 @@ from __future__ import annotations
 from netpos.estimation.compile import inlined
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.estimation.sensors.model import Reading, Sensor
+from netpos.estimation.sensors.range import SENSOR as RANGE
 from netpos.estimation.sensors.range import bend, distance
 from netpos.estimation.sensors.row import AXES
 from netpos.messages.values import Array, Field
@@ -64,6 +65,7 @@ SENSOR = Sensor(
     of_offset=difference,
     second_order=exact,
     second_order_mean=bends,
+    difference_of=RANGE.kind,
     in_strapdown=True,
     bias_sd="range_bias_sd_m",
     reading=Reading(
@@ -74,7 +76,6 @@ SENSOR = Sensor(
         unit="s",
         scale=SPEED_OF_LIGHT_MPS,
         from_master=True,
-        has_reference=True,
         simulated="toa",
     ),
 )

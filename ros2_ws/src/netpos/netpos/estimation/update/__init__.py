@@ -5,4 +5,5 @@
 ``gate``         acceptance by group
 ``fusion``       row by row into mean and covariance
 ``iteration``, ``fit``, ``bearing``  again where the model bends
+``slow_errors``  what an RSU errs by for long, where the model bends
 """

@@ -27,6 +27,7 @@ from netpos.estimation.update.fusion import (
     W_VARIANCE,
     fuse,
 )
+from netpos.estimation.update.slow_errors import has_been_heard
 from netpos.messages.values import Array
 
 # Iterating ends where the model is straight over the last step to this share of a row's noise sd.
@@ -105,12 +106,13 @@ def iterate_from(
 
 @leaf
 def is_curved(rows: Array, mean: Array, height_m: float, work: Array) -> bool:
-    """Whether a row used in the update leaves its tangent at the prior by more than a small share
-    of its noise when evaluated at the posterior ``mean`` (n,)."""
+    """Whether a row used in the update, whose slow error has not been heard before, leaves its
+    tangent at the prior by more than a small share of its noise when evaluated at the posterior
+    ``mean`` (n,)."""
     n = mean.size
     h = work[W_PH]
     for i in range(rows.shape[0]):
-        if work[W_USE, i] == 0.0:
+        if work[W_USE, i] == 0.0 or has_been_heard(rows, i, work):
             continue
         tangent = work[W_INNOVATION, i]
         for a in range(n):
@@ -141,9 +143,11 @@ def iterate_used(
 
 @leaf
 def is_wide(rows: Array, work: Array) -> bool:
-    """Whether the curvature under the prior adds much to the variance of a row used."""
+    """Whether the curvature under the prior adds much to the variance of a row used, whose slow
+    error has not been heard before."""
     for i in range(rows.shape[0]):
-        if work[W_USE, i] == 1.0 and work[W_VARIANCE, i] > _WIDE * rows[i, VARIANCE]:
+        wide = work[W_VARIANCE, i] > _WIDE * rows[i, VARIANCE]
+        if wide and work[W_USE, i] == 1.0 and not has_been_heard(rows, i, work):
             return True
     return False
 

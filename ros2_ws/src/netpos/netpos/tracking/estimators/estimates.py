@@ -20,13 +20,12 @@ from netpos.estimation.accel_density import (
 from netpos.estimation.engine import EpochInput
 from netpos.estimation.forms.table import form_of
 from netpos.estimation.level.protection import mixture_radius
-from netpos.estimation.measurement import GROUP
+from netpos.estimation.measurement import GROUP, ROW_WIDTH
 from netpos.estimation.mixture import epoch as mixtures
 from netpos.estimation.mixture.epoch import Dynamics, Memory, Outcome
 from netpos.estimation.mixture.gaussians import (
     LEAST_DENSITY_LOG,
     Mixture,
-    fuse_value,
     log_densities,
     mode_of,
     moments,
@@ -46,6 +45,7 @@ from netpos.tracking.estimators.models import (
     start_state,
 )
 
+_NO_ROWS = np.empty((0, ROW_WIDTH))
 _FARTHEST_BEHIND_SD = 5.0  # one Gaussian error in three million
 
 
@@ -237,19 +237,15 @@ class Estimate:
 
     def change_prior(self, index: int, before: float, after: float) -> None:
         """Take the state ``index``, whose prior had mean 0 and sd ``before``, for one of sd
-        ``after``: a measurement of 0 with the information gained, or noise of the variance gained.
-        Nothing happens to several components."""
-        if self._components is not None:
+        ``after`` (``with_prior``)."""
+        if before == after:
             return
-        cov, gained = self.cov.copy(), after * after - before * before
-        if gained >= 0.0:
-            cov[index, index] += gained
-        else:
-            h = np.zeros(self.mean.size)
-            h[index] = 1.0
-            variance = after * after * before * before / -gained
-            fuse_value(self.mean, cov, h, -self.mean[index], variance)
-        self._cov_or_sqrt = engine.to_cov_or_sqrt(cov, self._options)
+        changed = with_prior(self.components, index, before, after)
+        if self._components is not None:
+            self._set(changed)
+            return
+        self.mean = changed.means[0]
+        self._cov_or_sqrt = engine.to_cov_or_sqrt(changed.covs[0], self._options)
 
     def keep_in_front(self, origin: Array, front: Array) -> None:
         """Where the mean is behind the line through ``origin`` (2,) m with ``front`` (2,), of unit
@@ -272,7 +268,8 @@ class Estimate:
         if self._components is None:
             engine.predict(self.mean, self._cov_or_sqrt, dt, self.motion, bias, self._options)
         elif dt > 0.0:
-            self._set(mixtures.move(self._components, dt, self._with(bias), self._options))
+            dynamics = self._with(bias)
+            self._set(mixtures.move(self._components, dt, _NO_ROWS, dynamics, self._options))
 
     def step(
         self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
@@ -327,6 +324,32 @@ def _augmented(mixture: Mixture, sd: Array) -> Mixture:
     pairs = [augmented(m, c, sd) for m, c in zip(mixture.means, mixture.covs, strict=True)]
     means, covs = np.array([mean for mean, _ in pairs]), np.array([cov for _, cov in pairs])
     return Mixture(means, covs, mixture.log_weights)
+
+
+def with_prior(mixture: Mixture, index: int, before: float, after: float) -> Mixture:
+    """A mixture in which the state ``index``, whose prior had mean 0 and sd ``before``, has one of
+    sd ``after``, both > 0.
+
+    Narrower, the one prior is divided out of each component and the other multiplied in, which is
+    exact while the state stays. Wider, the state gets noise up to the variance that this leaves
+    it: little where it is known, all where nothing is. To move it to where it would then be is not
+    stable: what the process has forgotten counts as news. A state that is known no better than its
+    prior keeps its share of it.
+    """
+    means, covs, log_weights = (array.copy() for array in mixture)
+    for k in range(log_weights.size):
+        P, m = covs[k, :, index].copy(), means[k, index]
+        taken = min(1.0, before * before / P[index]) * (before**-2 - after**-2)
+        left = 1.0 - taken * P[index]
+        if taken > 0.0:
+            covs[k, index, index] /= left
+            continue
+        gain = taken / left
+        means[k] += gain * m * P
+        covs[k] += gain * np.outer(P, P)
+        log_weights[k] += 0.5 * (gain * m * m - math.log(left))
+    log_weights -= np.logaddexp.reduce(log_weights)
+    return Mixture(means, covs, log_weights)
 
 
 def cut_off_behind(mean: Array, cov: Array, origin: Array, front: Array) -> float:

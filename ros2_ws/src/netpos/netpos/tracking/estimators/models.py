@@ -18,6 +18,8 @@ from netpos.tracking.config import ROBUST, TrackerConfig
 from netpos.tracking.rsus.learning import LearnedErrors
 from netpos.tracking.rsus.rsu import BiasStates, SlowErrors
 
+_FOLLOWS_NONE = 2**31 - 1  # more states than there are
+
 
 def gate_thresholds(probability: float) -> Array:
     """Largest accepted squared Mahalanobis distance for 0, 1, ... degrees of freedom (chi-square
@@ -41,6 +43,7 @@ def options_of(config: TrackerConfig) -> FilterOptions:
         integrity_risk=float(config.integrity_risk),
         robust=robust_options_of(config),
         models=max(len(config.motion_models), 1),
+        first_slow_error=first_slow_error(config) if form.is_extended else _FOLLOWS_NONE,
         sector_slip=float(config.sector_slip_probability) if by_sectors(config) else 0.0,
         learns_density=config.learns_density,
         of_form=np.array([float(getattr(config, name)) for name in form.parameters]),
@@ -116,6 +119,12 @@ def initial_extra_sd(config: TrackerConfig) -> Array:
     """Standard deviations of the motion models' own states at the first fix; their means are 0."""
     sds = [model.initial_sd(config) for model in config.motion_models]
     return np.array(max(sds, key=len, default=()), dtype=float)
+
+
+def first_slow_error(config: TrackerConfig) -> int:
+    """Index of the first slow error of a planar state, behind those of the motion models and the
+    height."""
+    return N_CORE + initial_extra_sd(config).size + int(config.device_height_sd_m > 0.0)
 
 
 def height_state(config: TrackerConfig) -> HeightState:

@@ -28,7 +28,7 @@ from netpos.tracking.rest import rests
 from netpos.tracking.rsus.learning import WINDOW_S, ErrorModel, LearnedErrors, Name
 
 _RSU = "rsu/"
-REFERENCED = sum(int(r.field) for _, r in readings() if r.has_reference)
+REFERENCED = sum(int(r.field) for s, r in readings() if s.difference_of >= 0)
 """Fields that compare the RSU with a second one."""
 _RENEWED_S = 1e-6  # correlation time of what is new at every epoch
 _SLOW = {name for s in SENSORS for name in (s.bias_sd, s.common_bias_sd) if name is not None}
@@ -98,8 +98,7 @@ class StepErrors:
 
 def is_difference(kind: Kind) -> bool:
     """Whether a row of a kind compares an RSU with a second one, the reference."""
-    reading = BY_KIND[kind].reading
-    return reading is not None and reading.has_reference
+    return BY_KIND[kind].difference_of >= 0
 
 
 def _name(m: RsuMeasurement, kind: Kind) -> Name:
