@@ -71,7 +71,7 @@ def test_options_hold_what_the_parameters_say() -> None:
         coast_after_s=0.7,
         robust=RobustOptions(ROBUST.index("student_t"), 5.5, 0.1, 33.0),
         models=1,
-        first_slow_error=options.first_slow_error,
+        first_slow_error=2**31 - 1,
         sector_slip=1e-6,
         learns_density=True,
         of_form=options.of_form,

@@ -124,7 +124,8 @@ def initial_extra_sd(config: TrackerConfig) -> Array:
 def first_slow_error(config: TrackerConfig) -> int:
     """Index of the first slow error of a planar state, behind those of the motion models and the
     height."""
-    return N_CORE + initial_extra_sd(config).size + int(config.device_height_sd_m > 0.0)
+    others = slow_states(config)
+    return others.first + len(others.sd)
 
 
 def height_state(config: TrackerConfig) -> HeightState:
