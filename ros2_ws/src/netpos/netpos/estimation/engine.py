@@ -69,9 +69,8 @@ class StepResult(NamedTuple):
 
 class Scratch(NamedTuple):
     """Memory of ``predict_epoch`` and ``update_epoch``: of ``update.fusion.workspace``, groups
-    accepted (groups,), the prediction (n,), (n, n), the covariance (n, n) that the rows met: that
-    of the prediction with what ``open_velocity`` added; and the slow errors (2, n) of the step to
-    it."""
+    accepted (groups,), the prediction (n,), (n, n), and the covariance (n, n) that the rows met:
+    that of the prediction with what ``open_velocity`` added."""
 
     work: Array
     accepted: Array
