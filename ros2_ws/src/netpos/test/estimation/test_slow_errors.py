@@ -8,6 +8,7 @@ from ekf_update import updated
 from filter_rows import NO_GATE, row
 from netpos.estimation.measurement import (
     AXES,
+    BIAS,
     REFERENCE,
     VALUE,
     Kind,
@@ -115,6 +116,17 @@ def test_motion_that_no_slow_error_explains_leaves_them_as_they_are() -> None:
     np.testing.assert_allclose(followed(mean, cov, rows, after), cov, atol=1e-15)
 
 
+def test_rows_that_are_not_used_or_have_no_slow_error_turn_nothing() -> None:
+    mean, cov = tied(Kind.RANGE)
+    rows = rows_of(Kind.RANGE, np.random.default_rng(4), np.zeros(4))
+    after, used = mean + MOVED, np.array([1.0, 0.0, 1.0, 1.0])
+    rows[3, BIAS] = -1.0
+    turned = cov.copy()
+    follow_tangents(after, turned, 6, rows, used, mean, 1.0)
+    np.testing.assert_allclose(turned, followed(mean, cov, rows[[0, 2]], after), rtol=1e-12)
+    np.testing.assert_array_equal(turned[[7, 9], :6], cov[[7, 9], :6])
+
+
 def test_slow_error_that_has_not_been_heard_stays_as_it_is() -> None:
     mean, cov = prior(Kind.RANGE)
     rng = np.random.default_rng(3)
@@ -132,11 +144,12 @@ def test_way_is_real_as_far_as_the_velocity_is_known(speed: float, share: float)
     scale = np.ones(10)
     scale[2:4] = np.sqrt(0.125 / np.diag(cov)[2:4])
     cov *= np.outer(scale, scale)
-    mean[2:4] = speed, 0.0
+    velocity = speed * np.array([0.6, -0.8])
+    mean[2:4] = velocity
     rows, turned = rows_of(Kind.RANGE, np.random.default_rng(4), np.zeros(4)), cov.copy()
     follow_prediction(mean, turned, 6, rows, 2.0, 1.0)
     before = mean.copy()
-    before[0] -= share * 2.0 * speed
+    before[:2] -= share * 2.0 * velocity
     atol = 1e-9 if speed < 1.0 else 1e-3
     np.testing.assert_allclose(turned, followed(before, cov, rows, mean), rtol=0, atol=atol)
     assert share in (0.0, 1.0) or np.abs(turned - cov).max() > 1e-2
