@@ -166,18 +166,13 @@ def predict_to(
     bias: Array,
     options: FilterOptions,
 ) -> None:
-    """``predict`` to an epoch of ``rows`` (m, ROW_WIDTH), which say where slow errors bend
+    """``predict`` to an epoch of ``rows`` (m, ROW_WIDTH), whose tangents slow errors follow
     (``slow_errors``)."""
-    if bias.shape[1] == 0:
-        predict(mean, cov_or_sqrt, dt, motion, bias, options)
-        return
-    height_m, first = options.height_m, options.first_slow_error
-    cov, widened = cov_of(cov_or_sqrt, options), np.empty_like(bias)
-    slow_errors.with_linearisation(mean, cov, rows, height_m, bias, widened)
-    predict(mean, cov_or_sqrt, dt, motion, widened, options)
+    predict(mean, cov_or_sqrt, dt, motion, bias, options)
+    first = options.first_slow_error
     if mean.size > first:
-        choice.write_cov(options.filter, cov_or_sqrt, cov)
-        slow_errors.follow_prediction(mean, cov, first, rows, dt, height_m)
+        cov = cov_of(cov_or_sqrt, options)
+        slow_errors.follow_prediction(mean, cov, first, rows, dt, options.height_m)
         choice.write_cov_or_sqrt(options.filter, cov, cov_or_sqrt)
 
 

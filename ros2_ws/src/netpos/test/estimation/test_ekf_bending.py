@@ -13,6 +13,7 @@ from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import (
     GATE_VARIANCE,
     GROUP,
+    REPEATED,
     VALUE,
     VARIANCE,
     Kind,
@@ -91,6 +92,22 @@ def test_update_adds_the_curvature_to_both_variances() -> None:
     np.testing.assert_allclose(x, expected[0], rtol=1e-7)
     np.testing.assert_allclose(P, expected[1], rtol=1e-7, atol=1e-9)
     S = float((H @ cov @ H.T)[0, 0]) + variance
+    assert nis == pytest.approx(innovation[0] ** 2 / S, rel=1e-6)
+
+
+@pytest.mark.parametrize("more", [0.0, 3.0, 36.0])
+def test_what_linearising_leaves_out_of_repeated_values_averages_as_one(more: float) -> None:
+    """As if the curvature came in ``more`` values more: in the update, not in the gate."""
+    mean, cov, rows = curved_group()
+    rows[:, REPEATED] = more
+    x, P, _, nis, _ = updated(mean, cov, rows, 0.0, NO_GATE, 1)
+    curvature = 400.0**2 / 2 / 30.0**2
+    innovation, H = linearise(rows, mean, 0.0)
+    innovation -= 400.0 / 2 / 30.0
+    expected = fused(mean, cov, innovation, H, np.array([0.01 + (1.0 + more) * curvature]))
+    np.testing.assert_allclose(x, expected[0], rtol=1e-7)
+    np.testing.assert_allclose(P, expected[1], rtol=1e-7, atol=1e-9)
+    S = float((H @ cov @ H.T)[0, 0]) + 0.01 + curvature
     assert nis == pytest.approx(innovation[0] ** 2 / S, rel=1e-6)
 
 

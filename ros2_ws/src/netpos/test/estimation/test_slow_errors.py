@@ -12,15 +12,12 @@ from netpos.estimation.measurement import (
     REFERENCE,
     VALUE,
     Kind,
-    curvature_variance,
     linearise,
     wrap,
 )
 from netpos.estimation.update.slow_errors import (
-    LASTS_S,
     follow_prediction,
     follow_tangents,
-    with_linearisation,
 )
 from netpos.messages.values import Array
 
@@ -169,18 +166,3 @@ def test_second_value_of_a_device_at_rest_does_not_iterate() -> None:
     again = updated(mean, cov, rows, 1.0, NO_GATE, 8)
     np.testing.assert_array_equal(once[0], again[0])
     np.testing.assert_array_equal(once[1], again[1])
-
-
-def test_what_linearising_leaves_out_is_a_second_process() -> None:
-    """Their sum has the variance of both, and gains as much of it in a moment as both together."""
-    rng = np.random.default_rng(6)
-    mean, cov = prior(Kind.RANGE)
-    rows = rows_of(Kind.RANGE, rng, np.zeros(4))[[0, 2]]
-    bias = np.array([[0.7, 0.7, 0.2, 0.2], [50.0, 3.0, 50.0, 1e6]])
-    widened = np.full_like(bias, np.nan)
-    with_linearisation(mean, cov, rows, 1.0, bias, widened)
-    bent = [curvature_variance(r, mean, cov, 1.0) for r in rows]
-    variance = bias[0] ** 2 + [bent[0], 0.0, bent[1], 0.0]
-    renewed = bias[0] ** 2 / bias[1] + np.array([bent[0], 0.0, bent[1], 0.0]) / LASTS_S
-    np.testing.assert_allclose(widened[0] ** 2, variance, rtol=1e-12)
-    np.testing.assert_allclose(widened[0] ** 2 / widened[1], renewed, rtol=1e-12)

@@ -11,7 +11,6 @@ from netpos.estimation import engine
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.motion import Parameter, add_velocity_step
 from netpos.estimation.update.fit import innovations_with_sd
-from netpos.estimation.update.slow_errors import with_linearisation
 from netpos.messages.values import Array, TrackMode
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimators.estimates import UpdateResult
@@ -60,10 +59,9 @@ class FilterpyEstimate:
     def step(
         self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
     ) -> UpdateResult:
-        height_m, widened = self._options.height_m, np.empty_like(bias)
-        with_linearisation(self.mean, self.cov, rows, height_m, bias, widened)
-        dt, first = (stamp_ns - self.stamp_ns) * 1e-9, self._options.first_slow_error
-        self.predict(stamp_ns, widened)
+        height_m, first = self._options.height_m, self._options.first_slow_error
+        dt = (stamp_ns - self.stamp_ns) * 1e-9
+        self.predict(stamp_ns, bias)
         if dt > 0.0 and self.mean.size > first:
             reference.follow_prediction(self.mean, self.cov, first, rows, dt, height_m)
         self.prior = self.mean, self.cov

@@ -18,6 +18,7 @@ from netpos.estimation.measurement import (
     KIND,
     ORIGIN,
     REFERENCE,
+    REPEATED,
     VALUE,
     VARIANCE,
     Kind,
@@ -31,8 +32,8 @@ from netpos.estimation.measurement import (
 from netpos.estimation.motion import noise, propagate, transition
 from netpos.messages.values import Array
 
-# A FilterPy filter holding mean, cov after fusing rows with given variances.
-_Update = Callable[[Array, Array, Array, Array, float], Any]
+# A FilterPy filter holding mean, cov after fusing rows with the variances of a column.
+_Update = Callable[[Array, Array, Array, int, float], Any]
 
 
 def _noise(mean: Array, dt: float, motion: Array, bias: Array) -> Array:
@@ -77,16 +78,17 @@ def ekf_predict(mean: Array, cov: Array, dt: float, motion: Array, bias: Array) 
     mean[:], cov[:] = moved, reference.P
 
 
-def _ekf(mean: Array, cov: Array, rows: Array, variance: Array, height_m: float) -> Any:
+def _ekf(mean: Array, cov: Array, rows: Array, column: int, height_m: float) -> Any:
     reference = kalman.ExtendedKalmanFilter(dim_x=mean.size, dim_z=len(rows))
     reference.x, reference.P = mean.copy(), cov.copy()
     curvature = [curvature_variance(row, mean, cov, height_m) for row in rows]
+    values = 1.0 + rows[:, REPEATED] * (column == VARIANCE)
     bend = np.array([curvature_mean(row, mean, cov, height_m) for row in rows])
     reference.update(
         rows[:, VALUE] - bend,
         lambda x: linearise(rows, x, height_m)[1],
         lambda x: _values(rows, x, height_m),
-        R=np.diag(variance + curvature),
+        R=np.diag(rows[:, column] + values * curvature),
         residual=_difference(rows),
     )
     return reference
@@ -154,7 +156,7 @@ def ukf_predict(mean: Array, cov: Array, dt: float, motion: Array, bias: Array) 
     mean[:], cov[:] = reference.x, reference.P + _noise(reference.x, dt, motion, bias)
 
 
-def _ukf(mean: Array, cov: Array, rows: Array, variance: Array, height_m: float) -> Any:
+def _ukf(mean: Array, cov: Array, rows: Array, column: int, height_m: float) -> Any:
     difference = _difference(rows)
 
     def average(values: Array, weights: Array) -> Array:
@@ -175,7 +177,7 @@ def _ukf(mean: Array, cov: Array, rows: Array, variance: Array, height_m: float)
     )
     reference.x, reference.P = mean.copy(), cov.copy()
     reference.sigmas_f = _points(mean.size).sigma_points(mean, cov)
-    reference.update(rows[:, VALUE], R=np.diag(variance))
+    reference.update(rows[:, VALUE], R=np.diag(rows[:, column]))
     return reference
 
 
@@ -200,7 +202,7 @@ def _update(
     for group in np.unique(rows[:, GROUP]):
         members = rows[:, GROUP] == group
         part = rows[members]
-        nis = fused(mean, cov, part, part[:, GATE_VARIANCE], height_m).mahalanobis ** 2
+        nis = fused(mean, cov, part, GATE_VARIANCE, height_m).mahalanobis ** 2
         passes = nis <= gate_nis[min(len(part), len(gate_nis) - 1)]
         accepted[int(group)] = passes
         keep[members] = passes
@@ -209,7 +211,7 @@ def _update(
 
     def together(chosen: Array) -> float:
         some = rows[chosen]
-        fit = fused(mean, cov, some, some[:, GATE_VARIANCE], height_m)
+        fit = fused(mean, cov, some, GATE_VARIANCE, height_m)
         return float(fit.mahalanobis**2)
 
     nis = together(keep)
@@ -222,6 +224,6 @@ def _update(
             accepted[int(odd)] = 0.0
             keep &= rows[:, GROUP] != odd
     kept = rows[keep]
-    posterior = fused(mean, cov, kept, kept[:, VARIANCE], height_m)
+    posterior = fused(mean, cov, kept, VARIANCE, height_m)
     mean[:], cov[:] = posterior.x, posterior.P
     return float(nis), int(keep.sum())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -121,6 +122,18 @@ def test_every_biased_quantity_has_its_own_state_once() -> None:
     other = errors_of(states, b, measured(Field.RANGE, rsu_id="b"))
     assert other[Kind.RANGE].bias == 10
     assert states.tau_s[4] == 9.0
+
+
+@pytest.mark.parametrize(("since_s", "more"), [(0.1, 9.0), (0.25, 3.0), (1.0, 0.0), (5.0, 0.0)])
+def test_values_of_a_second_share_what_linearising_leaves_out(since_s: float, more: float) -> None:
+    """Of quantities with a slow error, from the second value on."""
+    states, rsu, first = BiasStates(), biased(azimuth_bias_sd_rad=0.0), measured()
+    assert {errors.repeated for errors in errors_of(states, rsu, first).values()} == {0.0}
+    states.accepted(rsu, first)
+    later = replace(first, stamp_ns=first.stamp_ns + round(since_s * 1e9))
+    repeated = {kind: errors.repeated for kind, errors in errors_of(states, rsu, later).items()}
+    assert repeated.pop(Kind.AZIMUTH) == 0.0
+    assert list(repeated.values()) == pytest.approx([more] * 3)
 
 
 def test_only_measured_quantities_get_states() -> None:

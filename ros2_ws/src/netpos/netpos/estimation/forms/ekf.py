@@ -10,7 +10,7 @@ import numpy as np
 
 from netpos.estimation.compile import inlined, kernel, leaf, local_array, spliced
 from netpos.estimation.forms.form import FilterForm
-from netpos.estimation.measurement import GATE_VARIANCE, GROUP, VARIANCE
+from netpos.estimation.measurement import GATE_VARIANCE, GROUP, REPEATED, VARIANCE
 from netpos.estimation.motion import add_noise, is_straight, propagate, transition
 from netpos.estimation.sensors.row import group_end
 from netpos.estimation.state import N_CORE, X
@@ -217,8 +217,9 @@ def gate(
     m = rows.shape[0]
     is_open = math.isinf(gate_nis[gate_nis.size - 1])
     for i in range(m):
-        work[W_VARIANCE, i] = rows[i, VARIANCE] + work[W_SECOND_ORDER, i]
-        work[W_GATE_VARIANCE, i] = rows[i, GATE_VARIANCE] + work[W_SECOND_ORDER, i]
+        bent = work[W_SECOND_ORDER, i]
+        work[W_VARIANCE, i] = rows[i, VARIANCE] + (1.0 + rows[i, REPEATED]) * bent
+        work[W_GATE_VARIANCE, i] = rows[i, GATE_VARIANCE] + bent
     used, start = 0, 0
     while start < m:
         group = int(rows[start, GROUP])

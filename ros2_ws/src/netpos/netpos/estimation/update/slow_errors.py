@@ -17,8 +17,6 @@ h(x) + b misses the value now, the next value tells.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from netpos.estimation.compile import inlined, kernel, leaf
@@ -31,7 +29,6 @@ from netpos.estimation.measurement import (
     ORIGIN,
     REFERENCE,
     ROW_WIDTH,
-    curvature_variance,
     innovation_row,
     part_kind,
     slow_error_of,
@@ -39,9 +36,6 @@ from netpos.estimation.measurement import (
 from netpos.estimation.state import X
 from netpos.estimation.update.fusion import W_COV, W_PRIOR_VARIANCE
 from netpos.messages.values import Array
-
-LASTS_S = 1.0
-"""What linearising leaves out of a value is a part of its slow error that lasts so long."""
 
 
 @inlined
@@ -126,23 +120,3 @@ def follow_prediction(
     before[X.PX] -= unknown / square * dt_s * mean[X.VX]
     before[X.PY] -= unknown / square * dt_s * mean[X.VY]
     follow_tangents(mean, cov, first, rows, used, before, height_m)
-
-
-@leaf
-def with_linearisation(
-    mean: Array, cov: Array, rows: Array, height_m: float, bias: Array, widened: Array
-) -> None:
-    """Write to ``widened`` (2, k) the table ``bias``, stationary sd and time constant of each slow
-    error, for a step to ``rows``: in those that they have, what linearising leaves out at mean
-    (n,), cov (n, n) is a second Gauss-Markov process. The sum of the two is taken for one process
-    of their variance, which renews itself as fast as both together."""
-    k = bias.shape[1]
-    first = mean.size - k
-    for c in range(k):
-        widened[0, c], widened[1, c] = bias[0, c], bias[1, c]
-    for i in range(rows.shape[0]):
-        c = slow_error_of(rows[i]) - first
-        if c >= 0:
-            own, bent = bias[0, c] ** 2, curvature_variance(rows[i], mean, cov, height_m)
-            widened[0, c] = math.sqrt(own + bent)
-            widened[1, c] = (own + bent) / (own / bias[1, c] + bent / LASTS_S)

@@ -30,6 +30,8 @@ from netpos.tracking.rsus.learning import WINDOW_S, ErrorModel, LearnedErrors, N
 _RSU = "rsu/"
 REFERENCED = sum(int(r.field) for s, r in readings() if s.difference_of >= 0)
 """Fields that compare the RSU with a second one."""
+LINEARISATION_S = 1.0
+"""What linearising leaves out of values lasts so long."""
 _RENEWED_S = 1e-6  # correlation time of what is new at every epoch
 _SLOW = {name for s in SENSORS for name in (s.bias_sd, s.common_bias_sd) if name is not None}
 
@@ -224,7 +226,9 @@ class BiasStates:
             if reference is not None and is_difference(kind) and reference.bias_sd(kind) > 0.0:
                 other = self._bias_slot(reference, kind)
         common = self._common_slot(rsu, kind) if rsu.common_bias_sd(kind) > 0.0 else -1
-        return RowErrors(own, common, other, scale * self._inflation(m, tau_s, kind), gate)
+        inflation = scale * self._inflation(m, tau_s, kind)
+        repeated = self._inflation(m, LINEARISATION_S, kind) - 1.0 if own >= 0 else 0.0
+        return RowErrors(own, common, other, inflation, gate, repeated)
 
     def _bias_slot(self, rsu: Rsu, kind: Kind) -> int:
         """Index of an RSU's own bias as it declares it."""
