@@ -2,9 +2,10 @@
 
     python scripts/error_grid.py [--seeds N] [--first-seed N] [--only ROW...] [--json FILE]
 
-RSUs around a yard measure ranges of one device 5 times a second; or four arrays on the walls of a
-room of 12 m by 6 m measure two direction cosines of a person 10 times a second. Their errors are
-white noise, a first-order Gauss-Markov bias each, and late paths; what they declare is wrong.
+RSUs around a yard, or four on a car, measure ranges of one device 5 times a second; or four arrays
+on the walls of a room of 12 m by 6 m measure two direction cosines of a person 10 times a second.
+Their errors are white noise, a first-order Gauss-Markov bias each, and late paths; what they
+declare is wrong.
 ``told`` is the tracker that was told noise, bias and correlation time (the mean one, where the
 bias changes with the place), ``learned`` the one that learns from what is declared, ``declared``
 the one that believes it, ``snapshot`` least squares of the last second. Figures are of the time
@@ -43,7 +44,7 @@ SETTLED_S = 30.0
 
 def cases() -> Iterator[Case]:
     """One error at a time around the middle, for a device that moves and one that stands; then
-    arrays."""
+    arrays; then a car."""
     for moving in (True, False):
         middle = Case(moving=moving)
         yield middle
@@ -68,6 +69,8 @@ def cases() -> Iterator[Case]:
     yield replace(room)
     yield replace(room, length_m=1.0)
     yield replace(room, length_m=1.0, stops=True)
+    yield Case(bias=0.3, time_s=math.inf, rsus=4, on_a_car=True)
+    yield Case(bias=0.5, rsus=4, on_a_car=True)
 
 
 def figures(case: Case, seeds: range, *, told: bool, learn: bool) -> tuple[float, float, float]:
@@ -129,7 +132,7 @@ def main() -> None:
     args = parser.parse_args()
     seeds, rows = range(args.first_seed, args.first_seed + args.seeds), []
     print(
-        "variance bias time_s length_m blocked RSUs arrays moving stops"
+        "variance bias time_s length_m blocked RSUs arrays on_car moving stops"
         " | RMSE [m] snapshot told declared learned ratio | NEES told declared learned"
     )
     for i, case in enumerate(cases()):
@@ -143,8 +146,8 @@ def main() -> None:
         rows.append(asdict(case) | {"snapshot_rmse_m": least_squares} | found)
         print(
             f"{case.variance:8g} {case.bias:4g} {case.time_s:6g} {case.length_m:8g}"
-            f" {case.blocked:7g} {case.rsus:4d} {case.arrays!s:>6} {case.moving!s:>6}"
-            f" {case.stops!s:>5}"
+            f" {case.blocked:7g} {case.rsus:4d} {case.arrays!s:>6} {case.on_a_car!s:>6}"
+            f" {case.moving!s:>6} {case.stops!s:>5}"
             f" | {least_squares:.3f} {told[0]:.3f} {declared[0]:.3f} {learned[0]:.3f}"
             f" {learned[0] / told[0]:5.2f} | {told[1]:6.2f} {declared[1]:6.2f} {learned[1]:6.2f}",
             flush=True,

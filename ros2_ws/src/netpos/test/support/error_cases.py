@@ -1,5 +1,6 @@
-"""Simulated errors of ranges around a yard, and of arrays on the walls of a room: white noise, a
-first-order Gauss-Markov bias each, and late paths, against what is declared."""
+"""Simulated errors of ranges around a yard or from the corners of a car, and of arrays on the
+walls of a room: white noise, a first-order Gauss-Markov bias each, and late paths, against what is
+declared."""
 
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ GO_S, STOP_AND_GO_S = 5.0, 20.0
 WALK_MPS = 1.3
 DEVICE_M = {False: 0.0, True: 1.13}  # height, for ranges and for arrays
 FACING_RAD = np.radians([0.0, 90.0, 180.0, 270.0])  # of the arrays
+ON_A_CAR_M = np.array([[0.7, 0.9, -0.6], [2.6, -0.9, -0.6], [2.6, -0.9, 0.9], [2.6, 0.9, 0.9]])
 INWARDS_M = np.array([[0.0, 3.0, 2.3], [6.0, 0.0, 2.3], [12.0, 3.0, 2.3], [6.0, 6.0, 2.3]])
 
 
@@ -23,7 +25,7 @@ INWARDS_M = np.array([[0.0, 3.0, 2.3], [6.0, 0.0, 2.3], [12.0, 3.0, 2.3], [6.0, 
 class Case:
     """True errors: variance over the one declared, bias [sd of the noise declared], correlation
     time [s] and length [m], share of blocked paths; RSUs; whether the device moves, and whether it
-    stops in between; whether the RSUs are arrays."""
+    stops in between; whether the RSUs are arrays, or close together on a car."""
 
     variance: float = 1.0
     bias: float = 1.0
@@ -34,6 +36,7 @@ class Case:
     moving: bool = True
     stops: bool = False
     arrays: bool = False
+    on_a_car: bool = False
 
     @property
     def noise_sd(self) -> float:
@@ -47,7 +50,11 @@ class Case:
 
 
 def walk(case: Case, times: Array) -> Array:
-    """(n, 2) m: a loop in the yard or in the room, all the time or by turns, or a place."""
+    """(n, 2) m: a loop in the yard or in the room, all the time or by turns, or a place; or away
+    from a car and back."""
+    if case.on_a_car:
+        away = 6.0 + np.minimum(times, DURATION_S - times)
+        return np.column_stack([away, 4.0 * np.sin(times / 7.0) + 2.0 * np.sin(times / 13.0)])
     if not case.moving:
         return np.tile([8.0, 2.0] if case.arrays else [2.0, -1.5], (times.size, 1))
     if case.stops:
@@ -68,7 +75,9 @@ def _in_room(way_m: Array) -> Array:
 
 
 def anchors(case: Case) -> Array:
-    """(n, 3) m, evenly around the yard, or on the four walls."""
+    """(n, 3) m, evenly around the yard, on the four walls, or on the car."""
+    if case.on_a_car:
+        return ON_A_CAR_M
     if case.arrays:
         return INWARDS_M
     angle = 2.0 * np.pi * (np.arange(case.rsus) + 0.3) / case.rsus
