@@ -30,8 +30,8 @@ from netpos.estimation.sensors.row import (
     LEVER,
     ORIGIN,
     REFERENCE,
-    REPEATED,
     ROW_WIDTH,
+    SAME_BEND,
     VALUE,
     VARIANCE,
 )
@@ -52,8 +52,8 @@ __all__ = [
     "LEVER",
     "ORIGIN",
     "REFERENCE",
-    "REPEATED",
     "ROW_WIDTH",
+    "SAME_BEND",
     "VALUE",
     "VARIANCE",
     "Kind",
@@ -68,6 +68,7 @@ __all__ = [
     "linearise",
     "of_offset",
     "offset_up",
+    "over_same_bend",
     "part_kind",
     "predict_row",
     "second_order_mean_of_offset",
@@ -294,6 +295,13 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
     if row[HEIGHT] > 0.0:
         return float(_second_order_in_3d(_FOR_UPDATE, kind, row, (dx, dy, dz), cov))
     return float(second_order_of_offset(kind, row, dx, dy, dz, cov, 2))
+
+
+@inlined
+def over_same_bend(row: Array, second_order_var: float) -> float:
+    """Variance that values which share what linearising leaves out have of it, so that together
+    they count as one: white noise of the same spectral density at 0."""
+    return float((1.0 + row[SAME_BEND]) * second_order_var)
 
 
 @inlined

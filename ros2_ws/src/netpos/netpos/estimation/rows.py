@@ -26,8 +26,8 @@ from netpos.estimation.measurement import (
     LEVER,
     ORIGIN,
     REFERENCE,
-    REPEATED,
     ROW_WIDTH,
+    SAME_BEND,
     VALUE,
     VARIANCE,
     Kind,
@@ -83,7 +83,7 @@ class RowErrors(NamedTuple):
     """Variance factor of correlated noise."""
     gate: float = 1.0
     """Variance factor of single values."""
-    repeated: float = 0.0
+    same_bend: float = 0.0
     """How many more values come in the time that what linearising leaves out of one lasts."""
 
 
@@ -173,7 +173,7 @@ def put_scalars(
         row[VARIANCE] = row[GATE_VARIANCE] = variance
         row[BIAS] = row[COMMON] = -1.0
         row[GROUP], row[HEADING] = group, heading
-        row[BLOCKED] = row[HEIGHT] = row[REFERENCE] = row[REPEATED] = 0.0
+        row[BLOCKED] = row[HEIGHT] = row[REFERENCE] = row[SAME_BEND] = 0.0
         for i in range(HEADING - AXES):
             row[AXES + i] = place[_POSE + i]
         for i in range(3):
@@ -257,7 +257,7 @@ def couple(rows: Array, errors: Sequence[RowErrors]) -> None:
         row[VARIANCE] *= own.inflation
         row[GATE_VARIANCE] *= own.gate
         row[BIAS], row[COMMON], row[REFERENCE] = own.bias, own.common, own.reference
-        row[REPEATED] = own.repeated
+        row[SAME_BEND] = own.same_bend
 
 
 def drop_biases(rows: Array) -> None:

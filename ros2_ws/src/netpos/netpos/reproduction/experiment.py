@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from netpos.estimation.measurement import BIAS, HEIGHT, REPEATED
+from netpos.estimation.measurement import BIAS, HEIGHT, SAME_BEND
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.estimation.state import N_CORE, POSITION, VELOCITY, HeightState, X
 from netpos.evaluation.bounds import bound_covariances
@@ -20,7 +20,7 @@ from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.simulation import Beacons
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimators.models import height_state, pose_state
-from netpos.tracking.rsus.rsu import LINEARISATION_S, Rsu
+from netpos.tracking.rsus.rsu import LINEARISATION_S, Rsu, values_as_one
 
 VUE = "vue_1"
 
@@ -165,18 +165,19 @@ class Setup:
         if not heard.size or heard[0] > 0:
             raise ValueError(f"no RSU hears the first beacon of {simulation.scenario.name}")
         stamps_ns = simulation.beacons(VUE).stamp_ns[heard]
-        _note_repeats(rows, np.repeat(stamps_ns, np.diff(row_start)))
+        _note_same_bends(rows, np.repeat(stamps_ns, np.diff(row_start)))
         return heard, Epochs(stamps_ns, row_start, rows, bias, seen.rsu[heard])
 
 
-def _note_repeats(rows: Array, stamps_ns: Ints) -> None:
+def _note_same_bends(rows: Array, stamps_ns: Ints) -> None:
     """Write to ``rows`` (M, ROW_WIDTH), made at ``stamps_ns`` (M,), how many more values of their
     slow error come in the time that what linearising leaves out of one lasts."""
     order = np.argsort(rows[:, BIAS], kind="stable")
     order = order[rows[order, BIAS] >= 0.0]
     since_s = np.diff(stamps_ns[order]) * 1e-9
     again = np.diff(rows[order, BIAS]) == 0.0
-    rows[order[1:][again], REPEATED] = np.maximum(LINEARISATION_S / since_s[again], 1.0) - 1.0
+    values = [values_as_one(LINEARISATION_S, s) for s in since_s[again].tolist()]
+    rows[order[1:][again], SAME_BEND] = np.array(values) - 1.0
 
 
 def _truth(beacons: Beacons, heard: Ints, n: int, height: HeightState) -> Array:

@@ -12,6 +12,7 @@ from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import (
     BIAS,
     HEADING,
+    SAME_BEND,
     VARIANCE,
     Kind,
     curvature_variance,
@@ -127,8 +128,8 @@ def test_a_bearing_that_contradicts_is_weighed_like_any(aside: float, rel: float
 
 
 def test_other_rows_follow_at_the_result() -> None:
-    """A range beside the bearing, and one that is not used; a bearing under a prior that is none
-    is fused linearised, too."""
+    """A range beside the bearing, one of three of the same bend, and one that is not used; a
+    bearing under a prior that is none is fused linearised, too."""
     mean, cov = _prior([6.0, 0.0], 0.3)
     rows = np.array(
         [
@@ -137,6 +138,7 @@ def test_other_rows_follow_at_the_result() -> None:
             filter_rows.row(Kind.RANGE, 1.0, 0.2, 2, (8.0, 5.0, 1.0)),
         ]
     )
+    rows[0, SAME_BEND] = 2.0
     for is_flat in (False, True):
         if is_flat:
             cov[0], cov[:, 0] = 0.0, 0.0
@@ -150,7 +152,8 @@ def test_other_rows_follow_at_the_result() -> None:
             linear = rows[:1]
         z, H = linearise(linear, expected, 0.5)
         z -= bends(expected, expected_cov, linear, 0.5)
-        extra = [curvature_variance(r, expected, expected_cov, 0.5) for r in linear]
+        bent = [curvature_variance(r, expected, expected_cov, 0.5) for r in linear]
+        extra = (1.0 + linear[:, SAME_BEND]) * bent
         gain = expected_cov @ H.T
         gain @= np.linalg.inv(H @ gain + np.diag(linear[:, VARIANCE] + extra))
         np.testing.assert_allclose(x, expected + gain @ z, rtol=1e-9)

@@ -10,8 +10,9 @@ import pytest
 from filter_rows import make_cov, row
 from netpos.estimation.engine import EpochInput
 from netpos.estimation.forms import ekf
-from netpos.estimation.measurement import GROUP, VARIANCE, Kind
+from netpos.estimation.measurement import GROUP, SAME_BEND, VARIANCE, Kind
 from netpos.estimation.mixture import epoch as epochs
+from netpos.estimation.mixture.candidates import candidates
 from netpos.estimation.mixture.gaussians import (
     Mixture,
     fuse_value,
@@ -22,9 +23,11 @@ from netpos.estimation.mixture.gaussians import (
     one_component,
 )
 from netpos.estimation.mixture.reduction import PART_MERGE_COST, reduced
+from netpos.estimation.mixture.splits import paths
 from netpos.estimation.mixture.splits.ring import cut_along_ring, is_wide
 from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.rows import linear_rows
+from netpos.estimation.update.predicted import predicted_rows
 from netpos.messages.values import Array
 from netpos.tracking import TrackerConfig
 from netpos.tracking.estimators.estimates import Estimate
@@ -598,3 +601,20 @@ def test_blocked_paths_against_the_grid(
     assert np.sqrt(off @ np.linalg.solve(cov, off) / 2.0) < apart_sd
     # The excess of a blocked path is exponential; a component takes its moments.
     assert np.trace(found_cov[:2, :2]) == pytest.approx(np.trace(cov), rel=0.4)
+
+
+@pytest.mark.parametrize("more", [0.0, 30.0])
+def test_a_blocked_path_shares_what_linearising_leaves_out(more: float) -> None:
+    """A late range of ``more`` others with the same bend, in NumPy: half of 0.07^2 each."""
+    options = options_of(TrackerConfig(filter="ekf", nlos_probability=0.3))
+    x, P = prior((0.0, 0.0), (2.0, 2.0))
+    rows = np.array([row(Kind.RANGE, 63.0, 0.2**2, origin=np.array([60.0, 0.0, 0.0]))])
+    rows[0, SAME_BEND] = more
+    found, predicted = candidates(2, 6, 1), predicted_rows(x, P, rows, options.height_m)
+    assert paths.add(0, 0, one_component(x, P), rows, options, found) == 2
+    blocked = paths.paths_in(0, rows, predicted, options.robust).blocked
+    gain = -P[0] / (P[0, 0] + 0.2**2 + (1.0 + more) * (4.0 / 60.0) ** 2 / 2.0)
+    innovation = 3.0 - 4.0 / 2.0 / 60.0 - blocked.excess
+    np.testing.assert_allclose(found.means[1], x + gain * innovation, rtol=1e-9)
+    expected = P + np.outer(gain, P[0]) + blocked.excess_var * np.outer(gain, gain)
+    np.testing.assert_allclose(found.covs[1], expected, atol=1e-9)

@@ -13,7 +13,7 @@ from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import (
     GATE_VARIANCE,
     GROUP,
-    REPEATED,
+    SAME_BEND,
     VALUE,
     VARIANCE,
     Kind,
@@ -99,7 +99,7 @@ def test_update_adds_the_curvature_to_both_variances() -> None:
 def test_what_linearising_leaves_out_of_repeated_values_averages_as_one(more: float) -> None:
     """As if the curvature came in ``more`` values more: in the update, not in the gate."""
     mean, cov, rows = curved_group()
-    rows[:, REPEATED] = more
+    rows[:, SAME_BEND] = more
     x, P, _, nis, _ = updated(mean, cov, rows, 0.0, NO_GATE, 1)
     curvature = 400.0**2 / 2 / 30.0**2
     innovation, H = linearise(rows, mean, 0.0)

@@ -17,6 +17,7 @@ from netpos.estimation.measurement import (
     KIND,
     ORIGIN,
     ROW_WIDTH,
+    SAME_BEND,
     VALUE,
     VARIANCE,
     Kind,
@@ -74,15 +75,20 @@ def test_misfit_is_twice_the_negative_log_posterior(seed: int) -> None:
     )
 
 
-def test_surprise_is_what_scipy_makes_of_it() -> None:
+@pytest.mark.parametrize("more", [0.0, 3.0])
+def test_surprise_is_what_scipy_makes_of_it(more: float) -> None:
+    """What linearising leaves out: shared with ``more`` values in the distance, and that of a
+    single value in the determinant."""
     mean, cov, rows = range_problem(3)
+    rows[:, SAME_BEND] = more
     innovation, H = linearise(rows, mean, 0.0)
     innovation -= bends(mean, cov, rows)
-    bent = [second_order_variance(row, mean, cov, 0.0) for row in rows]
-    S = H @ cov @ H.T + np.diag(rows[:, VARIANCE] + bent)
+    bent = np.array([second_order_variance(row, mean, cov, 0.0) for row in rows])
+    single = H @ cov @ H.T + np.diag(rows[:, VARIANCE] + bent)
+    S = single + np.diag(more * bent)
     distance, size = neg2_log_likelihood(mean, cov, rows)
     assert distance == pytest.approx(innovation @ np.linalg.solve(S, innovation), rel=1e-9)
-    assert size == pytest.approx(np.linalg.slogdet(2.0 * np.pi * S)[1], rel=1e-9)
+    assert size == pytest.approx(np.linalg.slogdet(2.0 * np.pi * single)[1], rel=1e-9)
 
 
 def test_a_bearing_does_not_bend_along_itself() -> None:

@@ -26,6 +26,7 @@ from netpos.estimation.level.protection import (
 )
 from netpos.estimation.measurement import (
     GROUP,
+    SAME_BEND,
     VALUE,
     VARIANCE,
     Kind,
@@ -260,7 +261,8 @@ def test_level_of_a_manoeuvre_with_biases_that_tell_nothing() -> None:
 
 def test_level_of_a_manoeuvre_is_linearised_at_its_own_answer() -> None:
     """RSUs some metres away, where bearings and ranges bend: the answer from the estimate, and
-    once more from that answer with the curvature left at it. A third group is refused."""
+    once more from that answer with the curvature left at it, that of the range shared with
+    another value. A third group is refused."""
     rng, said = np.random.default_rng(7), options()
     prior, cov = np.array([10.0, 20.0, 3.0, -1.0, 0.5, 0.1]), filter_rows.make_cov(rng, 6)
     rows = np.array(
@@ -270,6 +272,7 @@ def test_level_of_a_manoeuvre_is_linearised_at_its_own_answer() -> None:
             filter_rows.row(Kind.RANGE, 90.0, 0.3, 2, (0.0, 0.0, 3.0)),
         ]
     )
+    rows[1, SAME_BEND] = 1.0
     accepted, mean, height_m = np.array([1.0, 1.0, 0.0]), prior + 0.4, said.height_m
     predicted = predicted_rows(prior, cov, rows, height_m)
     _, longest_s = detection_delay_s(rows, predicted, said.gate_nis[2], 4.0)
@@ -284,6 +287,7 @@ def test_level_of_a_manoeuvre_is_linearised_at_its_own_answer() -> None:
         x = prior + wide @ H.T @ np.linalg.solve(S, z + H @ (x - prior))
         P = wide - wide @ H.T @ np.linalg.solve(S, H @ wide)
         bent = np.array([curvature_variance(row, x, P, height_m) for row in used])
+        bent *= 1.0 + used[:, SAME_BEND]
         longer = bends(x, P, used, height_m)
     assert (bent[1:] > 0.01 * used[1:, VARIANCE]).all()
     expected = np.linalg.norm(x[POSITION] - mean[POSITION]) + protection_level(

@@ -18,7 +18,7 @@ from netpos.estimation.measurement import (
     KIND,
     ORIGIN,
     REFERENCE,
-    REPEATED,
+    SAME_BEND,
     VALUE,
     VARIANCE,
     Kind,
@@ -82,7 +82,7 @@ def _ekf(mean: Array, cov: Array, rows: Array, column: int, height_m: float) -> 
     reference = kalman.ExtendedKalmanFilter(dim_x=mean.size, dim_z=len(rows))
     reference.x, reference.P = mean.copy(), cov.copy()
     curvature = [curvature_variance(row, mean, cov, height_m) for row in rows]
-    values = 1.0 + rows[:, REPEATED] * (column == VARIANCE)
+    values = 1.0 + rows[:, SAME_BEND] * (column == VARIANCE)
     bend = np.array([curvature_mean(row, mean, cov, height_m) for row in rows])
     reference.update(
         rows[:, VALUE] - bend,

@@ -145,6 +145,17 @@ def test_values_that_follow_each_other_count_as_one_until_their_scatter_is_seen(
     assert model.window_scale == pytest.approx(1.0 / 40.0, rel=0.25)
 
 
+def test_who_scatters_beyond_all_candidates_has_the_largest_scale() -> None:
+    """An RSU that errs by a hundred times what it states, and by other values every second."""
+    errors = np.random.default_rng(4).normal(0.0, 0.1, (300, 4))
+    errors[:, 0] = 10.0 * np.sin(2.0 * math.pi * np.arange(300) / 15.0)
+    model = learned_of(errors, 0.1).models[NAMES[0]]
+    assert model.window_scale > 4.0 * 64.0
+    assert model.scale == pytest.approx(64.0, rel=0.01)
+    assert math.isfinite(model.bias_sd)
+    assert math.isfinite(model.time_s(0.0))
+
+
 def test_what_a_shift_of_the_position_explains_is_not_an_error_of_the_rsus() -> None:
     """All residuals are those of a device 3 m to the side: nothing contradicts anything."""
     rng = np.random.default_rng(5)

@@ -128,10 +128,10 @@ def test_every_biased_quantity_has_its_own_state_once() -> None:
 def test_values_of_a_second_share_what_linearising_leaves_out(since_s: float, more: float) -> None:
     """Of quantities with a slow error, from the second value on."""
     states, rsu, first = BiasStates(), biased(azimuth_bias_sd_rad=0.0), measured()
-    assert {errors.repeated for errors in errors_of(states, rsu, first).values()} == {0.0}
+    assert {errors.same_bend for errors in errors_of(states, rsu, first).values()} == {0.0}
     states.accepted(rsu, first)
     later = replace(first, stamp_ns=first.stamp_ns + round(since_s * 1e9))
-    repeated = {kind: errors.repeated for kind, errors in errors_of(states, rsu, later).items()}
+    repeated = {kind: errors.same_bend for kind, errors in errors_of(states, rsu, later).items()}
     assert repeated.pop(Kind.AZIMUTH) == 0.0
     assert list(repeated.values()) == pytest.approx([more] * 3)
 

@@ -22,6 +22,7 @@ from netpos.estimation.measurement import (
     curvature_mean,
     curvature_variance,
     innovation_row,
+    over_same_bend,
 )
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.state import X
@@ -228,7 +229,8 @@ def apply_about(
                 innovation[i] += H[i, a] * (x[a] - prior_mean[a])
             variance[i] = rows[i, VARIANCE]
             if again:
-                variance[i] += curvature_variance(rows[i], x, P, height_m)
+                bent = curvature_variance(rows[i], x, P, height_m)
+                variance[i] += over_same_bend(rows[i], bent)
                 innovation[i] -= curvature_mean(rows[i], x, P, height_m)
         for a in range(n):
             x[a] = prior_mean[a]

@@ -12,7 +12,7 @@ array a compiled kernel can take:
     forward and left count only where there is a heading), BLOCKED (probability that the path was
     blocked; 0: the option's), HEIGHT (state index of the device's height over the nominal one; 0:
     the height is known), REFERENCE (state index of the bias that is subtracted, that of the RSU a
-    difference counts from; 0: none), REPEATED (how many more values of its RSU come in the time
+    difference counts from; 0: none), SAME_BEND (how many more values of its RSU come in the time
     that what linearising leaves out of one lasts)
 
 A sensor may keep other figures in ORIGIN and AXES; its module says which.
@@ -25,7 +25,7 @@ from netpos.messages.values import Array
 
 KIND, VALUE, VARIANCE, GATE_VARIANCE, BIAS, COMMON, GROUP, ORIGIN = range(8)
 AXES = 10
-HEADING, LEVER, BLOCKED, HEIGHT, REFERENCE, REPEATED = 19, 20, 23, 24, 25, 26
+HEADING, LEVER, BLOCKED, HEIGHT, REFERENCE, SAME_BEND = 19, 20, 23, 24, 25, 26
 ROW_WIDTH = 27
 
 

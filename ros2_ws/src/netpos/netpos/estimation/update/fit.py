@@ -9,7 +9,12 @@ import numpy.typing as npt
 
 from netpos.estimation.compile import kernel
 from netpos.estimation.factor import factor
-from netpos.estimation.measurement import VARIANCE, linearise, second_order_variance
+from netpos.estimation.measurement import (
+    VARIANCE,
+    linearise,
+    over_same_bend,
+    second_order_variance,
+)
 from netpos.estimation.update.predicted import PredictedRows, note_innovations, predicted_rows
 from netpos.messages.values import Array
 
@@ -66,7 +71,10 @@ def neg2_log_likelihood(
     where mean (n,), cov (n, n) ``predicted`` them, and ln det(2 pi S): minus twice their log
     density is the sum of the two. What is known exactly is left out.
 
-    S has the curvature as ``second_order_variance``, to weigh priors of different widths.
+    S has the curvature as ``second_order_variance``, to weigh priors of different widths: in the
+    distance as in an update, so that values which share what linearising leaves out tell the same
+    once; in the determinant as of a single value, or a wide prior would pay for its width with
+    each of them.
     """
     innovation, S = predicted.innovation[index], np.empty((index.size, index.size))
     for a in range(index.size):
@@ -76,8 +84,13 @@ def neg2_log_likelihood(
             for c in range(mean.size):
                 total += predicted.H[i, c] * predicted.HP[index[b], c]
             S[a, b] = S[b, a] = total
-        S[a, a] += rows[i, VARIANCE] + second_order_variance(rows[i], mean, cov, height_m)
-    L = factor(S)
+    single = S.copy()
+    for a in range(index.size):
+        row = rows[index[a]]
+        bent = second_order_variance(row, mean, cov, height_m)
+        single[a, a] += row[VARIANCE] + bent
+        S[a, a] += row[VARIANCE] + over_same_bend(row, bent)
+    L, L_single = factor(S), factor(single)
     distance, size = 0.0, 0.0
     for i in range(innovation.size):
         if L[i, i] == 0.0:
@@ -86,7 +99,7 @@ def neg2_log_likelihood(
             innovation[i] -= L[i, k] * innovation[k]
         innovation[i] /= L[i, i]
         distance += innovation[i] ** 2
-        size += math.log(2.0 * math.pi * L[i, i] ** 2)
+        size += math.log(2.0 * math.pi * L_single[i, i] ** 2)
     return distance, size
 
 

@@ -30,7 +30,7 @@ from netpos.estimation.rows import (
 )
 from netpos.estimation.state import KNOWN_HEIGHT, N_CORE, VELOCITY, HeightState, X
 from netpos.messages.values import Array, Field, GroundSpeed, RsuMeasurement, Velocity
-from netpos.tracking.rsus.rsu import REFERENCED, BiasStates, Rsu
+from netpos.tracking.rsus.rsu import REFERENCED, BiasStates, Rsu, values_as_one
 
 Source = RsuMeasurement | Velocity | GroundSpeed
 Sites = tuple[bool, Array, Array | None]
@@ -148,8 +148,7 @@ def epoch_rows_of(
 def velocity_inflation(
     items: Sequence[Source], last_ns: Mapping[str, int], tau_s: float
 ) -> dict[str, float]:
-    """Variance factors of velocities whose errors last, by source: white noise of the same
-    spectral density at 0 (as ``BiasStates`` has it for RSUs).
+    """``values_as_one`` of velocities whose errors last, by source.
 
     last_ns : stamp of the last velocity fused, by source; tau_s : correlation time, 0 for white
     """
@@ -157,7 +156,7 @@ def velocity_inflation(
     for item in items:
         if tau_s > 0.0 and isinstance(item, Velocity) and item.source in last_ns:
             since_s = (item.stamp_ns - last_ns[item.source]) * 1e-9
-            factors[item.source] = max(1.0, tau_s / since_s) if since_s > 0.0 else 1.0
+            factors[item.source] = values_as_one(tau_s, since_s)
     return factors
 
 

@@ -121,10 +121,12 @@ class ErrorModel:
     def least_scale(self) -> float:
         """What is stated is believed to a quarter of ``window_scale`` where successive values have
         half of their variance or more in common: what changes that slowly may change more slowly
-        still. Down to nothing where they have nothing in common."""
+        still. Down to nothing where they have nothing in common. No more than the largest
+        candidate."""
         count = self.within[1]
         common = 1.0 - self._step * count / (_WITHIN_STRENGTH + count)
-        return min(2.0 * common, 1.0) * self.window_scale / _LARGEST_OVERSTATED
+        least = min(2.0 * common, 1.0) * self.window_scale / _LARGEST_OVERSTATED
+        return min(least, float(_SCALES[-1]))
 
     def scattering(
         self, gate_scale: float, within: tuple[float, float, float, float]

@@ -36,6 +36,13 @@ _RENEWED_S = 1e-6  # correlation time of what is new at every epoch
 _SLOW = {name for s in SENSORS for name in (s.bias_sd, s.common_bias_sd) if name is not None}
 
 
+def values_as_one(lasts_s: float, since_s: float) -> float:
+    """Variance factor of a value ``since_s`` after the one before, so that those within
+    ``lasts_s``, the correlation time of their errors, count as one: white noise of the same
+    spectral density at 0. 1 for a first value (``since_s`` not above 0)."""
+    return max(1.0, lasts_s / since_s) if since_s > 0.0 else 1.0
+
+
 @dataclass(frozen=True, slots=True)
 class Rsu:
     """A known RSU: its description and the rotation map -> RSU axes (9,)."""
@@ -227,8 +234,8 @@ class BiasStates:
                 other = self._bias_slot(reference, kind)
         common = self._common_slot(rsu, kind) if rsu.common_bias_sd(kind) > 0.0 else -1
         inflation = scale * self._inflation(m, tau_s, kind)
-        repeated = self._inflation(m, LINEARISATION_S, kind) - 1.0 if own >= 0 else 0.0
-        return RowErrors(own, common, other, inflation, gate, repeated)
+        same_bend = self._inflation(m, LINEARISATION_S, kind) - 1.0 if own >= 0 else 0.0
+        return RowErrors(own, common, other, inflation, gate, same_bend)
 
     def _bias_slot(self, rsu: Rsu, kind: Kind) -> int:
         """Index of an RSU's own bias as it declares it."""
@@ -399,9 +406,6 @@ class BiasStates:
         return self._slot(name, rsu.common_bias_sd(kind), tau_s)
 
     def _inflation(self, m: RsuMeasurement, tau_s: float, kind: Kind) -> float:
-        """White noise of the same spectral density at 0: variance times correlation time over
-        sampling interval."""
-        last = self._last_ns.get(_name(m, kind))
-        if last is None or m.stamp_ns <= last:
-            return 1.0
-        return max(1.0, tau_s * 1e9 / (m.stamp_ns - last))
+        """``values_as_one`` of ``m`` and the value before it that was fused."""
+        since_ns = m.stamp_ns - self._last_ns.get(_name(m, kind), m.stamp_ns)
+        return values_as_one(tau_s, since_ns * 1e-9)
