@@ -618,3 +618,43 @@ def test_a_blocked_path_shares_what_linearising_leaves_out(more: float) -> None:
     np.testing.assert_allclose(found.means[1], x + gain * innovation, rtol=1e-9)
     expected = P + np.outer(gain, P[0]) + blocked.excess_var * np.outer(gain, gain)
     np.testing.assert_allclose(found.covs[1], expected, atol=1e-9)
+
+
+def test_the_candidates_of_a_late_range_and_an_azimuth() -> None:
+    """In NumPy: by a direct path, by a blocked one; by either of a component of little weight."""
+    options = options_of(TrackerConfig(filter="ekf", nlos_probability=0.3))
+    x, P = prior((0.0, 0.0), (2.0, 2.0))
+    site, variances = np.array([600.0, 0.0, 0.0]), np.array([0.01**2, 0.2**2])
+    for late_m, log_weight, count in ((3.0, 0.0, 2), (0.3, -14.0, 1)):
+        values = np.pi - 0.001, 600.0 + late_m
+        rows = np.array(
+            [
+                row(kind, value, var, origin=site)
+                for kind, value, var in zip(
+                    (Kind.AZIMUTH, Kind.RANGE), values, variances.tolist(), strict=True
+                )
+            ]
+        )
+        predicted = predicted_rows(x, P, rows, options.height_m)
+        seen = paths.paths_in(1, rows, predicted, options.robust)
+        found = candidates(2, 6, 1)
+        part = Mixture(x[None], P[None], np.array([log_weight]))
+        assert paths.add(0, 0, part, rows, options, found) == count
+        bent = predicted.second_order_var
+        H, z = predicted.H, predicted.innovation
+        S = H @ P @ H.T + np.diag(variances + bent)
+        fits = multivariate_normal(np.zeros(2), S).logpdf(z)
+        ways = (seen.direct, seen.blocked) if count == 2 else (seen.either,)
+        for k, way in enumerate(ways):
+            shift = np.array([0.0, way.excess])
+            gain = P @ H.T @ np.linalg.inv(S)
+            expected = P - gain @ H @ P + way.excess_var * np.outer(gain[:, 1], gain[:, 1])
+            assert found.log_weights[k] == pytest.approx(log_weight + fits + way.log, abs=1e-3)
+            np.testing.assert_allclose(found.means[k], x + gain @ (z - shift), atol=2e-3)
+            np.testing.assert_allclose(found.covs[k], expected, atol=2e-3)
+            if count == 2:
+                nis = (z - shift) @ np.linalg.solve(S, z - shift)
+                assert found.nis[k] == pytest.approx(nis, rel=0.02)
+            assert (found.accepted[k, 0], found.used[k]) == (1.0, 2.0)
+            assert found.blocked[k] == way.blocked
+            assert found.within_s[k] == 0.0
