@@ -68,9 +68,9 @@ __all__ = [
     "linearise",
     "of_offset",
     "offset_up",
-    "over_same_bend",
     "part_kind",
     "predict_row",
+    "same_bend_variance",
     "second_order_mean_of_offset",
     "second_order_of_offset",
     "second_order_variance",
@@ -298,9 +298,9 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
 
 
 @inlined
-def over_same_bend(row: Array, second_order_var: float) -> float:
-    """Variance that values which share what linearising leaves out have of it, so that together
-    they count as one: white noise of the same spectral density at 0."""
+def same_bend_variance(row: Array, second_order_var: float) -> float:
+    """``second_order_var`` of one value, times the number of values with the same bend: as white
+    noise of that variance they together count as one. In the unit of the row, squared."""
     return float((1.0 + row[SAME_BEND]) * second_order_var)
 
 

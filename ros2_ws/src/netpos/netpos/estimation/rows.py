@@ -84,7 +84,7 @@ class RowErrors(NamedTuple):
     gate: float = 1.0
     """Variance factor of single values."""
     same_bend: float = 0.0
-    """How many more values come in the time that what linearising leaves out of one lasts."""
+    """How many more values have the same bend: what linearising leaves out."""
 
 
 WHITE = RowErrors()

@@ -171,7 +171,7 @@ class Setup:
 
 def _note_same_bends(rows: Array, stamps_ns: Ints) -> None:
     """Write to ``rows`` (M, ROW_WIDTH), made at ``stamps_ns`` (M,), how many more values of their
-    slow error come in the time that what linearising leaves out of one lasts."""
+    slow error have the same bend."""
     order = np.argsort(rows[:, BIAS], kind="stable")
     order = order[rows[order, BIAS] >= 0.0]
     since_s = np.diff(stamps_ns[order]) * 1e-9

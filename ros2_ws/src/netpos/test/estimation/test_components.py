@@ -621,7 +621,8 @@ def test_a_blocked_path_shares_what_linearising_leaves_out(more: float) -> None:
 
 
 def test_the_candidates_of_a_late_range_and_an_azimuth() -> None:
-    """In NumPy: by a direct path, by a blocked one; by either of a component of little weight."""
+    """Against NumPy: one by a direct path and one by a blocked path. A component of little weight
+    has one for both."""
     options = options_of(TrackerConfig(filter="ekf", nlos_probability=0.3))
     x, P = prior((0.0, 0.0), (2.0, 2.0))
     site, variances = np.array([600.0, 0.0, 0.0]), np.array([0.01**2, 0.2**2])

@@ -146,7 +146,7 @@ def test_values_that_follow_each_other_count_as_one_until_their_scatter_is_seen(
 
 
 def test_who_scatters_beyond_all_candidates_has_the_largest_scale() -> None:
-    """An RSU that errs by a hundred times what it states, and by other values every second."""
+    """An RSU that errs by up to a hundred times what it states, in a wave of three seconds."""
     errors = np.random.default_rng(4).normal(0.0, 0.1, (300, 4))
     errors[:, 0] = 10.0 * np.sin(2.0 * math.pi * np.arange(300) / 15.0)
     model = learned_of(errors, 0.1).models[NAMES[0]]

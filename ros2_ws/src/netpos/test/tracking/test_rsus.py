@@ -131,9 +131,9 @@ def test_values_of_a_second_share_what_linearising_leaves_out(since_s: float, mo
     assert {errors.same_bend for errors in errors_of(states, rsu, first).values()} == {0.0}
     states.accepted(rsu, first)
     later = replace(first, stamp_ns=first.stamp_ns + round(since_s * 1e9))
-    repeated = {kind: errors.same_bend for kind, errors in errors_of(states, rsu, later).items()}
-    assert repeated.pop(Kind.AZIMUTH) == 0.0
-    assert list(repeated.values()) == pytest.approx([more] * 3)
+    more_of = {kind: errors.same_bend for kind, errors in errors_of(states, rsu, later).items()}
+    assert more_of.pop(Kind.AZIMUTH) == 0.0
+    assert list(more_of.values()) == pytest.approx([more] * 3)
 
 
 def test_only_measured_quantities_get_states() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from netpos.estimation.compile import inlined, kernel, leaf, local_array, spliced
 from netpos.estimation.forms.form import FilterForm
-from netpos.estimation.measurement import GATE_VARIANCE, GROUP, VARIANCE, over_same_bend
+from netpos.estimation.measurement import GATE_VARIANCE, GROUP, VARIANCE, same_bend_variance
 from netpos.estimation.motion import add_noise, is_straight, propagate, transition
 from netpos.estimation.sensors.row import group_end
 from netpos.estimation.state import N_CORE, X
@@ -218,7 +218,7 @@ def gate(
     is_open = math.isinf(gate_nis[gate_nis.size - 1])
     for i in range(m):
         bent = work[W_SECOND_ORDER, i]
-        work[W_VARIANCE, i] = rows[i, VARIANCE] + over_same_bend(rows[i], bent)
+        work[W_VARIANCE, i] = rows[i, VARIANCE] + same_bend_variance(rows[i], bent)
         work[W_GATE_VARIANCE, i] = rows[i, GATE_VARIANCE] + bent
     used, start = 0, 0
     while start < m:

@@ -22,7 +22,7 @@ from netpos.estimation.measurement import (
     curvature_mean,
     curvature_variance,
     innovation_row,
-    over_same_bend,
+    same_bend_variance,
 )
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.state import X
@@ -230,7 +230,7 @@ def apply_about(
             variance[i] = rows[i, VARIANCE]
             if again:
                 bent = curvature_variance(rows[i], x, P, height_m)
-                variance[i] += over_same_bend(rows[i], bent)
+                variance[i] += same_bend_variance(rows[i], bent)
                 innovation[i] -= curvature_mean(rows[i], x, P, height_m)
         for a in range(n):
             x[a] = prior_mean[a]

@@ -12,8 +12,8 @@ array a compiled kernel can take:
     forward and left count only where there is a heading), BLOCKED (probability that the path was
     blocked; 0: the option's), HEIGHT (state index of the device's height over the nominal one; 0:
     the height is known), REFERENCE (state index of the bias that is subtracted, that of the RSU a
-    difference counts from; 0: none), SAME_BEND (how many more values of its RSU come in the time
-    that what linearising leaves out of one lasts)
+    difference counts from; 0: none), SAME_BEND (how many more values of its RSU have the
+    same bend, which is what linearising leaves out)
 
 A sensor may keep other figures in ORIGIN and AXES; its module says which.
 """

@@ -34,7 +34,7 @@ from netpos.estimation.measurement import (
     curvature_mean,
     curvature_variance,
     linearise,
-    over_same_bend,
+    same_bend_variance,
 )
 from netpos.estimation.state import POSITION, X
 from netpos.estimation.update.fusion import W_COV, W_PRIOR, W_USE, fuse
@@ -157,6 +157,8 @@ def fuse_around(mean: Array, cov: Array, rows: Array, height_m: float, work: Arr
     innovation, H = linearise(rows, mean, height_m)
     variance = rows[:, VARIANCE].copy()
     for i in range(m):
-        variance[i] += over_same_bend(rows[i], curvature_variance(rows[i], mean, cov, height_m))
+        variance[i] += same_bend_variance(
+            rows[i], curvature_variance(rows[i], mean, cov, height_m)
+        )
         innovation[i] -= curvature_mean(rows[i], mean, cov, height_m)
     fuse(mean, cov, innovation, H, variance, use, work)

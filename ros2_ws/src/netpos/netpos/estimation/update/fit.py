@@ -12,7 +12,7 @@ from netpos.estimation.factor import factor
 from netpos.estimation.measurement import (
     VARIANCE,
     linearise,
-    over_same_bend,
+    same_bend_variance,
     second_order_variance,
 )
 from netpos.estimation.update.predicted import PredictedRows, note_innovations, predicted_rows
@@ -71,10 +71,10 @@ def neg2_log_likelihood(
     where mean (n,), cov (n, n) ``predicted`` them, and ln det(2 pi S): minus twice their log
     density is the sum of the two. What is known exactly is left out.
 
-    S has the curvature as ``second_order_variance``, to weigh priors of different widths: in the
-    distance as in an update, so that values which share what linearising leaves out tell the same
-    once; in the determinant as of a single value, or a wide prior would pay for its width with
-    each of them.
+    S has the curvature as ``second_order_variance``, to weigh priors of different widths. In the
+    distance it is that of values with the same bend, as in an update: together they count as one.
+    In the determinant it is that of a single value: a wide prior does not fit worse because there
+    are more of them.
     """
     innovation, S = predicted.innovation[index], np.empty((index.size, index.size))
     for a in range(index.size):
@@ -89,7 +89,7 @@ def neg2_log_likelihood(
         row = rows[index[a]]
         bent = second_order_variance(row, mean, cov, height_m)
         single[a, a] += row[VARIANCE] + bent
-        S[a, a] += row[VARIANCE] + over_same_bend(row, bent)
+        S[a, a] += row[VARIANCE] + same_bend_variance(row, bent)
     L, L_single = factor(S), factor(single)
     distance, size = 0.0, 0.0
     for i in range(innovation.size):

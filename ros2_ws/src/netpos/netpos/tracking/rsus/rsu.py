@@ -31,15 +31,15 @@ _RSU = "rsu/"
 REFERENCED = sum(int(r.field) for s, r in readings() if s.difference_of >= 0)
 """Fields that compare the RSU with a second one."""
 LINEARISATION_S = 1.0
-"""What linearising leaves out of values lasts so long."""
+"""Values of an RSU have the same bend, what linearising leaves out, for so long."""
 _RENEWED_S = 1e-6  # correlation time of what is new at every epoch
 _SLOW = {name for s in SENSORS for name in (s.bias_sd, s.common_bias_sd) if name is not None}
 
 
 def values_as_one(lasts_s: float, since_s: float) -> float:
-    """Variance factor of a value ``since_s`` after the one before, so that those within
-    ``lasts_s``, the correlation time of their errors, count as one: white noise of the same
-    spectral density at 0. 1 for a first value (``since_s`` not above 0)."""
+    """Variance factor of a value ``since_s`` [s] after the one before it. Errors that last
+    ``lasts_s`` [s] become white noise of the same spectral density at 0: the values of that time
+    count as one. 1 for a first value (``since_s`` not above 0)."""
     return max(1.0, lasts_s / since_s) if since_s > 0.0 else 1.0
 
 

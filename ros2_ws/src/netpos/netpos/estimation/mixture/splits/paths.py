@@ -10,7 +10,7 @@ import numpy as np
 
 from netpos.estimation.compile import kernel
 from netpos.estimation.engine import EpochInput, FilterOptions, is_sound
-from netpos.estimation.measurement import BLOCKED, VARIANCE, over_same_bend
+from netpos.estimation.measurement import BLOCKED, VARIANCE, same_bend_variance
 from netpos.estimation.mixture.candidates import (
     Candidates,
     apply,
@@ -154,7 +154,7 @@ def add(
         found.covs[end + 1],
         predicted.H[late, : mean.size].copy(),
         predicted.innovation[late],
-        rows[late, VARIANCE] + over_same_bend(rows[late], predicted.second_order_var[late]),
+        rows[late, VARIANCE] + same_bend_variance(rows[late], predicted.second_order_var[late]),
     )
     found.accepted[end + 1, 0], found.used[end + 1], found.within_s[end + 1] = 1.0, 0.0, 0.0
     if rows.shape[0] > 1:
