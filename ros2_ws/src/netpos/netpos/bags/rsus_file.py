@@ -71,6 +71,13 @@ def save_rsus(bag: Path, file: Path) -> list[RsuInfo]:
             scatter = zip(scatter_of.quantities, scatter_of.scatter, strict=True)
             text = ", ".join(f"{quantity} {value:.2f}" for quantity, value in scatter)
             lines.append(f"  # learned; scatter over the sd stated: {text}")
+            lines += [
+                f"  # learned; share of distance too long: {quantity} {stretch:.4f} +- {sd:.2g}"
+                for quantity, stretch, sd in zip(
+                    scatter_of.quantities, scatter_of.stretch, scatter_of.stretch_sd, strict=True
+                )
+                if sd > 0.0
+            ]
         content = dump_yaml(_entry(info), default_flow_style=True, width=10_000).strip()
         name = dump_yaml(info.rsu_id).splitlines()[0]  # in quotes where it must be
         lines.append(f"  {name}: {content}")

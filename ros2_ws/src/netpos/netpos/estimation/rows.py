@@ -85,6 +85,8 @@ class RowErrors(NamedTuple):
     """Variance factor of single values."""
     same_bend: float = 0.0
     """How many more values have the same bend: what linearising leaves out."""
+    stretch: float = 0.0
+    """Share by which the distance is too long; it is taken out."""
 
 
 WHITE = RowErrors()
@@ -254,6 +256,7 @@ def _has_height(position: Array, cov: Array) -> bool:
 def couple(rows: Array, errors: Sequence[RowErrors]) -> None:
     """Write the slow and coloured errors of an RSU into the first rows of its measurement."""
     for row, own in zip(rows, errors, strict=False):
+        row[VALUE] /= 1.0 + own.stretch
         row[VARIANCE] *= own.inflation
         row[GATE_VARIANCE] *= own.gate
         row[BIAS], row[COMMON], row[REFERENCE] = own.bias, own.common, own.reference

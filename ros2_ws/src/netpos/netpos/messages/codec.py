@@ -251,6 +251,8 @@ class Codec(CommonCodec):
             bias_sd=column(errors.bias_sd),
             bias_spread=column(errors.bias_spread),
             correlation_time=column(errors.correlation_time_s),
+            stretch=column(errors.stretch),
+            stretch_sd=column(errors.stretch_sd),
         )
 
     @staticmethod
@@ -260,6 +262,7 @@ class Codec(CommonCodec):
         def column(values: Any) -> tuple[float, ...]:
             return tuple(float(value) for value in values)
 
+        none = (0.0,) * len(msg.quantities)  # recordings may be older than the stretch
         return RsuErrors(
             stamp_ns=certain_stamp_ns(msg.header.stamp),
             rsu_id=str(msg.rsu_id),
@@ -270,6 +273,8 @@ class Codec(CommonCodec):
             bias_sd=column(msg.bias_sd),
             bias_spread=column(msg.bias_spread),
             correlation_time_s=column(msg.correlation_time),
+            stretch=column(getattr(msg, "stretch", none)),
+            stretch_sd=column(getattr(msg, "stretch_sd", none)),
         )
 
     def step_to_msg(self, step: Step) -> Any:

@@ -287,6 +287,8 @@ class RsuErrors:
 
     scatter : sd of single values over the one stated; bias, bias_sd, bias_spread : m or rad, how
     much too large the values are now, the sd of that, and the sd of the bias over time
+    stretch, stretch_sd : by which share all distances of its network are too long, and the sd of
+    that; 0 of what is no distance
     """
 
     stamp_ns: int
@@ -298,6 +300,8 @@ class RsuErrors:
     bias_sd: tuple[float, ...]
     bias_spread: tuple[float, ...]
     correlation_time_s: tuple[float, ...]
+    stretch: tuple[float, ...]
+    stretch_sd: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

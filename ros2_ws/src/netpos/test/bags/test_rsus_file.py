@@ -108,6 +108,8 @@ def test_the_biases_of_differences_are_those_of_their_rsus(tmp_path: Path) -> No
             bias_sd=(0.1,),
             bias_spread=(spread,),
             correlation_time_s=(time_s,),
+            stretch=(0.0,),
+            stretch_sd=(0.0,),
         )
         for pair, spread, time_s in (("a1-a0", 0.4, 10.0), ("a2-a1", 0.2, 30.0))
     ]

@@ -199,6 +199,15 @@ def test_errors_enter_their_rows_only() -> None:
     np.testing.assert_allclose(rows[:4, VARIANCE], [0.03, 0.02, speed_of_light**2 * 1e-18, 1.25])
 
 
+def test_what_a_distance_is_too_long_by_is_taken_out() -> None:
+    info = random_info(np.random.default_rng(1), AngleConvention.SPHERICAL)
+    m = full_measurement(info, np.array([30.0, 20.0, 1.0]), 7.0)
+    plain = rsu_rows(m, info, rsu_axes(info), 0, [WHITE] * 4)
+    found = rsu_rows(m, info, rsu_axes(info), 0, [WHITE, WHITE, WHITE, RowErrors(stretch=0.07)])
+    assert found[3, VALUE] == pytest.approx(plain[3, VALUE] / 1.07)
+    np.testing.assert_array_equal(np.delete(found, 3, axis=0), np.delete(plain, 3, axis=0))
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_linear_rows_equal_the_update_with_the_full_covariance(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -28,6 +28,7 @@ from netpos.messages.values import (
     InitialPose,
     MagneticSample,
     Odometry,
+    RsuErrors,
     RsuInfo,
     RsuMeasurement,
     Step,
@@ -145,6 +146,19 @@ ODOMETRY = Odometry(
     pose_cov=numbers(36).reshape(6, 6),
     twist_cov=numbers(36, 50.0).reshape(6, 6),
 )
+ERRORS = RsuErrors(
+    stamp_ns=STAMP,
+    rsu_id="rsu_3",
+    vue_id="vue_7",
+    quantities=("RANGE", "AZIMUTH"),
+    scatter=(1.1, 0.9),
+    bias=(0.2, -0.03),
+    bias_sd=(0.05, 0.01),
+    bias_spread=(0.3, 0.04),
+    correlation_time_s=(30.0, 75.0),
+    stretch=(0.07, 0.0),
+    stretch_sd=(0.002, 0.0),
+)
 IMU = ImuSample(
     stamp_ns=STAMP,
     vue_id="vue_7",
@@ -165,6 +179,7 @@ ROUND_TRIPS = [
     (STATUS, "track_status_to_msg", "track_status_from_msg", "netpos_msgs/msg/TrackStatus"),
     (ODOMETRY, "odometry_to_msg", "odometry_from_msg", "nav_msgs/msg/Odometry"),
     (IMU, "imu_to_msg", "imu_from_msg", "sensor_msgs/msg/Imu"),
+    (ERRORS, "rsu_errors_to_msg", "rsu_errors_from_msg", "netpos_msgs/msg/RsuErrors"),
     (MAG, "magnetic_field_to_msg", "magnetic_field_from_msg", "sensor_msgs/msg/MagneticField"),
 ]
 
@@ -256,6 +271,13 @@ def test_a_status_of_before_steps_were_calibrated() -> None:
     old = SimpleNamespace(**{k: v for k, v in vars(msg).items() if not k.startswith("step_")})
     expected = replace(STATUS, steps=StepCalibration())
     assert_same(expected, codec().track_status_from_msg(old))
+
+
+def test_errors_of_before_distances_were_stretched() -> None:
+    msg = codec().rsu_errors_to_msg(ERRORS)
+    old = SimpleNamespace(**{k: v for k, v in vars(msg).items() if not k.startswith("stretch")})
+    expected = replace(ERRORS, stretch=(0.0, 0.0), stretch_sd=(0.0, 0.0))
+    assert_same(expected, codec().rsu_errors_from_msg(old))
 
 
 def test_transform_is_the_pose_of_the_odometry() -> None:

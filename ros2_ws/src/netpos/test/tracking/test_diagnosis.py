@@ -177,6 +177,8 @@ AS_STATED = RsuErrors(
     bias_sd=(0.01,),
     bias_spread=(0.05,),
     correlation_time_s=(30.0,),
+    stretch=(0.0,),
+    stretch_sd=(0.0,),
 )
 
 
@@ -197,6 +199,13 @@ AS_STATED = RsuErrors(
             "azimuth off by 2.0 deg",
         ),
         ({"quantities": ("COSINE_Y",), "bias": (-0.05,)}, "cosine_y off by -0.050"),
+        (
+            {"bias": (0.12,), "stretch": (0.0694,), "stretch_sd": (0.004,)},
+            "ranges 6.9 % long, 0.12 m long",
+        ),
+        ({"stretch": (-0.02,), "stretch_sd": (0.001,)}, "ranges 2.0 % short"),
+        ({"stretch": (0.02,), "stretch_sd": (0.007,)}, ""),
+        ({"stretch": (0.0009,), "stretch_sd": (0.0001,)}, ""),
     ],
 )
 def test_words(change: dict[str, tuple[float, ...]], said: str) -> None:
@@ -210,6 +219,8 @@ def test_several_quantities() -> None:
         scatter=(1.0, 2.0),
         bias=(0.1, 0.0),
         bias_sd=(0.01, 0.01),
+        stretch=(0.0, 0.0),
+        stretch_sd=(0.0, 0.0),
     )
     assert errors_in_words(both) == "azimuth off by 5.7 deg; ranges scatter 2.0 times as stated"
 
@@ -221,5 +232,9 @@ def test_diagnostics_say_it_and_call_it_no_fault() -> None:
     assert (found.level, found.message) == (Level.OK, "ok; ranges 0.12 m long")
     assert found.values["learned bias: RANGE"] == "0.12 +- 0.01"
     assert found.values["learned scatter: RANGE"] == "1.10"
+    assert "learned stretch: RANGE" not in found.values
+    stretched = replace(AS_STATED, stretch=(0.0694,), stretch_sd=(0.004,))
+    (of_network,) = of_rsus([report], {}, {}, {}, {"a2": stretched})
+    assert of_network.values["learned stretch: RANGE"] == "0.0694 +- 0.004"
     (plain,) = of_rsus([report], {}, {}, {}, {"a2": AS_STATED})
     assert plain.message == "ok"

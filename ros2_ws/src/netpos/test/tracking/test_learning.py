@@ -11,7 +11,7 @@ from netpos.estimation.rows import linear_rows
 from netpos.messages.values import Array, Field, Odometry, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.report import TrackOutput
-from netpos.tracking.rsus.learning import ErrorModel, LearnedErrors
+from netpos.tracking.rsus.learning import RATE, SCALE, SPREAD, ErrorModel, LearnedErrors
 from netpos.tracking.tracker import Tracker
 
 RSUS = np.array(
@@ -154,6 +154,24 @@ def test_who_scatters_beyond_all_candidates_has_the_largest_scale() -> None:
     assert model.scale == pytest.approx(64.0, rel=0.01)
     assert math.isfinite(model.bias_sd)
     assert math.isfinite(model.time_s(0.0))
+
+
+def test_a_window_fits_as_well_as_it_was_foreseen() -> None:
+    """The candidates' densities of a window, weighted as before it: Student's with 5 degrees of
+    freedom, the variance of a Gaussian of which is 0.72 of what is stated, without factors that
+    all have."""
+    model = ErrorModel.declared(0.1, 0.0, 0.0)
+    for k, y in enumerate([0.15, -0.3, 0.8]):
+        biased = (model.unit * SPREAD) ** 2
+        dt = 0.0 if k == 0 else 1.0
+        left = np.exp(-dt * RATE)
+        mean, var = left * model.mean, left**2 * model.var + (1.0 - left**2) * biased
+        S = var + SCALE * 0.01
+        density = S**-0.5 * (1.0 + (y - mean) ** 2 / (0.72 * S) / 5.0) ** -3.0
+        expected = model.log_fit + 0.6 * math.log(float(model.weights @ density))
+        model = model.weigh(k * 1_000_000_000, 0.0, y, 0.01, 0.6)
+        assert model.log_fit == pytest.approx(expected, rel=1e-12)
+        model = model.weighed(model.prior + model.evidence)
 
 
 def test_what_a_shift_of_the_position_explains_is_not_an_error_of_the_rsus() -> None:

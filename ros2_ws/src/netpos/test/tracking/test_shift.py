@@ -47,7 +47,8 @@ def left_of(biases: Array, believed: Array) -> tuple[Array, Array]:
     """``unshifted`` seen from a believed place (6,)."""
     rows = rows_of(biases)
     residuals, _ = linearise(rows, believed, 1.1)
-    return unshifted(rows, residuals, SD, believed, 1.1)
+    left, checked, _ = unshifted(rows, residuals, SD, believed, 1.1, np.zeros(8))
+    return left, checked
 
 
 @pytest.mark.parametrize("wrong", [(0.0, 0.0), (2.0, -1.5), (-1.5, 1.5), (5.0, -2.0)])
@@ -73,6 +74,21 @@ def test_an_error_looks_the_same_from_wherever_the_track_is() -> None:
 def test_two_ranges_leave_nothing() -> None:
     """As many unknowns as values: any residual is a shift."""
     rows = rows_of(np.zeros(8))[:2]
-    left, checked = unshifted(rows, np.array([0.05, -0.03]), SD[:2], PLACE, 1.1)
+    left, checked, beside = unshifted(
+        rows, np.array([0.05, -0.03]), SD[:2], PLACE, 1.1, np.array([3.0, 4.0])
+    )
     assert np.abs(left).max() < 1e-9
     assert np.abs(checked).max() < 1e-9
+    assert np.abs(beside).max() < 1e-9
+
+
+def test_other_residuals_are_freed_of_the_same_shifts() -> None:
+    """As least squares with the weights of the residuals leaves them."""
+    rows, sd = rows_of(np.zeros(8)), np.linspace(0.05, 0.2, 8)
+    other = np.arange(8.0)
+    left, _, beside = unshifted(rows, np.zeros(8), sd, PLACE, 1.1, other)
+    _, H = linearise(rows, PLACE, 1.1)
+    A = H[:, :2] / sd[:, None]
+    shift, *_ = np.linalg.lstsq(A, other / sd)
+    np.testing.assert_allclose(beside, other - H[:, :2] @ shift, atol=1e-9)
+    np.testing.assert_array_equal(left, 0.0)

@@ -123,6 +123,8 @@ class Sensor:
     compares none."""
     is_range: bool = False
     """A distance, so that a blocked path makes it late and one epoch leaves a ring."""
+    stretches: bool = False
+    """A distance that a network may measure too long by the same share everywhere."""
     in_strapdown: bool = False
     """A strapdown track takes it."""
     is_reported: bool = True

@@ -58,6 +58,7 @@ SENSOR = Sensor(
     second_order=exact,
     second_order_mean=bend,
     is_range=True,
+    stretches=True,
     in_strapdown=True,
     bias_sd="range_bias_sd_m",
     common_bias_sd="common_range_bias_sd_m",

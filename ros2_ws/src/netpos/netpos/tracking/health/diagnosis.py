@@ -16,6 +16,7 @@ from netpos.tracking.ordering.clocks import Stranger
 _NOTHING: Mapping[str, RsuErrors] = {}
 _NEVER: Mapping[str, int] = {}
 _BIAS_SDS = 3.0  # sd of a bias that is mentioned
+_STRETCH = 0.001  # share of the distance that is mentioned
 _SCATTER = 1.5  # times as stated, or less than one over it
 _LENGTHS = {"RANGE": "ranges", "TDOA": "time differences"}
 
@@ -144,18 +145,29 @@ def _with_errors(finding: Finding, errors: RsuErrors | None) -> Finding:
     for k, quantity in enumerate(errors.quantities):
         values[f"learned bias: {quantity}"] = f"{errors.bias[k]:.4g} +- {errors.bias_sd[k]:.2g}"
         values[f"learned scatter: {quantity}"] = f"{errors.scatter[k]:.2f}"
+        if errors.stretch_sd[k] > 0.0:
+            said_of = f"{errors.stretch[k]:.4f} +- {errors.stretch_sd[k]:.2g}"
+            values[f"learned stretch: {quantity}"] = said_of
     message = f"{finding.message}; {said}" if said else finding.message
     return replace(finding, message=message, values=values)
 
 
 def errors_in_words(errors: RsuErrors) -> str:
     """What is learned of the errors of an RSU, a phrase for each quantity that is not as stated:
-    "ranges 0.12 m long, scatter 3.1 times as stated"; empty where all are."""
+    "ranges 7.0 % long, 0.12 m long, scatter 3.1 times as stated"; empty where all are."""
     phrases = []
-    for quantity, scatter, bias, sd in zip(
-        errors.quantities, errors.scatter, errors.bias, errors.bias_sd, strict=True
+    for quantity, scatter, bias, sd, stretch, stretch_sd in zip(
+        errors.quantities,
+        errors.scatter,
+        errors.bias,
+        errors.bias_sd,
+        errors.stretch,
+        errors.stretch_sd,
+        strict=True,
     ):
         faults = []
+        if abs(stretch) > max(_BIAS_SDS * stretch_sd, _STRETCH):
+            faults.append(f"{100.0 * abs(stretch):.1f} % {'long' if stretch > 0.0 else 'short'}")
         if abs(bias) > _BIAS_SDS * sd:
             faults.append(_off(quantity, bias))
         if not 1.0 / _SCATTER < scatter < _SCATTER:

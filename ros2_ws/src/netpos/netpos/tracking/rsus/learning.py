@@ -19,14 +19,18 @@ gate, is learned apart (variational Bayes, Särkkä and Nummenmaa 2009).
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import add
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from netpos.estimation.measurement import KIND, VALUE
+from netpos.estimation.sensors.table import SENSORS
 from netpos.messages.values import Array
 from netpos.tracking.rsus.shift import unshifted
+from netpos.tracking.rsus.stretch import NONE_SEEN, Stretch, together
 
 WINDOW_S = 1.0
 """Values of an RSU within it count as one until their scatter says otherwise."""
@@ -51,6 +55,7 @@ _WITHIN_STRENGTH, _WITHIN_MEMORY = 5.0, 1000.0  # values, windows' worth of them
 _LEAST_STEP = 0.05  # of successive values, over their scatter
 _GAUSSIAN = 0.72  # of a variance: what the tail's distribution makes of a Gaussian's
 _ALONE = 0.05  # 1 - leverage of a row that nobody checks
+_STRETCHING = [s.kind for s in SENSORS if s.stretches]
 
 
 def _grid() -> Array:
@@ -63,6 +68,7 @@ def _grid() -> Array:
 SCALE, SPREAD, RATE, RATE_PER_M = _grid()
 
 Name = tuple[str, str]
+_STRETCH: Name = "distances", "stretch"
 Sums = tuple[float, ...]
 """Of the rows of a window: information, and that times residual; number, residual and its square
 over the sd stated; half the square of the step from the value before; that value."""
@@ -87,6 +93,10 @@ class ErrorModel:
     bias_sd: float = 0.0
     lasting: Array = field(default_factory=lambda: np.ones(len(_LASTING)))
     """Weights (12,) of how long the bias lasts."""
+    weights: Array = field(default_factory=lambda: np.ones(SCALE.size) / SCALE.size)
+    """(G,)"""
+    log_fit: float = 0.0
+    """Log-likelihood of all windows, each as it was foreseen."""
 
     @property
     def gate_scale(self) -> float:
@@ -166,6 +176,7 @@ class ErrorModel:
         total = float(ws.sum())
         return replace(
             self,
+            weights=w,
             scale=float(w @ SCALE),
             bias_sd=self.unit * total,
             lasting=ws[len(_SCALES) :].reshape(-1, len(_LASTING)).sum(axis=0) / total,
@@ -205,7 +216,9 @@ class ErrorModel:
         S = var + v
         d2 = (y - mean) ** 2 / (_GAUSSIAN * S)
         log_likelihood = -0.5 * np.log(S) - 0.5 * (_TAIL + 1.0) * np.log1p(d2 / _TAIL)
-        log_likelihood -= log_likelihood.max()
+        largest = float(log_likelihood.max())
+        log_likelihood -= largest
+        foreseen = largest + math.log(float(self.weights @ np.exp(log_likelihood)))
         weight = np.minimum((_TAIL + 1.0) / (_TAIL + d2), 1.0)
         gain = var / (var + v / (weight * share))
         return replace(
@@ -215,19 +228,41 @@ class ErrorModel:
             var=(1.0 - gain) * var,
             last_ns=stamp_ns,
             last_m=moved_m,
+            log_fit=self.log_fit + share * foreseen,
         )
+
+
+Learned = ErrorModel | Stretch
+Models = dict[Name, ErrorModel]
 
 
 class Others(Protocol):
     """What other devices have learned of the same RSUs."""
 
-    def note(self, owner: tuple[str, int], stamp_ns: int, name: Name, model: ErrorModel) -> None:
+    def note(self, owner: tuple[str, int], stamp_ns: int, name: Name, model: Learned) -> None:
         """Take what ``owner``, a device and the number of its life, has concluded."""
 
     def of_others(
         self, owner: tuple[str, int], stamp_ns: int, name: Name, unit: float
-    ) -> list[ErrorModel]:
+    ) -> list[Learned]:
         """What all but ``owner`` have concluded of ``name``."""
+
+
+class _Window(NamedTuple):
+    """What was heard in a window: name, last row (m, ROW_WIDTH), mean residual (m,) and its
+    variance by what is stated (m,), distance (m,) m, 0 where it is none, and what
+    ``ErrorModel.scattered`` takes of each."""
+
+    names: list[Name]
+    rows: Array
+    residual: Array
+    variance: Array
+    distance: Array
+    scatter: list[tuple[float, float, float]]
+
+    def moved(self, share: float) -> _Window:
+        """With the residuals where ``share`` of the distance more had been left in."""
+        return self._replace(residual=self.residual + share * self.distance)
 
 
 @dataclass(slots=True)
@@ -238,7 +273,15 @@ class LearnedErrors:
 
     others: Others | None = None
     owner: tuple[str, int] = ("", 0)
-    models: dict[Name, ErrorModel] = field(default_factory=dict)
+    models: Models = field(default_factory=dict)
+    """Those of the likelier hypothesis on the stretch."""
+    unlikelier: Models = field(default_factory=dict)
+    """Those of the other one."""
+    own_stretch: Stretch = NONE_SEEN
+    stretch: Stretch = NONE_SEEN
+    """With what others have seen of it."""
+    stretched: bool = False
+    """Whether it is likelier that there is one; rows leave it out then."""
     moved_m: float = 0.0
     moved_ns: int = -1
     window_ns: int = -1
@@ -251,6 +294,7 @@ class LearnedErrors:
         return replace(
             self,
             models=self.models.copy(),
+            unlikelier=self.unlikelier.copy(),
             window=self.window.copy(),
             newest=self.newest.copy(),
         )
@@ -260,6 +304,8 @@ class LearnedErrors:
     ) -> ErrorModel:
         """The model of ``name``, from its prior, and what others know by then, where it is new."""
         if name not in self.models:
+            if not self.models:
+                self._decide(stamp_ns)
             model = ErrorModel.declared(noise_sd, bias_sd, time_s)
             known = self._known(name, stamp_ns, model.unit)
             if known:
@@ -267,14 +313,32 @@ class LearnedErrors:
                     float(np.mean([other.gate_scale for other in known])),
                     tuple(np.mean([other.within for other in known], axis=0).tolist()),
                 )
-            self.models[name] = model
-            self._choose(name, stamp_ns)
+            self.models[name] = self.unlikelier[name] = model
+            self._choose(self.models, name, known)
+            self._choose(self.unlikelier, name, [])
         return self.models[name]
 
     def _known(self, name: Name, stamp_ns: int, unit: float) -> list[ErrorModel]:
+        found = self._of_others(name, stamp_ns, unit)
+        return [model for model in found if isinstance(model, ErrorModel)]
+
+    def _of_others(self, name: Name, stamp_ns: int, unit: float) -> list[Learned]:
         if self.others is None:
             return []
         return self.others.of_others(self.owner, stamp_ns, name, unit)
+
+    def _decide(self, stamp_ns: int) -> None:
+        """Choose the hypothesis on the stretch by all that is known of it."""
+        found = self._of_others(_STRETCH, stamp_ns, self.own_stretch.unit)
+        others = [stretch for stretch in found if isinstance(stretch, Stretch)]
+        self.stretch = together(self.own_stretch, others)
+        if self.stretch.is_one(self.stretched) != self.stretched:
+            self.stretched, given_up = not self.stretched, self.models
+            self.models = {
+                name: replace(model, scatter=given_up[name].scatter)
+                for name, model in self.unlikelier.items()
+            }
+            self.unlikelier = given_up
 
     def move(self, stamp_ns: int, speed_mps: float) -> None:
         """Note the way since the last call."""
@@ -306,38 +370,77 @@ class LearnedErrors:
         self.window, self.newest, self.window_ns = {}, {}, stamp_ns
         if not names:
             return []
-        sums = np.array([window[name] for name in names])
+        heard = self._heard(names, np.array([window[name] for name in names]), newest)
+        seen_from = mean, height_m
+        share = self.stretch.share
+        changed, left = self._weigh(self.models, heard, stamp_ns, seen_from)
+        if heard.distance.any():
+            other = heard.moved(share if self.stretched else -share)
+            _, other_left = self._weigh(self.unlikelier, other, stamp_ns, seen_from)
+            plain, stretched = self.unlikelier, self.models
+            if not self.stretched:
+                plain, stretched, left = stretched, plain, other_left
+            gained = sum(stretched[name].log_fit - plain[name].log_fit for name in stretched)
+            self.own_stretch = self.own_stretch.seen(*left, share, gained)
+            self._decide(stamp_ns)
+            self._tell(stamp_ns, _STRETCH, self.own_stretch)
+        for name in changed:
+            self._tell(stamp_ns, name, self.models[name])
+        return changed
+
+    def _tell(self, stamp_ns: int, name: Name, model: Learned) -> None:
+        if self.others is not None:
+            self.others.note(self.owner, stamp_ns, name, model)
+
+    @staticmethod
+    def _heard(names: list[Name], sums: Array, newest: Mapping[Name, Array]) -> _Window:
+        """What ``sums`` (m, 7) of the rows of a window say."""
         variance = 1.0 / sums[:, 0]
-        scatter = sums[:, 4] - sums[:, 3] ** 2 / sums[:, 2]
-        models = [
-            self.models[name].scattered(float(s), float(n) - 1.0, float(steps))
-            for name, s, n, steps in zip(names, scatter, sums[:, 2], sums[:, 5], strict=True)
-        ]
-        sd = np.sqrt([m.scale * v + m.bias_sd**2 for m, v in zip(models, variance, strict=True)])
+        square = sums[:, 4] - sums[:, 3] ** 2 / sums[:, 2]
+        scatter = np.column_stack([square, sums[:, 2] - 1.0, sums[:, 5]]).tolist()
         rows = np.array([newest[name] for name in names])
-        left, checked = unshifted(rows, sums[:, 1] * variance, sd, mean, height_m)
+        distance = np.where(np.isin(rows[:, KIND], _STRETCHING), rows[:, VALUE], 0.0)
+        return _Window(names, rows, sums[:, 1] * variance, variance, distance, scatter)
+
+    def _weigh(
+        self, models: Models, heard: _Window, stamp_ns: int, seen_from: tuple[Array, float]
+    ) -> tuple[list[Name], tuple[Array, Array, Array]]:
+        """Weigh the candidates of ``models`` by a window. Whose changed; what a shift leaves of
+        the residuals (m,) and of the distances (m,), over the sd of a residual, and the part of
+        each residual that is news (m,)."""
+        mine = [
+            models[name].scattered(*of_it)
+            for name, of_it in zip(heard.names, heard.scatter, strict=True)
+        ]
+        noise = np.array([m.scale for m in mine]) * heard.variance
+        slow = np.array([m.bias_sd for m in mine]) ** 2
+        sd = np.sqrt(noise + slow)
+        left, checked, distance = unshifted(
+            heard.rows, heard.residual, sd, *seen_from, heard.distance
+        )
         changed = []
-        for i, name in enumerate(names):
+        for i, name in enumerate(heard.names):
             if checked[i] > _ALONE:
                 y = float(left[i] / math.sqrt(checked[i]))
-                self.models[name] = models[i].weigh(
-                    stamp_ns, self.moved_m, y, float(variance[i]), float(checked[i])
+                models[name] = mine[i].weigh(
+                    stamp_ns, self.moved_m, y, float(heard.variance[i]), float(checked[i])
                 )
                 changed.append(name)
         for name in changed:
-            self._choose(name, stamp_ns)
-            if self.others is not None:
-                self.others.note(self.owner, stamp_ns, name, self.models[name])
-        return changed
+            known = self._known(name, stamp_ns, models[name].unit) if models is self.models else []
+            self._choose(models, name, known)
+        lasts = np.array([m.time_s(0.0) for m in mine]) * 2.0 / WINDOW_S
+        return changed, (left / sd, distance / sd, sd**2 / (noise + slow * np.maximum(lasts, 1.0)))
 
-    def _choose(self, name: Name, stamp_ns: int) -> None:
-        """Weigh the candidates of ``name`` by what it measured itself, of any device, and by the
-        mean of what the others of its kind did, as if it were one measurement of theirs."""
-        mine = self.models[name]
-        others = [m.evidence for n, m in self.models.items() if n[1] == name[1] and n != name]
+    def _choose(self, models: Models, name: Name, known: Sequence[ErrorModel]) -> None:
+        """Weigh the candidates of ``name`` by what it measured itself, of any device, those of
+        other devices as ``known``, and by the mean of what the others of its kind did, as if it
+        were one measurement of theirs."""
+        mine = models[name]
+        others = [m.evidence for n, m in models.items() if n[1] == name[1] and n != name]
         log_weights = mine.prior + mine.evidence
         if others:
             log_weights = log_weights + np.mean(others, axis=0)
-        for known in self._known(name, stamp_ns, mine.unit):
-            log_weights = log_weights + known.evidence
-        self.models[name] = mine.weighed(log_weights)
+        for of_other in known:
+            log_weights = log_weights + of_other.evidence
+        models[name] = mine.weighed(log_weights)

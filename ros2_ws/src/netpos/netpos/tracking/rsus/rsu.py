@@ -235,7 +235,14 @@ class BiasStates:
         common = self._common_slot(rsu, kind) if rsu.common_bias_sd(kind) > 0.0 else -1
         inflation = scale * self._inflation(m, tau_s, kind)
         same_bend = self._inflation(m, LINEARISATION_S, kind) - 1.0 if own >= 0 else 0.0
-        return RowErrors(own, common, other, inflation, gate, same_bend)
+        return RowErrors(own, common, other, inflation, gate, same_bend, self._stretch(kind)[0])
+
+    def _stretch(self, kind: Kind) -> tuple[float, float]:
+        """By which share values of a kind are too long, and the sd of that; 0 of what is no
+        distance."""
+        if self.learned is None or not (self.learned.stretched and BY_KIND[kind].stretches):
+            return 0.0, 0.0
+        return self.learned.stretch.share, self.learned.stretch.sd
 
     def _bias_slot(self, rsu: Rsu, kind: Kind) -> int:
         """Index of an RSU's own bias as it declares it."""
@@ -332,6 +339,7 @@ class BiasStates:
         for rsu_id, of_it in quantities.items():
             models = [self.learned.models[rsu_id, quantity] for quantity in of_it]
             biases = [self._bias_of((rsu_id, quantity), mean, cov) for quantity in of_it]
+            stretches = [self._stretch(Kind[quantity]) for quantity in of_it]
             found.append(
                 RsuErrors(
                     stamp_ns=stamp_ns,
@@ -343,6 +351,8 @@ class BiasStates:
                     bias_sd=tuple(sd for _, sd in biases),
                     bias_spread=tuple(model.bias_sd for model in models),
                     correlation_time_s=tuple(model.time_s(0.0) for model in models),
+                    stretch=tuple(stretch for stretch, _ in stretches),
+                    stretch_sd=tuple(sd for _, sd in stretches),
                 )
             )
         return tuple(found)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from netpos.tracking.rsus.learning import ErrorModel, Name
+from netpos.tracking.rsus.learning import Learned, Name
 
 _SAME_UNIT = 0.01  # relative
 
@@ -20,9 +20,9 @@ class SharedErrors:
 
     def __init__(self, settle_s: float) -> None:
         self._settle_ns = round(1e9 * settle_s)
-        self._models: dict[Name, dict[tuple[str, int], deque[tuple[int, ErrorModel]]]] = {}
+        self._models: dict[Name, dict[tuple[str, int], deque[tuple[int, Learned]]]] = {}
 
-    def note(self, owner: tuple[str, int], stamp_ns: int, name: Name, model: ErrorModel) -> None:
+    def note(self, owner: tuple[str, int], stamp_ns: int, name: Name, model: Learned) -> None:
         """Take what a device, in its life number ``owner[1]``, has concluded."""
         kept = self._models.setdefault(name, {}).setdefault(owner, deque())
         kept.append((stamp_ns, model))
@@ -42,7 +42,7 @@ class SharedErrors:
 
     def of_others(
         self, owner: tuple[str, int], stamp_ns: int, name: Name, unit: float
-    ) -> list[ErrorModel]:
+    ) -> list[Learned]:
         """What all but ``owner`` had concluded of ``name`` by then, of the same ``unit``."""
         before_ns = stamp_ns - self._settle_ns
         found = []

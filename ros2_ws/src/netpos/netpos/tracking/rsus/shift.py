@@ -15,9 +15,10 @@ _UNSEEN = 1e-6  # of the largest singular value
 
 
 def unshifted(
-    rows: Array, residuals: Array, sd: Array, mean: Array, height_m: float
-) -> tuple[Array, Array]:
-    """Residuals (m,) after the best shift, and one minus the leverage of each (m,).
+    rows: Array, residuals: Array, sd: Array, mean: Array, height_m: float, beside: Array
+) -> tuple[Array, Array, Array]:
+    """Residuals (m,) after the best shift, one minus the leverage of each (m,), and what such a
+    shift leaves of other residuals ``beside`` (m,).
 
     rows : (m, ROW_WIDTH), one per RSU and quantity; their biases are in the residuals
     residuals : (m,) at ``mean`` (n,); sd : (m,) of what is wrong with each
@@ -50,7 +51,9 @@ def unshifted(
         place, left, H = trial, innovation / sd, trial_H
     U = _seen(H[:, shifted] / sd[:, None])[0]
     left = left - U @ (U.T @ left)
-    return left * sd, 1.0 - np.square(U).sum(axis=1)
+    other = beside / sd
+    other = other - U @ (U.T @ other)
+    return left * sd, 1.0 - np.square(U).sum(axis=1), other * sd
 
 
 def _seen(A: Array) -> tuple[Array, Array, Array]:
