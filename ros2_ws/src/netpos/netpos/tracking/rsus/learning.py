@@ -13,7 +13,8 @@ of candidates (scale of the variance, sd of the bias, rates at which it is forgo
 per metre of way) is weighed by the likelihood of y, each candidate by a Kalman filter of its own
 for b, with a Student tail. The update takes the mean variance and the mean sd of the bias of all
 candidates: what is not known yet makes the track less sure. The scale of single values, for the
-gate, is learned apart (variational Bayes, Särkkä and Nummenmaa 2009).
+gate, is learned apart (variational Bayes, Särkkä and Nummenmaa 2009). Whether distances are too
+long by a share that all have in common is learned beside it (``stretch``).
 """
 
 from __future__ import annotations
