@@ -66,23 +66,28 @@ def save_rsus(bag: Path, file: Path) -> list[RsuInfo]:
     ]
     lines = [f"# RSUs of {bag.name}; m, rad, s, axes of map", "rsus:"]
     for info in declared:
-        scatter_of = learned.get(info.rsu_id)
-        if scatter_of is not None:
-            scatter = zip(scatter_of.quantities, scatter_of.scatter, strict=True)
-            text = ", ".join(f"{quantity} {value:.2f}" for quantity, value in scatter)
-            lines.append(f"  # learned; scatter over the sd stated: {text}")
-            lines += [
-                f"  # learned; share of distance too long: {quantity} {stretch:.4f} +- {sd:.2g}"
-                for quantity, stretch, sd in zip(
-                    scatter_of.quantities, scatter_of.stretch, scatter_of.stretch_sd, strict=True
-                )
-                if sd > 0.0
-            ]
+        lines += [f"  # learned; {text}" for text in _comments(learned.get(info.rsu_id))]
         content = dump_yaml(_entry(info), default_flow_style=True, width=10_000).strip()
         name = dump_yaml(info.rsu_id).splitlines()[0]  # in quotes where it must be
         lines.append(f"  {name}: {content}")
     write_text(file, "\n".join(lines) + "\n")
     return declared
+
+
+def _comments(errors: RsuErrors | None) -> list[str]:
+    """What is learned of an RSU and no declaration holds."""
+    if errors is None:
+        return []
+    scatter = zip(errors.quantities, errors.scatter, strict=True)
+    stretch = zip(errors.quantities, errors.stretch, errors.stretch_sd, strict=True)
+    return [
+        "scatter over the sd stated: " + ", ".join(f"{of} {value:.2f}" for of, value in scatter),
+        *(
+            f"share by which distances are too long: {of} {share:.4f} +- {sd:.2g}"
+            for of, share, sd in stretch
+            if sd > 0.0
+        ),
+    ]
 
 
 def rsus_text(infos: Iterable[RsuInfo]) -> str:

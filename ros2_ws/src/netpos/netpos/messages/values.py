@@ -287,8 +287,8 @@ class RsuErrors:
 
     scatter : sd of single values over the one stated; bias, bias_sd, bias_spread : m or rad, how
     much too large the values are now, the sd of that, and the sd of the bias over time
-    stretch, stretch_sd : by which share all distances of its network are too long, and the sd of
-    that; 0 of what is no distance
+    stretch, stretch_sd : by which share all distances that the device's track hears are too long,
+    and the sd of that; 0 of what is no distance
     """
 
     stamp_ns: int

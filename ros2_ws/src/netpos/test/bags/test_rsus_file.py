@@ -96,33 +96,61 @@ def test_what_was_learned_is_saved_and_serves_the_next_day(bags: Path, tmp_path:
     assert nees["told"] < 0.3 * nees["tuesday"]
 
 
+def learned_of(rsu_id: str, quantity: str, **learned: float) -> RsuErrors:
+    """Of one quantity; what is not given is as stated."""
+    as_stated = {
+        "scatter": 1.0,
+        "bias": 0.1,
+        "bias_sd": 0.1,
+        "bias_spread": 0.1,
+        "correlation_time_s": 10.0,
+        "stretch": 0.0,
+        "stretch_sd": 0.0,
+    }
+    values = {name: (value,) for name, value in (as_stated | learned).items()}
+    return RsuErrors(stamp_ns=S, rsu_id=rsu_id, vue_id="v", quantities=(quantity,), **values)  # type: ignore[arg-type]
+
+
+def write_learned(bag: Path, learned: list[RsuErrors]) -> None:
+    with BagWriter(bag) as writer:
+        for info in INFOS:
+            writer.write(RSU_INFO, codec().rsu_info_to_msg(info), S)
+        for errors in learned:
+            writer.write(RSU_LEARNED, codec().rsu_errors_to_msg(errors), S)
+
+
 def test_the_biases_of_differences_are_those_of_their_rsus(tmp_path: Path) -> None:
     learned = [
-        RsuErrors(
-            stamp_ns=S,
-            rsu_id=pair,
-            vue_id="v",
-            quantities=("TDOA",),
-            scatter=(1.0,),
-            bias=(0.1,),
-            bias_sd=(0.1,),
-            bias_spread=(spread,),
-            correlation_time_s=(time_s,),
-            stretch=(0.0,),
-            stretch_sd=(0.0,),
-        )
+        learned_of(pair, "TDOA", bias_spread=spread, correlation_time_s=time_s)
         for pair, spread, time_s in (("a1-a0", 0.4, 10.0), ("a2-a1", 0.2, 30.0))
     ]
-    with BagWriter(tmp_path / "bag") as bag:
-        for info in INFOS:
-            bag.write(RSU_INFO, codec().rsu_info_to_msg(info), S)
-        for errors in learned:
-            bag.write(RSU_LEARNED, codec().rsu_errors_to_msg(errors), S)
+    write_learned(tmp_path / "bag", learned)
     saved = {info.rsu_id: info for info in save_rsus(tmp_path / "bag", tmp_path / "rsus.yaml")}
     expected = {"a0": (0.14, 10.0), "a1": (0.02, 30.0), "a2": (0.02, 30.0), "a3": (0.0, 0.0)}
     for name, (variance, time_s) in expected.items():
         assert saved[name].range_bias_sd_m ** 2 == pytest.approx(variance)
         assert saved[name].bias_correlation_time_s == pytest.approx(time_s)
+
+
+def test_distances_that_are_too_long_are_a_comment_of_the_file(tmp_path: Path) -> None:
+    learned = [
+        learned_of("a1", "RANGE", scatter=1.25, stretch=0.0694, stretch_sd=0.004),
+        learned_of("a2", "RANGE"),
+    ]
+    write_learned(tmp_path / "bag", learned)
+    save_rsus(tmp_path / "bag", tmp_path / "rsus.yaml")
+    comments = [
+        line.strip()
+        for line in (tmp_path / "rsus.yaml").read_text().splitlines()
+        if line.startswith("  #")
+    ]
+    assert comments == [
+        "# learned; scatter over the sd stated: RANGE 1.25",
+        "# learned; share by which distances are too long: RANGE 0.0694 +- 0.004",
+        "# learned; scatter over the sd stated: RANGE 1.00",
+    ]
+    read = {info.rsu_id for info in read_rsus(tmp_path / "rsus.yaml")}
+    assert read == {info.rsu_id for info in INFOS}
 
 
 def test_a_file_reads_as_it_was_saved(bags: Path, tmp_path: Path) -> None:

@@ -11,7 +11,8 @@ from netpos.estimation.rows import linear_rows
 from netpos.messages.values import Array, Field, Odometry, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.report import TrackOutput
-from netpos.tracking.rsus.learning import RATE, SCALE, SPREAD, ErrorModel, LearnedErrors
+from netpos.tracking.rsus.error_model import RATE, SCALE, SPREAD, ErrorModel
+from netpos.tracking.rsus.learning import LearnedErrors
 from netpos.tracking.tracker import Tracker
 
 RSUS = np.array(

@@ -25,7 +25,8 @@ from netpos.messages.values import (
     StepCalibration,
 )
 from netpos.tracking.rest import rests
-from netpos.tracking.rsus.learning import WINDOW_S, ErrorModel, LearnedErrors, Name
+from netpos.tracking.rsus.error_model import ErrorModel
+from netpos.tracking.rsus.learning import WINDOW_S, LearnedErrors, Name
 
 _RSU = "rsu/"
 REFERENCED = sum(int(r.field) for s, r in readings() if s.difference_of >= 0)

@@ -31,15 +31,16 @@ _TAIL = 5.0  # degrees of freedom of the errors of windows
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """What windows say of it: their information, that times the share, the information that is
-    left if slow errors are the same from window to window, and by how much the hypothesis that
-    there is one has foreseen them better. But for the last they fade."""
+    """What windows say of it. All but ``log_odds`` fades."""
 
     information: float = 0.0
+    """On the share (1)."""
     weighted: float = 0.0
+    """That times the share."""
     independent: float = 0.0
+    """Information that is left if slow errors are the same from window to window."""
     log_odds: float = 0.0
-    unit: float = 1.0
+    """By how much the hypothesis that there is one has foreseen the windows better."""
 
     def __add__(self, other: Stretch) -> Stretch:
         return Stretch(
@@ -51,12 +52,12 @@ class Stretch:
 
     @property
     def share(self) -> float:
-        """By which share distances are too long if they are."""
+        """By which share distances are too long if they are (1)."""
         return self.weighted / (_PRIOR_INFORMATION + self.information)
 
     @property
     def sd(self) -> float:
-        """Of that."""
+        """Of that (1)."""
         return 1.0 / math.sqrt(_PRIOR_INFORMATION + self.independent)
 
     def is_one(self, believed: bool) -> bool:
@@ -66,13 +67,14 @@ class Stretch:
         return likelier and (believed or abs(self.share) > _CERTAIN_SD * self.sd)
 
     def seen(
-        self, left: Array, distance: Array, news: Array, share: float, log_odds: float
+        self, left: Array, distance: Array, independent: Array, share: float, log_odds: float
     ) -> Stretch:
-        """With a window more, after which the hypothesis is likelier by ``log_odds``.
+        """With a window more of m distances, after which the hypothesis is likelier by
+        ``log_odds``.
 
-        left, distance : (m,) what is left of residuals after ``share`` was taken out, and of the
-            distances, both over the sd of the residual
-        news : (m,) part of each that is news; of slow errors little is
+        left, distance : (m,) what is left of residuals after ``share`` (1) was taken out, and of
+            the distances, both over the sd of the residual
+        independent : (m,) part of each variance that is not the same from window to window
         """
         weight = np.minimum((_TAIL + 1.0) / (_TAIL + left**2), 1.0)
         new = weight * distance**2
@@ -80,7 +82,7 @@ class Stretch:
         return Stretch(
             old * self.information + information,
             old * self.weighted + float(weight @ (distance * left)) + share * information,
-            old * self.independent + float(news @ new),
+            old * self.independent + float(independent @ new),
             log_odds,
         )
 
