@@ -1,28 +1,24 @@
 """What RSUs really measure, learned from how they contradict each other.
 
-The residuals of all RSUs are compared in windows of a second: what a shift of the position and of
-the clock explains is taken out of them (``shift``),
+Every second the residuals of all RSUs are compared: what a shift of the position and of the clock
+explains is taken out of them,
 
-    r = h(x + d + w) - h(x) + b + n,
+    r = h(x + d) - h(x) + b + n,   y = (r - h(x + d^) + h(x)) / sqrt(1 - leverage),
 
-with any shift d and with w, by which the device may have moved otherwise than straight ahead
-within the window. The straight way x has the velocity of before the window: residuals of the
-estimates themselves would have the updates in them, which absorb what RSUs disagree by, the more
-the fewer there are. What the others do not foresee of a residual (studentised: Cook and Weisberg
-1982) scatters as the bias b and the noise n do, and what the track believes of the position is not
-in it: a track that is wrong must not take its own error for that of the RSUs. Where RSUs are heard
-so seldom that they do not check each other within a second, a window goes on until they do.
-
-What a window says of an RSU is in ``error_model``. Whether distances are too long by a share that
-all have in common is learned beside it (``stretch``), by two hypotheses that hear the same
+with d^ of least squares (``shift``), so that y scatters as the bias b and the noise n do
+(studentised residuals, Cook and Weisberg 1982) and neither the motion model nor what the track
+believes of the position is in it: a track that is wrong must not take its own error for that of
+the RSUs. What y says of each RSU is in ``error_model``. Whether distances are too long by a share
+that all have in common is learned beside it (``stretch``), by two hypotheses that hear the same
 windows.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import add
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -31,15 +27,12 @@ from netpos.estimation.measurement import KIND, VALUE
 from netpos.estimation.sensors.table import SENSORS
 from netpos.messages.values import Array
 from netpos.tracking.rsus.error_model import ErrorModel
-from netpos.tracking.rsus.shift import DeviceState, Left, Way, residuals_on, unshifted
+from netpos.tracking.rsus.shift import unshifted
 from netpos.tracking.rsus.stretch import NONE_SEEN, Stretch, together
 
 WINDOW_S = 1.0
-"""Length of a window; values of an RSU within it count as one until their scatter says
-otherwise."""
+"""Values of an RSU within it count as one until their scatter says otherwise."""
 _WINDOW_NS = round(WINDOW_S * 1e9)
-_ENOUGH = 0.9  # of a measurement that others check: a window of less goes on
-_LONGEST_NS = 10 * _WINDOW_NS
 _ALONE = 0.05  # 1 - leverage of a row that nobody checks
 _SAME_UNIT = 0.01  # relative
 _STRETCHING = [s.kind for s in SENSORS if s.stretches]
@@ -48,17 +41,9 @@ Name = tuple[str, str]
 _STRETCH: Name = "distances", "stretch"
 Models = dict[Name, ErrorModel]
 Learned = ErrorModel | Stretch
-
-
-class _Value(NamedTuple):
-    """A row (ROW_WIDTH,) as it was heard, what it says of its residual by the variance that the
-    update took, and what the update left of it, over the sd stated."""
-
-    name: Name
-    stamp_ns: int
-    row: Array
-    information: float
-    left: float
+Sums = tuple[float, ...]
+"""Of the rows of a window: information, and that times residual; number, residual and its square
+over the sd stated; half the square of the step from the value before; that value."""
 
 
 class Others(Protocol):
@@ -74,74 +59,45 @@ class Others(Protocol):
 class _Window(NamedTuple):
     """What was heard of m RSUs and quantities in a window.
 
-    rows : (m, ROW_WIDTH) the last of each; residual, variance : (m,) their mean on a straight way,
-    and its variance by what is stated; way : that of the device; after : its state at the end;
-    distance : (m,) m, 0 where it is none; scatter : of each what ``ErrorModel.scattered`` takes
+    rows : (m, ROW_WIDTH) the last of each; residual, variance : (m,) their mean, and its variance
+    by what is stated; distance : (m,) m, 0 where it is none; scatter : of each what
+    ``ErrorModel.scattered`` takes
     """
 
     names: list[Name]
     rows: Array
     residual: Array
     variance: Array
-    way: Way
-    after: DeviceState
     distance: Array
     scatter: list[tuple[float, float, float]]
 
     @classmethod
-    def of(cls, values: Sequence[_Value], before: DeviceState, after: DeviceState) -> _Window:
-        """What ``values`` say that were heard since one posterior and until another."""
-        of_name: dict[Name, list[int]] = {}
-        for k, value in enumerate(values):
-            of_name.setdefault(value.name, []).append(k)
-        rows = np.array([value.row for value in values])
-        stamps_ns = np.array([value.stamp_ns for value in values])
-        weights = np.zeros((len(of_name), len(values)))
-        scatter = []
-        for i, of_it in enumerate(of_name.values()):
-            weights[i, of_it] = [values[k].information for k in of_it]
-            z = np.array([values[k].left for k in of_it])
-            square, steps = float(((z - z.mean()) ** 2).sum()), float((np.diff(z) ** 2).sum())
-            scatter.append((square, len(of_it) - 1.0, steps / 2.0))
-        information = weights.sum(axis=1)
-        weights /= information[:, None]
-        residual = weights @ residuals_on((before, after), rows, stamps_ns)
-        way = Way.of(stamps_ns, weights, before)
-        last = rows[[of_it[-1] for of_it in of_name.values()]]
-        distance = np.where(np.isin(last[:, KIND], _STRETCHING), last[:, VALUE], 0.0)
-        return cls(list(of_name), last, residual, 1.0 / information, way, after, distance, scatter)
+    def of(cls, sums: Mapping[Name, Sums], newest: Mapping[Name, Array]) -> _Window:
+        """What ``sums`` of rows, and the ``newest`` of them (ROW_WIDTH,), say."""
+        names, total = list(sums), np.array(list(sums.values()))
+        variance = 1.0 / total[:, 0]
+        square = total[:, 4] - total[:, 3] ** 2 / total[:, 2]
+        scatter = np.column_stack([square, total[:, 2] - 1.0, total[:, 5]]).tolist()
+        rows = np.array([newest[name] for name in names])
+        distance = np.where(np.isin(rows[:, KIND], _STRETCHING), rows[:, VALUE], 0.0)
+        return cls(names, rows, total[:, 1] * variance, variance, distance, scatter)
 
     def moved(self, share: float) -> _Window:
         """With the residuals where ``share`` of the distance more had been left in."""
         return self._replace(residual=self.residual + share * self.distance)
 
 
-class _Seen(NamedTuple):
-    """A window as the models of a hypothesis see it.
+class _Left(NamedTuple):
+    """What the best shift of the device leaves of a window.
 
-    models : of each, with the scatter within the window; left : what a shift leaves of it;
-    independent : (m,) part of each variance that is not the same from window to window
+    residual, distance : (m,) over the sd of the residual; checked : (m,) one minus the leverage;
+    independent : (m,) part of the variance that is not the same from window to window
     """
 
-    models: list[ErrorModel]
-    left: Left
+    residual: Array
+    distance: Array
+    checked: Array
     independent: Array
-
-    @classmethod
-    def of(cls, models: Models, window: _Window) -> _Seen:
-        """What ``models`` see."""
-        mine = [
-            models[name].scattered(*of_it)
-            for name, of_it in zip(window.names, window.scatter, strict=True)
-        ]
-        noise = np.array([m.scale for m in mine]) * window.variance
-        slow = np.array([m.bias_sd for m in mine]) ** 2
-        sd = np.sqrt(noise + slow)
-        lasts = np.array([m.time_s(0.0) for m in mine]) * 2.0 / WINDOW_S
-        left = unshifted(
-            window.rows, window.residual, sd, window.way, window.after, window.distance
-        )
-        return cls(mine, left, sd**2 / (noise + slow * np.maximum(lasts, 1.0)))
 
 
 @dataclass(slots=True)
@@ -163,10 +119,10 @@ class LearnedErrors:
     """Whether it is likelier that there is one; rows leave it out then."""
     moved_m: float = 0.0
     moved_ns: int = -1
-    heard: list[_Value] = field(default_factory=list)
-    """In the window that goes on."""
-    before: DeviceState | None = None
-    """With which the window before ended."""
+    window_ns: int = -1
+    window: dict[Name, Sums] = field(default_factory=dict)
+    newest: dict[Name, Array] = field(default_factory=dict)
+    """The last row (ROW_WIDTH,) of each in the window."""
 
     def copy(self) -> LearnedErrors:
         """An independent copy."""
@@ -174,7 +130,8 @@ class LearnedErrors:
             self,
             models=self.models.copy(),
             unlikelier=self.unlikelier.copy(),
-            heard=self.heard.copy(),
+            window=self.window.copy(),
+            newest=self.newest.copy(),
         )
 
     def model(
@@ -202,67 +159,82 @@ class LearnedErrors:
             self.moved_m += speed_mps * (stamp_ns - self.moved_ns) * 1e-9
         self.moved_ns = stamp_ns
 
-    def hear(self, value: tuple[Name, int, Array], left: Sequence[float], stated: float) -> None:
-        """Note whose row (ROW_WIDTH,) it is, its stamp and the row, what is left of it by
-        ``unexplained``, and the variance stated."""
-        model = self.models[value[0]]
-        self.heard.append(_Value(*value, model.scale / left[2], left[0] / math.sqrt(stated)))
-        self.models[value[0]] = model.heard(left[1] / stated)
+    def hear(self, name: Name, row: Array, left: list[float], stated: float) -> None:
+        """Note a row (ROW_WIDTH,), what is left of it by ``unexplained``, and the variance
+        stated."""
+        model = self.models[name]
+        information, r = model.scale / left[2], left[0]
+        z = r / math.sqrt(stated)
+        old = self.window.get(name)
+        step = 0.0 if old is None else 0.5 * (z - old[-1]) ** 2
+        new = (information, information * r, 1.0, z, z * z, step)
+        self.window[name] = (*(new if old is None else map(add, old, new)), z)
+        self.newest[name] = row
+        self.models[name] = model.heard(left[1] / stated)
 
-    def conclude(self, posterior: DeviceState) -> list[Name]:
-        """Weigh a window that is over with the epoch of a posterior; whose models changed."""
-        stamp_ns, values, before = posterior.stamp_ns, self.heard, self.before
-        if before is None or not values:
-            self.heard, self.before = [], posterior
+    def conclude(self, stamp_ns: int, mean: Array, height_m: float) -> list[Name]:
+        """Weigh a window that is over, seen from the mean (n,) of the posterior; whose models
+        changed."""
+        if self.window_ns < 0:
+            self.window_ns = stamp_ns
+        if stamp_ns < self.window_ns + _WINDOW_NS:
             return []
-        if stamp_ns < before.stamp_ns + _WINDOW_NS:
+        sums, newest = self.window, self.newest
+        self.window, self.newest, self.window_ns = {}, {}, stamp_ns
+        if not sums:
             return []
-        window = _Window.of(values, before, posterior)
-        seen = _Seen.of(self.models, window)
-        goes_on = stamp_ns < values[0].stamp_ns + _LONGEST_NS
-        if goes_on and seen.left.checked.sum() < _ENOUGH:
-            return []
-        self.heard, self.before = [], posterior
-        changed = self._weigh(self.models, window, seen)
+        heard, seen_from = _Window.of(sums, newest), (mean, height_m)
+        left = self._weigh(self.models, heard, stamp_ns, seen_from)
+        changed = [name for name, c in zip(heard.names, left.checked, strict=True) if c > _ALONE]
         for name in changed:
             _choose(self.models, name, self._known(name, stamp_ns, self.models[name].unit))
-        if window.distance.any():
-            self._weigh_stretch(window, seen)
+        if heard.distance.any():
+            self._weigh_stretch(heard, left, stamp_ns, seen_from)
         for name in changed:
             self._tell(stamp_ns, name, self.models[name])
         return changed
 
-    def _weigh(self, models: Models, window: _Window, seen: _Seen) -> list[Name]:
-        """Weigh the candidates of ``models`` by a window; whose changed."""
-        left, changed = seen.left, []
-        for i, name in enumerate(window.names):
-            if left.checked[i] > _ALONE:
-                of_it = left.residual[i], window.variance[i], left.checked[i]
-                models[name] = seen.models[i].weigh(
-                    window.after.stamp_ns, self.moved_m, *(float(value) for value in of_it)
+    def _weigh(
+        self, models: Models, heard: _Window, stamp_ns: int, seen_from: tuple[Array, float]
+    ) -> _Left:
+        """Weigh the candidates of ``models`` by a window."""
+        mine = [
+            models[name].scattered(*of_it)
+            for name, of_it in zip(heard.names, heard.scatter, strict=True)
+        ]
+        noise = np.array([m.scale for m in mine]) * heard.variance
+        slow = np.array([m.bias_sd for m in mine]) ** 2
+        sd = np.sqrt(noise + slow)
+        left, checked, distance = unshifted(
+            heard.rows, heard.residual, sd, *seen_from, heard.distance
+        )
+        for i, name in enumerate(heard.names):
+            if checked[i] > _ALONE:
+                y = float(left[i] / math.sqrt(checked[i]))
+                models[name] = mine[i].weigh(
+                    stamp_ns, self.moved_m, y, float(heard.variance[i]), float(checked[i])
                 )
-                changed.append(name)
-        return changed
+        lasts = np.array([m.time_s(0.0) for m in mine]) * 2.0 / WINDOW_S
+        independent = sd**2 / (noise + slow * np.maximum(lasts, 1.0))
+        return _Left(left / sd, distance / sd, checked, independent)
 
-    def _weigh_stretch(self, window: _Window, seen: _Seen) -> None:
+    def _weigh_stretch(
+        self, heard: _Window, left: _Left, stamp_ns: int, seen_from: tuple[Array, float]
+    ) -> None:
         """Weigh the two hypotheses on the stretch by a window, of which the likelier one has
-        ``seen`` that."""
-        share, stamp_ns = self.stretch.share, window.after.stamp_ns
-        other = window.moved(share if self.stretched else -share)
-        seen_by_other = _Seen.of(self.unlikelier, other)
-        for name in self._weigh(self.unlikelier, other, seen_by_other):
-            _choose(self.unlikelier, name, [])
+        ``left`` that."""
+        share = self.stretch.share
+        other = heard.moved(share if self.stretched else -share)
+        other_left = self._weigh(self.unlikelier, other, stamp_ns, seen_from)
+        for name, checked in zip(heard.names, other_left.checked, strict=True):
+            if checked > _ALONE:
+                _choose(self.unlikelier, name, [])
         without, stretched = self.models, self.unlikelier
         if self.stretched:
-            without, stretched = stretched, without
-        of_stretched = seen if self.stretched else seen_by_other
+            without, stretched, other_left = stretched, without, left
         gained = sum(stretched[name].log_fit - without[name].log_fit for name in stretched)
         self.own_stretch = self.own_stretch.seen(
-            of_stretched.left.white,
-            of_stretched.left.beside,
-            of_stretched.independent,
-            share,
-            gained,
+            other_left.residual, other_left.distance, other_left.independent, share, gained
         )
         self._decide(stamp_ns)
         self._tell(stamp_ns, _STRETCH, self.own_stretch)

@@ -27,7 +27,6 @@ from netpos.messages.values import (
 from netpos.tracking.rest import rests
 from netpos.tracking.rsus.error_model import ErrorModel
 from netpos.tracking.rsus.learning import WINDOW_S, LearnedErrors, Name
-from netpos.tracking.rsus.shift import DeviceState
 
 _RSU = "rsu/"
 REFERENCED = sum(int(r.field) for s, r in readings() if s.difference_of >= 0)
@@ -280,15 +279,19 @@ class BiasStates:
         return self._biases[name]
 
     def learn(
-        self, rows: Array, accepted: Array, posterior: DeviceState
+        self,
+        stamp_ns: int,
+        fitted: tuple[Array, Array],
+        posterior: tuple[Array, Array],
+        height_m: float,
     ) -> tuple[list[Name], list[PriorChange]]:
-        """Learn from what the ``posterior`` leaves of ``rows`` (m, ROW_WIDTH), of which groups
-        were ``accepted`` (groups,). Returns what was concluded of whom, and the bias states whose
-        sd changed."""
+        """Learn from what the ``posterior``, mean (n,) and covariance (n, n), leaves of the rows
+        ``fitted``, (m, ROW_WIDTH) and which groups were accepted (groups,). Returns what was
+        concluded of whom, and the bias states whose sd changed."""
         learned = self.learned
         if learned is None:
             return [], []
-        stamp_ns, mean, cov, height_m, _ = posterior
+        (rows, accepted), (mean, cov) = fitted, posterior
         names = {biases: name for name, biases in self._biases.items()}
         left = unexplained(mean, cov, rows, height_m).tolist()
         for row, said in zip(rows, left, strict=True):
@@ -296,12 +299,12 @@ class BiasStates:
             if name is None or not accepted[int(row[GROUP])]:
                 continue
             stated = float(row[GATE_VARIANCE]) / learned.models[name].gate_scale
-            learned.hear((name, stamp_ns, row), said, stated)
+            learned.hear(name, row, said, stated)
         velocity = mean[VELOCITY].tolist()
         still = rests(velocity, cov.diagonal()[VELOCITY].tolist())
         speed = 0.0 if still else math.hypot(*velocity)
         learned.move(stamp_ns, speed)
-        concluded = learned.conclude(posterior)
+        concluded = learned.conclude(stamp_ns, mean, height_m)
         return concluded, self._take_learned(learned, concluded, speed)
 
     def _take_learned(
