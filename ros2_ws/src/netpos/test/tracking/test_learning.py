@@ -13,6 +13,7 @@ from netpos.tracking.config import TrackerConfig
 from netpos.tracking.report import TrackOutput
 from netpos.tracking.rsus.error_model import RATE, SCALE, SPREAD, ErrorModel
 from netpos.tracking.rsus.learning import LearnedErrors
+from netpos.tracking.rsus.shared_errors import SharedErrors
 from netpos.tracking.tracker import Tracker
 
 RSUS = np.array(
@@ -361,6 +362,20 @@ def test_a_device_takes_over_what_others_have_learned() -> None:
     # RMSE: no worse than chance makes it, seed by seed.
     worse = np.subtract(helped, alone)[:, 0]
     assert worse.mean() < 2.0 * worse.std(ddof=1) / math.sqrt(worse.size)
+
+
+@pytest.mark.parametrize(("noise_sd", "is_taken"), [(0.1, True), (0.2, False)])
+def test_what_is_learned_in_another_unit_is_not_taken_over(
+    noise_sd: float, is_taken: bool
+) -> None:
+    """Candidates of biases are in units of the noise stated, where no bias is declared."""
+    shared, name = SharedErrors(settle_s=2.0), NAMES[0]
+    first = learned_of(slow_and_white(3, 60, 0.1, 0.5, 30.0), 0.1).models[name]
+    shared.note(("vue_1", 1), 60_000_000_000, name, first)
+    alone = LearnedErrors().model(name, noise_sd, 0.0, 0.0)
+    later = LearnedErrors(shared, ("vue_2", 1)).model(name, noise_sd, 0.0, 0.0, 90_000_000_000)
+    assert (later.bias_sd > 1.5 * alone.bias_sd) is is_taken
+    assert (later.gate_scale != alone.gate_scale) is is_taken
 
 
 def test_what_is_shared_does_not_depend_on_the_order_of_arrival() -> None:

@@ -90,14 +90,14 @@ class _Window(NamedTuple):
 class _Left(NamedTuple):
     """What the best shift of the device leaves of a window.
 
-    residual, distance : (m,) over the sd of the residual; checked : (m,) one minus the leverage;
-    independent : (m,) part of the variance that is not the same from window to window
+    residual, distance : (m,) over the sd of the residual; independent : (m,) part of the variance
+    that is not the same from window to window; changed : whose models it changed
     """
 
     residual: Array
     distance: Array
-    checked: Array
     independent: Array
+    changed: list[Name]
 
 
 @dataclass(slots=True)
@@ -185,19 +185,18 @@ class LearnedErrors:
             return []
         heard, seen_from = _Window.of(sums, newest), (mean, height_m)
         left = self._weigh(self.models, heard, stamp_ns, seen_from)
-        changed = [name for name, c in zip(heard.names, left.checked, strict=True) if c > _ALONE]
-        for name in changed:
+        for name in left.changed:
             _choose(self.models, name, self._known(name, stamp_ns, self.models[name].unit))
         if heard.distance.any():
             self._weigh_stretch(heard, left, stamp_ns, seen_from)
-        for name in changed:
+        for name in left.changed:
             self._tell(stamp_ns, name, self.models[name])
-        return changed
+        return left.changed
 
     def _weigh(
         self, models: Models, heard: _Window, stamp_ns: int, seen_from: tuple[Array, float]
     ) -> _Left:
-        """Weigh the candidates of ``models`` by a window."""
+        """Weigh the candidates of ``models`` by a window, as far as RSUs check each other."""
         mine = [
             models[name].scattered(*of_it)
             for name, of_it in zip(heard.names, heard.scatter, strict=True)
@@ -208,27 +207,27 @@ class LearnedErrors:
         left, checked, distance = unshifted(
             heard.rows, heard.residual, sd, *seen_from, heard.distance
         )
+        changed = []
         for i, name in enumerate(heard.names):
             if checked[i] > _ALONE:
                 y = float(left[i] / math.sqrt(checked[i]))
                 models[name] = mine[i].weigh(
                     stamp_ns, self.moved_m, y, float(heard.variance[i]), float(checked[i])
                 )
+                changed.append(name)
         lasts = np.array([m.time_s(0.0) for m in mine]) * 2.0 / WINDOW_S
         independent = sd**2 / (noise + slow * np.maximum(lasts, 1.0))
-        return _Left(left / sd, distance / sd, checked, independent)
+        return _Left(left / sd, distance / sd, independent, changed)
 
     def _weigh_stretch(
         self, heard: _Window, left: _Left, stamp_ns: int, seen_from: tuple[Array, float]
     ) -> None:
-        """Weigh the two hypotheses on the stretch by a window, of which the likelier one has
-        ``left`` that."""
+        """Weigh the two hypotheses on the stretch by a window; ``left``: of the likelier one."""
         share = self.stretch.share
         other = heard.moved(share if self.stretched else -share)
         other_left = self._weigh(self.unlikelier, other, stamp_ns, seen_from)
-        for name, checked in zip(heard.names, other_left.checked, strict=True):
-            if checked > _ALONE:
-                _choose(self.unlikelier, name, [])
+        for name in other_left.changed:
+            _choose(self.unlikelier, name, [])
         without, stretched = self.models, self.unlikelier
         if self.stretched:
             without, stretched, other_left = stretched, without, left
