@@ -54,6 +54,7 @@ __all__ = [
     "REFERENCE",
     "ROW_WIDTH",
     "SAME_BEND",
+    "SAME_BEND_S",
     "VALUE",
     "VARIANCE",
     "Kind",
@@ -77,6 +78,11 @@ __all__ = [
     "slow_error_of",
     "wrap",
 ]
+
+SAME_BEND_S = 1.0
+"""Values of an RSU have the same bend, what linearising leaves out, for so long where the device
+stays."""
+_SAME_BEND_WAY = 0.05  # of the distance
 
 
 @inlined
@@ -298,10 +304,22 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
 
 
 @inlined
-def same_bend_variance(row: Array, second_order_var: float) -> float:
+def same_bend_variance(row: Array, mean: Array, second_order_var: float) -> float:
     """``second_order_var`` of one value, times the number of values with the same bend: as white
-    noise of that variance they together count as one. In the unit of the row, squared."""
-    return float((1.0 + row[SAME_BEND]) * second_order_var)
+    noise of that variance they together count as one. In the unit of the row, squared.
+
+    Where the device of ``mean`` (n,) moves, they are those of a twentieth of its distance to the
+    RSU: farther on the direction has turned, and with the square of the distance the bend is
+    another one by a tenth.
+    """
+    values = 1.0 + row[SAME_BEND]
+    if row[SAME_BEND] > 0.0:
+        dx, dy = mean[X.PX] - row[ORIGIN], mean[X.PY] - row[ORIGIN + 1]
+        near = _SAME_BEND_WAY * math.sqrt(dx * dx + dy * dy)
+        way = SAME_BEND_S * math.sqrt(mean[X.VX] ** 2 + mean[X.VY] ** 2)
+        if way > near:
+            values = max(values * near / way, 1.0)
+    return float(values * second_order_var)
 
 
 @inlined

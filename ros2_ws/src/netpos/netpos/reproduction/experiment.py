@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from netpos.estimation.measurement import BIAS, HEIGHT, SAME_BEND
+from netpos.estimation.measurement import BIAS, HEIGHT, SAME_BEND, SAME_BEND_S
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.estimation.state import N_CORE, POSITION, VELOCITY, HeightState, X
 from netpos.evaluation.bounds import bound_covariances
@@ -20,7 +20,7 @@ from netpos.scenario import Simulation, load_scenario
 from netpos.scenario.simulation import Beacons
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimators.models import height_state, pose_state
-from netpos.tracking.rsus.rsu import LINEARISATION_S, Rsu, values_as_one
+from netpos.tracking.rsus.rsu import Rsu, values_as_one
 
 VUE = "vue_1"
 
@@ -176,7 +176,7 @@ def _note_same_bends(rows: Array, stamps_ns: Ints) -> None:
     order = order[rows[order, BIAS] >= 0.0]
     since_s = np.diff(stamps_ns[order]) * 1e-9
     again = np.diff(rows[order, BIAS]) == 0.0
-    values = [values_as_one(LINEARISATION_S, s) for s in since_s[again].tolist()]
+    values = [values_as_one(SAME_BEND_S, s) for s in since_s[again].tolist()]
     rows[order[1:][again], SAME_BEND] = np.array(values) - 1.0
 
 

@@ -7,7 +7,7 @@ import math
 import filter_rows
 import numpy as np
 import pytest
-from curved_rows import bends
+from curved_rows import bends, values_of_a_bend
 from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import (
     BIAS,
@@ -153,7 +153,7 @@ def test_other_rows_follow_at_the_result() -> None:
         z, H = linearise(linear, expected, 0.5)
         z -= bends(expected, expected_cov, linear, 0.5)
         bent = [curvature_variance(r, expected, expected_cov, 0.5) for r in linear]
-        extra = (1.0 + linear[:, SAME_BEND]) * bent
+        extra = values_of_a_bend(expected, linear) * bent
         gain = expected_cov @ H.T
         gain @= np.linalg.inv(H @ gain + np.diag(linear[:, VARIANCE] + extra))
         np.testing.assert_allclose(x, expected + gain @ z, rtol=1e-9)

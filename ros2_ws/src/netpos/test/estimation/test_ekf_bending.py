@@ -19,7 +19,7 @@ from netpos.estimation.measurement import (
     Kind,
     linearise,
 )
-from netpos.estimation.state import X
+from netpos.estimation.state import VELOCITY, X
 from netpos.estimation.update import fit, fusion
 from netpos.estimation.update.predicted import predict_rows
 from netpos.messages.values import Array
@@ -95,16 +95,23 @@ def test_update_adds_the_curvature_to_both_variances() -> None:
     assert nis == pytest.approx(innovation[0] ** 2 / S, rel=1e-6)
 
 
-@pytest.mark.parametrize("more", [0.0, 3.0, 36.0])
-def test_what_linearising_leaves_out_of_repeated_values_averages_as_one(more: float) -> None:
-    """As if the curvature came in ``more`` values more: in the update, not in the gate."""
+@pytest.mark.parametrize(
+    ("more", "speed", "values"),
+    [(0.0, 0.0, 1.0), (3.0, 0.0, 4.0), (36.0, 1.5, 37.0), (36.0, 3.0, 18.5), (36.0, 60.0, 1.0)],
+)
+def test_what_linearising_leaves_out_of_repeated_values_averages_as_one(
+    more: float, speed: float, values: float
+) -> None:
+    """As if the curvature came in that many ``values``, those of a second or of 1.5 m, a twentieth
+    of the distance: in the update, not in the gate."""
     mean, cov, rows = curved_group()
+    mean[VELOCITY] = 0.6 * speed, -0.8 * speed
     rows[:, SAME_BEND] = more
     x, P, _, nis, _ = updated(mean, cov, rows, 0.0, NO_GATE, 1)
     curvature = 400.0**2 / 2 / 30.0**2
     innovation, H = linearise(rows, mean, 0.0)
     innovation -= 400.0 / 2 / 30.0
-    expected = fused(mean, cov, innovation, H, np.array([0.01 + (1.0 + more) * curvature]))
+    expected = fused(mean, cov, innovation, H, np.array([0.01 + values * curvature]))
     np.testing.assert_allclose(x, expected[0], rtol=1e-7)
     np.testing.assert_allclose(P, expected[1], rtol=1e-7, atol=1e-9)
     S = float((H @ cov @ H.T)[0, 0]) + 0.01 + curvature

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from curved_rows import bends, log_posterior_cost, range_problem
+from curved_rows import bends, log_posterior_cost, range_problem, values_of_a_bend
 from filter_rows import random_spd
 from netpos.estimation.measurement import (
     AXES,
@@ -85,7 +85,7 @@ def test_surprise_is_what_scipy_makes_of_it(more: float) -> None:
     innovation -= bends(mean, cov, rows)
     bent = np.array([second_order_variance(row, mean, cov, 0.0) for row in rows])
     single = H @ cov @ H.T + np.diag(rows[:, VARIANCE] + bent)
-    S = single + np.diag(more * bent)
+    S = single + np.diag((values_of_a_bend(mean, rows) - 1.0) * bent)
     distance, size = neg2_log_likelihood(mean, cov, rows)
     assert distance == pytest.approx(innovation @ np.linalg.solve(S, innovation), rel=1e-9)
     assert size == pytest.approx(np.linalg.slogdet(2.0 * np.pi * single)[1], rel=1e-9)

@@ -7,7 +7,7 @@ import math
 import filter_rows
 import numpy as np
 import pytest
-from curved_rows import bends
+from curved_rows import bends, values_of_a_bend
 from engine_cases import opened
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -287,7 +287,7 @@ def test_level_of_a_manoeuvre_is_linearised_at_its_own_answer() -> None:
         x = prior + wide @ H.T @ np.linalg.solve(S, z + H @ (x - prior))
         P = wide - wide @ H.T @ np.linalg.solve(S, H @ wide)
         bent = np.array([curvature_variance(row, x, P, height_m) for row in used])
-        bent *= 1.0 + used[:, SAME_BEND]
+        bent *= values_of_a_bend(x, used)
         longer = bends(x, P, used, height_m)
     assert (bent[1:] > 0.01 * used[1:, VARIANCE]).all()
     expected = np.linalg.norm(x[POSITION] - mean[POSITION]) + protection_level(

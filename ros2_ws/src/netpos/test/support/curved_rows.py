@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 from filter_rows import row
 from netpos.estimation.measurement import (
+    ORIGIN,
+    SAME_BEND,
     VARIANCE,
     Kind,
     curvature_mean,
     curvature_variance,
     linearise,
 )
-from netpos.estimation.state import X
+from netpos.estimation.state import POSITION, VELOCITY, X
 from netpos.messages.values import Array
 
 
@@ -48,3 +50,12 @@ def two_variances(mean: Array, cov: Array, rows: Array) -> Array:
     """Variances of an update: the rows' and the curvature's."""
     extra = [curvature_variance(r, mean, cov, 0.0) for r in rows]
     return np.asarray(rows[:, VARIANCE] + extra)
+
+
+def values_of_a_bend(mean: Array, rows: Array) -> Array:
+    """How many values have the bend of each row: those of a second, or of a twentieth of the
+    distance."""
+    distance = np.linalg.norm(mean[POSITION] - rows[:, ORIGIN : ORIGIN + 2], axis=1)
+    speed = max(float(np.linalg.norm(mean[VELOCITY])), 1e-9)
+    values: Array = 1.0 + rows[:, SAME_BEND]
+    return np.maximum(values * np.minimum(distance / 20.0 / speed, 1.0), 1.0)

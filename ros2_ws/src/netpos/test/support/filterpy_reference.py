@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from curved_rows import values_of_a_bend
 from filterpy import kalman
 from netpos.estimation.forms.sigma import ALPHA, BETA, kappa
 from netpos.estimation.measurement import (
@@ -18,7 +19,6 @@ from netpos.estimation.measurement import (
     KIND,
     ORIGIN,
     REFERENCE,
-    SAME_BEND,
     VALUE,
     VARIANCE,
     Kind,
@@ -81,14 +81,14 @@ def ekf_predict(mean: Array, cov: Array, dt: float, motion: Array, bias: Array) 
 def _ekf(mean: Array, cov: Array, rows: Array, column: int, height_m: float) -> Any:
     reference = kalman.ExtendedKalmanFilter(dim_x=mean.size, dim_z=len(rows))
     reference.x, reference.P = mean.copy(), cov.copy()
-    curvature = [curvature_variance(row, mean, cov, height_m) for row in rows]
-    values = 1.0 + rows[:, SAME_BEND] * (column == VARIANCE)
+    bent = np.array([curvature_variance(row, mean, cov, height_m) for row in rows])
+    bent *= values_of_a_bend(mean, rows) if column == VARIANCE else 1.0
     bend = np.array([curvature_mean(row, mean, cov, height_m) for row in rows])
     reference.update(
         rows[:, VALUE] - bend,
         lambda x: linearise(rows, x, height_m)[1],
         lambda x: _values(rows, x, height_m),
-        R=np.diag(rows[:, column] + values * curvature),
+        R=np.diag(rows[:, column] + bent),
         residual=_difference(rows),
     )
     return reference

@@ -13,7 +13,7 @@ array a compiled kernel can take:
     blocked; 0: the option's), HEIGHT (state index of the device's height over the nominal one; 0:
     the height is known), REFERENCE (state index of the bias that is subtracted, that of the RSU a
     difference counts from; 0: none), SAME_BEND (how many more values of its RSU have the
-    same bend, which is what linearising leaves out)
+    same bend, which is what linearising leaves out, while the device stays)
 
 A sensor may keep other figures in ORIGIN and AXES; its module says which.
 """

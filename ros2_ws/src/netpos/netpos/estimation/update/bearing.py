@@ -158,7 +158,7 @@ def fuse_around(mean: Array, cov: Array, rows: Array, height_m: float, work: Arr
     variance = rows[:, VARIANCE].copy()
     for i in range(m):
         variance[i] += same_bend_variance(
-            rows[i], curvature_variance(rows[i], mean, cov, height_m)
+            rows[i], mean, curvature_variance(rows[i], mean, cov, height_m)
         )
         innovation[i] -= curvature_mean(rows[i], mean, cov, height_m)
     fuse(mean, cov, innovation, H, variance, use, work)

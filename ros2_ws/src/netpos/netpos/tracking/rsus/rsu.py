@@ -11,7 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from netpos.common.pair_errors import of_each_receiver
-from netpos.estimation.measurement import BIAS, GATE_VARIANCE, GROUP, REFERENCE, Kind
+from netpos.estimation.measurement import (
+    BIAS,
+    GATE_VARIANCE,
+    GROUP,
+    REFERENCE,
+    SAME_BEND_S,
+    Kind,
+)
 from netpos.estimation.rows import WHITE, RowErrors, rsu_axes, rsu_place, scalar_kinds
 from netpos.estimation.sensors.table import BY_KIND, SENSORS, readings
 from netpos.estimation.state import N_CORE, VELOCITY
@@ -31,8 +38,6 @@ from netpos.tracking.rsus.learning import WINDOW_S, LearnedErrors, Name
 _RSU = "rsu/"
 REFERENCED = sum(int(r.field) for s, r in readings() if s.difference_of >= 0)
 """Fields that compare the RSU with a second one."""
-LINEARISATION_S = 1.0
-"""Values of an RSU have the same bend, what linearising leaves out, for so long."""
 _RENEWED_S = 1e-6  # correlation time of what is new at every epoch
 _SLOW = {name for s in SENSORS for name in (s.bias_sd, s.common_bias_sd) if name is not None}
 
@@ -235,7 +240,7 @@ class BiasStates:
                 other = self._bias_slot(reference, kind)
         common = self._common_slot(rsu, kind) if rsu.common_bias_sd(kind) > 0.0 else -1
         inflation = scale * self._inflation(m, tau_s, kind)
-        same_bend = self._inflation(m, LINEARISATION_S, kind) - 1.0 if own >= 0 else 0.0
+        same_bend = self._inflation(m, SAME_BEND_S, kind) - 1.0 if own >= 0 else 0.0
         return RowErrors(own, common, other, inflation, gate, same_bend, self._stretch(kind)[0])
 
     def _stretch(self, kind: Kind) -> tuple[float, float]:

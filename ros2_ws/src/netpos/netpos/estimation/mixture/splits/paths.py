@@ -148,13 +148,14 @@ def add(
     apply_predicted(end, direct_log, rows, options, options.gate_nis, found, work)
     found.blocked[end] = 0.0
     found.means[end + 1], found.covs[end + 1] = mean, cov
+    bent = predicted.second_order_var[late]
     nis = fuse_by(
         paths.blocked,
         found.means[end + 1],
         found.covs[end + 1],
         predicted.H[late, : mean.size].copy(),
         predicted.innovation[late],
-        rows[late, VARIANCE] + same_bend_variance(rows[late], predicted.second_order_var[late]),
+        rows[late, VARIANCE] + same_bend_variance(rows[late], mean, bent),
     )
     found.accepted[end + 1, 0], found.used[end + 1], found.within_s[end + 1] = 1.0, 0.0, 0.0
     if rows.shape[0] > 1:
