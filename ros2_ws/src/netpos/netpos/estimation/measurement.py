@@ -304,25 +304,6 @@ def curvature_variance(row: Array, mean: Array, cov: Array, height_m: float) -> 
 
 
 @inlined
-def same_bend_variance(row: Array, mean: Array, second_order_var: float) -> float:
-    """``second_order_var`` of one value, times the number of values with the same bend: as white
-    noise of that variance they together count as one. In the unit of the row, squared.
-
-    Where the device of ``mean`` (n,) moves, they are those of a twentieth of its distance to the
-    RSU: farther on the direction has turned, and with the square of the distance the bend is
-    another one by a tenth.
-    """
-    values = 1.0 + row[SAME_BEND]
-    if row[SAME_BEND] > 0.0:
-        dx, dy = mean[X.PX] - row[ORIGIN], mean[X.PY] - row[ORIGIN + 1]
-        near = _SAME_BEND_WAY * math.sqrt(dx * dx + dy * dy)
-        way = SAME_BEND_S * math.sqrt(mean[X.VX] ** 2 + mean[X.VY] ** 2)
-        if way > near:
-            values = max(values * near / way, 1.0)
-    return float(values * second_order_var)
-
-
-@inlined
 def curvature_mean(row: Array, mean: Array, cov: Array, height_m: float) -> float:
     """How far the mean value of ``row`` is above that at ``mean`` (n,), for a prior ``cov`` (n,
     n): half the trace of h'' P of the second-order extended Kalman filter (Bar-Shalom, Li and
@@ -352,6 +333,30 @@ def second_order_variance(row: Array, mean: Array, cov: Array, height_m: float) 
     if row[HEIGHT] > 0.0:
         return float(_second_order_in_3d(_EXACT, kind, row, (dx, dy, dz), cov))
     return float(_exact_second_order(kind, row, dx, dy, dz, cov, 2))
+
+
+@leaf
+def same_bend_variance(
+    row: Array, mean: Array, cov: Array, height_m: float, second_order_var: float
+) -> float:
+    """``second_order_var``, the ``curvature_variance`` of ``row``, and the true curvature once for
+    every other value with the same bend: as white noise of that variance they together count as
+    one. In the unit of the row, squared.
+
+    Where the device of ``mean`` (n,) moves, they are those of a twentieth of its distance to the
+    RSU: farther on the direction has turned, and with the square of the distance the bend is
+    another one by a tenth.
+    """
+    if row[SAME_BEND] == 0.0:
+        return second_order_var
+    values = 1.0 + row[SAME_BEND]
+    dx, dy = mean[X.PX] - row[ORIGIN], mean[X.PY] - row[ORIGIN + 1]
+    near = _SAME_BEND_WAY * math.sqrt(dx * dx + dy * dy)
+    way = SAME_BEND_S * math.sqrt(mean[X.VX] ** 2 + mean[X.VY] ** 2)
+    if way > near:
+        values = max(values * near / way, 1.0)
+    others = (values - 1.0) * second_order_variance(row, mean, cov, height_m)
+    return float(second_order_var + others)
 
 
 @leaf

@@ -118,6 +118,18 @@ def test_what_linearising_leaves_out_of_repeated_values_averages_as_one(
     assert nis == pytest.approx(innovation[0] ** 2 / S, rel=1e-6)
 
 
+def test_other_values_of_a_bend_have_the_true_curvature_of_a_direction() -> None:
+    """An azimuth bends by dx dy / r^2 alone, in the update by its largest curvature once."""
+    mean, cov = np.array([10.0, 0.0, 0, 0, 0, 0]), np.diag([4.0, 0.25, 1, 1, 1, 1.0])
+    rows = np.array([row(Kind.AZIMUTH, 0.05, 1e-4, 0, np.zeros(3))])
+    rows[:, SAME_BEND] = 9.0
+    x, P, *_ = updated(mean, cov, rows, 0.0, NO_GATE, 1)
+    largest, true = (4.0**2 + 0.25**2) / 2 / 10.0**4, 4.0 * 0.25 / 10.0**4
+    gain = 0.25 / 10.0 / (0.25 / 100.0 + 1e-4 + largest + 9.0 * true)
+    assert x[X.PY] == pytest.approx(gain * 0.05, rel=1e-9)
+    assert P[X.PY, X.PY] == pytest.approx(0.25 - gain * 0.25 / 10.0, rel=1e-9)
+
+
 def test_height_of_the_device_reaches_every_stage() -> None:
     """An RSU 3 m up: with the right height the range fits, with another it does not."""
     mean, cov = np.array([4.0, 0, 0, 0, 0, 0]), 0.01 * np.eye(6)

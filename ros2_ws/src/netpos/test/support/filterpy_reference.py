@@ -27,6 +27,7 @@ from netpos.estimation.measurement import (
     is_cyclic,
     linearise,
     predict_row,
+    second_order_variance,
     wrap,
 )
 from netpos.estimation.motion import noise, propagate, transition
@@ -82,7 +83,9 @@ def _ekf(mean: Array, cov: Array, rows: Array, column: int, height_m: float) -> 
     reference = kalman.ExtendedKalmanFilter(dim_x=mean.size, dim_z=len(rows))
     reference.x, reference.P = mean.copy(), cov.copy()
     bent = np.array([curvature_variance(row, mean, cov, height_m) for row in rows])
-    bent *= values_of_a_bend(mean, rows) if column == VARIANCE else 1.0
+    if column == VARIANCE:
+        true = np.array([second_order_variance(row, mean, cov, height_m) for row in rows])
+        bent += (values_of_a_bend(mean, rows) - 1.0) * true
     bend = np.array([curvature_mean(row, mean, cov, height_m) for row in rows])
     reference.update(
         rows[:, VALUE] - bend,

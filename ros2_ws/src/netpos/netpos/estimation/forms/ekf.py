@@ -218,8 +218,9 @@ def gate(
     is_open = math.isinf(gate_nis[gate_nis.size - 1])
     for i in range(m):
         bent = work[W_SECOND_ORDER, i]
-        work[W_VARIANCE, i] = rows[i, VARIANCE] + same_bend_variance(rows[i], mean, bent)
         work[W_GATE_VARIANCE, i] = rows[i, GATE_VARIANCE] + bent
+        bent = same_bend_variance(rows[i], mean, cov, height_m, bent)
+        work[W_VARIANCE, i] = rows[i, VARIANCE] + bent
     used, start = 0, 0
     while start < m:
         group = int(rows[start, GROUP])

@@ -230,7 +230,7 @@ def apply_about(
             variance[i] = rows[i, VARIANCE]
             if again:
                 bent = curvature_variance(rows[i], x, P, height_m)
-                variance[i] += same_bend_variance(rows[i], x, bent)
+                variance[i] += same_bend_variance(rows[i], x, P, height_m, bent)
                 innovation[i] -= curvature_mean(rows[i], x, P, height_m)
         for a in range(n):
             x[a] = prior_mean[a]

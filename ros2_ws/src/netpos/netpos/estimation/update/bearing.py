@@ -157,8 +157,7 @@ def fuse_around(mean: Array, cov: Array, rows: Array, height_m: float, work: Arr
     innovation, H = linearise(rows, mean, height_m)
     variance = rows[:, VARIANCE].copy()
     for i in range(m):
-        variance[i] += same_bend_variance(
-            rows[i], mean, curvature_variance(rows[i], mean, cov, height_m)
-        )
+        bent = curvature_variance(rows[i], mean, cov, height_m)
+        variance[i] += same_bend_variance(rows[i], mean, cov, height_m, bent)
         innovation[i] -= curvature_mean(rows[i], mean, cov, height_m)
     fuse(mean, cov, innovation, H, variance, use, work)

@@ -89,7 +89,7 @@ def neg2_log_likelihood(
         row = rows[index[a]]
         bent = second_order_variance(row, mean, cov, height_m)
         single[a, a] += row[VARIANCE] + bent
-        S[a, a] += row[VARIANCE] + same_bend_variance(row, mean, bent)
+        S[a, a] += row[VARIANCE] + same_bend_variance(row, mean, cov, height_m, bent)
     L, L_single = factor(S), factor(single)
     distance, size = 0.0, 0.0
     for i in range(innovation.size):

@@ -155,7 +155,7 @@ def add(
         found.covs[end + 1],
         predicted.H[late, : mean.size].copy(),
         predicted.innovation[late],
-        rows[late, VARIANCE] + same_bend_variance(rows[late], mean, bent),
+        rows[late, VARIANCE] + same_bend_variance(rows[late], mean, cov, options.height_m, bent),
     )
     found.accepted[end + 1, 0], found.used[end + 1], found.within_s[end + 1] = 1.0, 0.0, 0.0
     if rows.shape[0] > 1:
