@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from netpos.estimation.measurement import VALUE
 from netpos.estimation.rows import linear_rows
 from netpos.messages.values import Array, Field, Odometry, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
@@ -14,6 +15,7 @@ from netpos.tracking.report import TrackOutput
 from netpos.tracking.rsus.error_model import RATE, SCALE, SPREAD, ErrorModel
 from netpos.tracking.rsus.learning import LearnedErrors
 from netpos.tracking.rsus.shared_errors import SharedErrors
+from netpos.tracking.rsus.shift import DeviceState
 from netpos.tracking.tracker import Tracker
 
 RSUS = np.array(
@@ -24,11 +26,33 @@ NAMES = [("rsu/a", "RANGE"), ("rsu/b", "RANGE"), ("rsu/c", "RANGE"), ("rsu/d", "
 SIDES = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 
 
-def seen_from(side: list[float]) -> Array:
-    """Row (ROW_WIDTH,) of an RSU so far away that its value is linear in the position."""
-    H = np.zeros((1, 6))
-    H[0, :2] = side
-    return linear_rows(np.zeros(1), np.eye(1), H, 0)[0]
+OF_SIDES = {
+    tuple(side): linear_rows(np.zeros(1), np.eye(1), np.array([[*side, 0, 0, 0, 0]]), 0)[0]
+    for side in SIDES
+}
+
+
+def measured(side: Array, error: float, x: float = 0.0) -> Array:
+    """Row (ROW_WIDTH,) of an RSU so far away that its value is linear in the position, of a device
+    at (x, 0)."""
+    row = OF_SIDES[tuple(side)].copy()
+    row[VALUE] = error + side[0] * x
+    return row
+
+
+def known(stamp_ns: int, x: float = 0.0) -> DeviceState:
+    """Of a device at (x, 0), as everybody knows."""
+    mean = np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0])
+    return DeviceState(stamp_ns, mean, np.zeros((6, 6)), 0.0, 0.0)
+
+
+def hear(
+    learned: LearnedErrors, name: tuple[str, str], row: Array, stamp_ns: int, stated: float
+) -> None:
+    """Let a row (ROW_WIDTH,) of ``measured`` be heard of, with the variance stated."""
+    error = float(row[VALUE])
+    learned.move(stamp_ns, np.zeros(3), True)
+    learned.hear(name, row, [error, error**2, stated], stated)
 
 
 def learned_of(
@@ -40,14 +64,17 @@ def learned_of(
     learned = LearnedErrors()
     for name in NAMES:
         learned.model(name, stated_sd, 0.0, 0.0)
-    for k, row in enumerate(errors):
+    x = before = 0.0
+    for k, of_all in enumerate(errors):
         stamp_ns = k * 1_000_000_000 // rate_hz
-        for name, error, side in zip(NAMES, row.tolist(), SIDES.tolist(), strict=True):
+        speed = 0.0 if speeds is None else float(speeds[k])
+        x, before = x + 0.5 * (before + speed) / rate_hz, speed
+        learned.move(stamp_ns, np.array([speed, 0.0, 0.0]), speed == 0.0)
+        for name, error, side in zip(NAMES, of_all.tolist(), SIDES, strict=True):
             variance = learned.models[name].scale * stated_sd**2 * rate_hz
-            left = [error, error**2, variance]
-            learned.hear(name, seen_from(side), left, stated_sd**2)
-        learned.move(stamp_ns, 0.0 if speeds is None else float(speeds[k]))
-        learned.conclude(stamp_ns, np.zeros(6), 0.0)
+            row = measured(side, error, x)
+            learned.hear(name, row, [error, error**2, variance], stated_sd**2)
+        learned.conclude(known(stamp_ns, x))
     return learned
 
 
@@ -193,9 +220,9 @@ def test_nothing_is_learned_of_rsus_that_nobody_checks() -> None:
         learned.model(name, 0.1, 0.0, 0.0)
     before = {name: learned.models[name].bias_sd for name in NAMES[:2]}
     for k in range(500):
-        for name, side in zip(NAMES[:2], SIDES.tolist(), strict=False):
-            learned.hear(name, seen_from(side), [0.7, 0.49, 0.01], 0.01)
-        learned.conclude(k * 200_000_000, np.zeros(6), 0.0)
+        for name, side in zip(NAMES[:2], SIDES, strict=False):
+            hear(learned, name, measured(side, 0.7), k * 200_000_000, 0.01)
+        learned.conclude(known(k * 200_000_000))
     for name in NAMES[:2]:
         assert not learned.models[name].evidence.any()
         assert learned.models[name].bias_sd == before[name]
@@ -217,9 +244,9 @@ def test_a_copy_goes_its_own_way() -> None:
     twin = learned.copy()
     kept = {name: (m.bias_sd, m.scale) for name, m in twin.models.items()}
     for k, row in enumerate(errors[150:], start=150):
-        for name, error, side in zip(NAMES, row.tolist(), SIDES.tolist(), strict=True):
-            learned.hear(name, seen_from(side), [error, error**2, 0.01], 0.01)
-        learned.conclude(k * 200_000_000, np.zeros(6), 0.0)
+        for name, error, side in zip(NAMES, row.tolist(), SIDES, strict=True):
+            hear(learned, name, measured(side, error), k * 200_000_000, 0.01)
+        learned.conclude(known(k * 200_000_000))
     assert {name: (m.bias_sd, m.scale) for name, m in twin.models.items()} == kept
     assert any(learned.models[n].bias_sd != kept[n][0] for n in NAMES)
 
@@ -303,6 +330,59 @@ def test_a_late_measurement_ends_in_the_same_estimate_as_one_in_order() -> None:
     assert revised.stamp_ns == in_order.stamp_ns
     np.testing.assert_array_equal(revised.position, in_order.position)
     np.testing.assert_array_equal(revised.pose_cov, in_order.pose_cov)
+
+
+def in_turn(seed: int, noise_sd: float) -> list[RsuMeasurement]:
+    """Ranges of a device on a circle, 1 m/s, to four RSUs 40 m away: four a second, two of each
+    before the next one; 0.5 m is stated."""
+    rng, found = np.random.default_rng(seed), []
+    for k in range(4 * 240):
+        t, i = k / 4.0, k // 2 % 4
+        distance = float(np.linalg.norm(on_circle(t) - FAR[i]))
+        found.append(
+            RsuMeasurement(
+                stamp_ns=round((1.0 + t) * 1e9),
+                rsu_id=f"a{i}",
+                vue_id="vue_1",
+                sequence=k,
+                expected=1,
+                fields=Field.RANGE,
+                range_m=distance + float(rng.normal(0.0, noise_sd)),
+                range_var=0.25,
+            )
+        )
+    return found
+
+
+FAR = np.array([[40.0, 0.0, 2.0], [0.0, 40.0, 2.0], [-40.0, 5.0, 2.0], [3.0, -40.0, 2.0]])
+
+
+def on_circle(t: float) -> Array:
+    return np.array([14.0 * math.cos(t / 14.0), 14.0 * math.sin(t / 14.0), 0.0])
+
+
+@pytest.mark.parametrize("noise_sd", [0.25, 0.5, 1.0])
+def test_rsus_that_are_heard_in_turn_check_each_other(noise_sd: float) -> None:
+    """No second has the ranges of three, and every update is large: what it moved the estimate by
+    must not count as an agreement."""
+    nees, scatter = [], []
+    for seed in range(2):
+        tracker = Tracker(TrackerConfig(learn_errors=True))
+        for i, site in enumerate(FAR):
+            tracker.add_rsu(RsuInfo(rsu_id=f"a{i}", position=site))
+        outputs = []
+        for m in in_turn(seed, noise_sd):
+            tracker.add(m)
+            outputs += tracker.process()
+        newest = {e.rsu_id: e for output in outputs for e in output.errors}
+        scatter += [errors.scatter[0] for errors in newest.values()]
+        for o in (output.odometry for output in outputs):
+            if o is not None and o.stamp_ns > 61_000_000_000:
+                error = (o.position - on_circle(o.stamp_ns * 1e-9 - 1.0))[:2]
+                nees.append(float(error @ np.linalg.solve(o.pose_cov[:2, :2], error)))
+    assert len(scatter) == 8
+    assert 1.0 / 1.4 < np.mean(scatter) / (noise_sd / 0.5) < 1.4
+    assert 1.0 < np.mean(nees) < 3.3
 
 
 def test_what_is_learned_is_told_every_second() -> None:

@@ -13,6 +13,7 @@ from netpos.estimation.state import VELOCITY
 from netpos.messages.values import AngleConvention, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.rsus.learning import LearnedErrors
 from netpos.tracking.rsus.rsu import BiasStates, Rsu
+from netpos.tracking.rsus.shift import DeviceState
 from scipy.spatial.transform import Rotation
 
 ALL = Field.AZIMUTH | Field.ELEVATION | Field.TOA | Field.RANGE
@@ -223,12 +224,12 @@ def test_errors_last_while_a_device_stands() -> None:
     states, rsu = BiasStates(learned=LearnedErrors()), Rsu.of(info())
     assert states.learned is not None
     errors_of(states, rsu, measured(Field.RANGE))
-    nothing = np.zeros((0, ROW_WIDTH)), np.ones(0)
+    nothing, cov = np.zeros((0, ROW_WIDTH)), 0.2**2 * np.eye(7)
     lasts = []
     for k, speed in enumerate([0.2, 0.2, 2.0]):
         mean = np.zeros(7)
         mean[VELOCITY] = speed, 0.0
-        states.learn((k + 1) * 10**9, nothing, (mean, 0.2**2 * np.eye(7)), 0.0)
+        states.learn(nothing, np.ones(0), DeviceState((k + 1) * 10**9, mean, cov, 0.0, 0.5))
         lasts.append(states.tau_s[0])
     model = states.learned.models["rsu/a", "RANGE"]
     assert lasts[:2] == [model.time_s(0.0)] * 2

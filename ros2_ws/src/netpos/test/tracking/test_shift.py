@@ -8,7 +8,7 @@ from netpos.estimation.measurement import ROW_WIDTH, VALUE, linearise
 from netpos.estimation.rows import put_measurement
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.rsus.rsu import Rsu
-from netpos.tracking.rsus.shift import unshifted
+from netpos.tracking.rsus.shift import DeviceState, Way, unshifted
 
 PLACE = np.array([2.4, 3.6, 0.0, 0.0, 0.0, 0.0])
 WALLS = [(0.0, 3.0, 0.0), (6.0, 0.0, 90.0), (12.0, 3.0, 180.0), (6.0, 6.0, -90.0)]
@@ -43,12 +43,25 @@ def rows_of(biases: Array) -> Array:
     return rows
 
 
+def at(place: Array, stamp_ns: int = 0, velocity_sd: float = 0.0) -> DeviceState:
+    """Of a device at ``place`` (6,), with 0.5 m/s^2/sqrt(Hz)."""
+    cov = np.diag([0.0, 0.0, velocity_sd**2, velocity_sd**2, 0.0, 0.0])
+    return DeviceState(stamp_ns, place, cov, 1.1, 0.5)
+
+
+def one_instant(rows: Array, believed: Array) -> Way:
+    """Of a device whose values (m, ROW_WIDTH) were all heard at one instant."""
+    there = at(believed)
+    stamps_ns, to_go = np.zeros(len(rows), dtype=np.int64), np.zeros((len(rows), 3))
+    return Way.of(rows, stamps_ns, np.eye(len(rows)), to_go, (there, there))
+
+
 def left_of(biases: Array, believed: Array) -> tuple[Array, Array]:
-    """``unshifted`` seen from a believed place (6,)."""
-    rows = rows_of(biases)
-    residuals, _ = linearise(rows, believed, 1.1)
-    left, checked, _ = unshifted(rows, residuals, SD, believed, 1.1, np.zeros(8))
-    return left, checked
+    """What ``unshifted`` leaves (8,) of one instant seen from a believed place (6,), and one less
+    the leverage (8,)."""
+    way = one_instant(rows_of(biases), believed)
+    left = unshifted(way, np.zeros(8), SD, np.zeros(8))
+    return left.residual * np.sqrt(left.checked), left.checked
 
 
 @pytest.mark.parametrize("wrong", [(0.0, 0.0), (2.0, -1.5), (-1.5, 1.5), (5.0, -2.0)])
@@ -73,22 +86,91 @@ def test_an_error_looks_the_same_from_wherever_the_track_is() -> None:
 
 def test_two_ranges_leave_nothing() -> None:
     """As many unknowns as values: any residual is a shift."""
-    rows = rows_of(np.zeros(8))[:2]
-    left, checked, beside = unshifted(
-        rows, np.array([0.05, -0.03]), SD[:2], PLACE, 1.1, np.array([3.0, 4.0])
-    )
-    assert np.abs(left).max() < 1e-9
-    assert np.abs(checked).max() < 1e-9
-    assert np.abs(beside).max() < 1e-9
+    way = one_instant(rows_of(np.zeros(8))[:2], PLACE)
+    left = unshifted(way, np.array([0.05, -0.03]), SD[:2], np.array([3.0, 4.0]))
+    assert np.abs(left.white).max() < 1e-9
+    assert np.abs(left.checked).max() < 1e-9
+    assert np.abs(left.beside).max() < 1e-9
 
 
 def test_other_residuals_are_freed_of_the_same_shifts() -> None:
     """As least squares with the weights of the residuals leaves them."""
     rows, sd = rows_of(np.zeros(8)), np.linspace(0.05, 0.2, 8)
     other = np.arange(8.0)
-    left, _, beside = unshifted(rows, np.zeros(8), sd, PLACE, 1.1, other)
+    left = unshifted(one_instant(rows, PLACE), np.zeros(8), sd, other)
     _, H = linearise(rows, PLACE, 1.1)
     A = H[:, :2] / sd[:, None]
     shift, *_ = np.linalg.lstsq(A, other / sd)
-    np.testing.assert_allclose(beside, other - H[:, :2] @ shift, atol=1e-9)
-    np.testing.assert_array_equal(left, 0.0)
+    np.testing.assert_allclose(left.beside * sd, other - H[:, :2] @ shift, atol=1e-9)
+    np.testing.assert_allclose(left.residual, 0.0, atol=1e-12)
+
+
+def test_a_residual_is_what_all_others_do_not_foresee() -> None:
+    """Over its sd, by the joint density of values that have noise, the way and any place in
+    common: leaving one out (Cook and Weisberg 1982)."""
+    rng = np.random.default_rng(2)
+    rows, sd = rows_of(np.zeros(8)), np.linspace(0.05, 0.2, 8)
+    stamps_ns = np.sort(np.round(1e9 * rng.uniform(0.0, 2.0, 8)).astype(np.int64))
+    ends = at(PLACE, velocity_sd=0.3), at(PLACE, 2_000_000_000)
+    way = Way.of(rows, stamps_ns, np.eye(8), np.zeros((8, 3)), ends)
+    residuals = 1e-3 * rng.normal(0.0, sd)  # so small that angles are linear
+    left = unshifted(way, residuals, sd, np.zeros(8))
+    _, H = linearise(rows, PLACE, 1.1)
+    V = np.diag(sd**2) + way.covariance(H) + 1e5 * H[:, :2] @ H[:, :2].T
+    for i in range(8):
+        others = np.arange(8) != i
+        gain = np.linalg.solve(V[np.ix_(others, others)], V[others, i])
+        variance = V[i, i] - gain @ V[others, i]
+        assert left.checked[i] == pytest.approx(sd[i] ** 2 / variance, rel=1e-3)
+        z = (residuals[i] - gain @ residuals[others]) / np.sqrt(variance)
+        assert left.residual[i] / sd[i] == pytest.approx(z, rel=2e-3, abs=1e-6)
+
+
+def test_the_way_wanders_as_the_motion_model_says() -> None:
+    """The covariance of positions at several instants, by the transition of a constant velocity
+    under white acceleration."""
+    times, density, velocity_sd = np.array([0.3, 0.5, 1.4]), 0.5, 0.7
+    P, t, x = np.diag([0.0, velocity_sd**2]), 0.0, []
+    joint = np.zeros((3, 3))
+    states: list[Array] = []  # cov of the state at each instant with the position now, by columns
+    for k, time in enumerate(times):
+        dt = time - t
+        F, t = np.array([[1.0, dt], [0.0, 1.0]]), time
+        P = F @ P @ F.T + density**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        states = [F @ column for column in states] + [P[:, 0]]
+        joint[k, : k + 1] = joint[: k + 1, k] = [column[0] for column in states]
+        x.append(P[0, 0])
+    H = np.zeros((3, 3))
+    H[:, 0] = 1.0
+    means = np.array([[0.5, 0.5, 0.0], [0.0, 0.2, 0.8]])
+    for weights in (np.eye(3), means):
+        ends = at(PLACE, velocity_sd=velocity_sd), at(PLACE, 2_000_000_000)
+        stamps_ns = np.round(1e9 * times).astype(np.int64)
+        way = Way.of(rows_of(np.zeros(8))[:3], stamps_ns, weights, np.zeros((3, 3)), ends)
+        np.testing.assert_allclose(way.covariance(H), weights @ joint @ weights.T, rtol=1e-9)
+
+
+def test_what_the_way_explains_is_in_no_residual() -> None:
+    """Of a device that turns a corner between four arrays: seen from where it ended, and with the
+    Jacobian of where each value was measured."""
+    rows, to_go, H = [], [], []
+    for k, (dx, dy) in enumerate([(2.0, 1.0), (1.0, 1.0), (0.0, 1.0), (0.0, 0.5)]):
+        place = PLACE.copy()
+        place[:2] -= dx, dy
+        row = rows_of(np.zeros(8))[2 * k : 2 * k + 1]
+        innovation, of_row = linearise(row, place, 1.1)
+        row[:, VALUE] -= innovation
+        rows.append(row)
+        to_go.append([dx, dy, 0.0])
+        H.append(of_row[0, [0, 1, 4]])
+    ends = at(PLACE), at(PLACE, 1_000_000_000)
+    stamps_ns = np.array([1, 2, 3, 4]) * 200_000_000
+    weights = np.array([[0.3, 0.7, 0.0, 0.0], [0.0, 0.0, 0.5, 0.5]])
+    way = Way.of(np.concatenate(rows), stamps_ns, weights, np.array(to_go), ends)
+    said, of_values = way.residuals(np.zeros(3))
+    assert np.abs(said).max() < 1e-12
+    np.testing.assert_allclose(of_values, np.array(H))
+    shifted, _ = way.residuals(np.array([1e-4, -2e-4, 0.0]))
+    np.testing.assert_allclose(
+        shifted, -weights @ of_values @ np.array([1e-4, -2e-4, 0.0]), rtol=2e-3
+    )

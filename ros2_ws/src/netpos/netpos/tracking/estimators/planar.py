@@ -50,6 +50,7 @@ from netpos.tracking.networks.secondary import OwnNoise, Secondary
 from netpos.tracking.rsus.learning import LearnedErrors
 from netpos.tracking.rsus.rsu import Rsu
 from netpos.tracking.rsus.shared_errors import SharedErrors
+from netpos.tracking.rsus.shift import DeviceState
 from netpos.tracking.smoothing.planar import Posterior, PosteriorRecorder
 
 _IMU_HOLE_S = 0.05
@@ -238,9 +239,10 @@ class PlanarEstimator(Estimator):
         estimate, biases = self.estimate, self.biases
         if biases.learned is None or estimate is None or estimate.modes:
             return ()
-        fitted = (rows, np.array(accepted))
-        height_m = self._config.device_height_m
-        concluded, changes = biases.learn(stamp_ns, fitted, estimate.likeliest, height_m)
+        mean, cov = (of_it.copy() for of_it in estimate.likeliest)
+        height_m, density = self._config.device_height_m, estimate.accel_density
+        posterior = DeviceState(stamp_ns, mean, cov, height_m, density)
+        concluded, changes = biases.learn(rows, np.array(accepted), posterior)
         for change in changes:
             estimate.change_prior(*change)
         self.bias = biases.arrays()

@@ -1,24 +1,29 @@
 """What RSUs really measure, learned from how they contradict each other.
 
-Every second the residuals of all RSUs are compared: what a shift of the position and of the clock
-explains is taken out of them,
+What all RSUs measured is compared in windows of a second, seen from the way of the device by the
+velocities estimated: what a shift of that way and of the clock explains is taken out of it
+(``shift``),
 
-    r = h(x + d) - h(x) + b + n,   y = (r - h(x + d^) + h(x)) / sqrt(1 - leverage),
+    r = h(x + d + w) - h(x) + b + n,
 
-with d^ of least squares (``shift``), so that y scatters as the bias b and the noise n do
-(studentised residuals, Cook and Weisberg 1982) and neither the motion model nor what the track
-believes of the position is in it: a track that is wrong must not take its own error for that of
-the RSUs. What y says of each RSU is in ``error_model``. Whether distances are too long by a share
-that all have in common is learned beside it (``stretch``), by two hypotheses that hear the same
+with any shift d and with w, by which the device may have moved otherwise within the window. Seen
+from the estimates themselves, values would have the updates in them, which absorb what RSUs
+disagree by, the more the fewer there are. What the others do not foresee of a residual
+(studentised: Cook and Weisberg 1982) scatters as the bias b and the noise n do. What the track
+believes of the position is not in it: a track that is wrong must not take its own error for that
+of the RSUs. Where RSUs are heard so seldom that they do not check each other within a second, a
+window goes on until they do.
+
+What a window says of an RSU is in ``error_model``. Whether distances are too long by a share that
+all have in common is learned beside it (``stretch``), by two hypotheses that hear the same
 windows.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from operator import add
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -27,12 +32,15 @@ from netpos.estimation.measurement import KIND, VALUE
 from netpos.estimation.sensors.table import SENSORS
 from netpos.messages.values import Array
 from netpos.tracking.rsus.error_model import ErrorModel
-from netpos.tracking.rsus.shift import unshifted
+from netpos.tracking.rsus.shift import DeviceState, Left, Way, unshifted
 from netpos.tracking.rsus.stretch import NONE_SEEN, Stretch, together
 
 WINDOW_S = 1.0
-"""Values of an RSU within it count as one until their scatter says otherwise."""
+"""Length of a window; values of an RSU within it count as one until their scatter says
+otherwise."""
 _WINDOW_NS = round(WINDOW_S * 1e9)
+_ENOUGH = 0.9  # of a measurement that others check
+_LONGEST_NS = 10 * _WINDOW_NS
 _ALONE = 0.05  # 1 - leverage of a row that nobody checks
 _SAME_UNIT = 0.01  # relative
 _STRETCHING = [s.kind for s in SENSORS if s.stretches]
@@ -41,9 +49,21 @@ Name = tuple[str, str]
 _STRETCH: Name = "distances", "stretch"
 Models = dict[Name, ErrorModel]
 Learned = ErrorModel | Stretch
-Sums = tuple[float, ...]
-"""Of the rows of a window: information, and that times residual; number, residual and its square
-over the sd stated; half the square of the step from the value before; that value."""
+
+
+class _Value(NamedTuple):
+    """A value as it was heard.
+
+    row : (ROW_WIDTH,); gone : (3,) the way of the device until then; information : one over the
+    variance that the update took; left : what the update left of it, over the sd stated
+    """
+
+    name: Name
+    stamp_ns: int
+    row: Array
+    gone: Array
+    information: float
+    left: float
 
 
 class Others(Protocol):
@@ -59,45 +79,74 @@ class Others(Protocol):
 class _Window(NamedTuple):
     """What was heard of m RSUs and quantities in a window.
 
-    rows : (m, ROW_WIDTH) the last of each; residual, variance : (m,) their mean, and its variance
-    by what is stated; distance : (m,) m, 0 where it is none; scatter : of each what
-    ``ErrorModel.scattered`` takes
+    way : with the mean of each; variance : (m,) of the means, by what is stated; more : (m,) to
+    add to their residuals; distance : (m,) what they measure [m], 0 of other quantities;
+    scatter : of each what ``ErrorModel.scattered`` takes
     """
 
     names: list[Name]
-    rows: Array
-    residual: Array
+    way: Way
     variance: Array
+    more: Array
     distance: Array
     scatter: list[tuple[float, float, float]]
 
     @classmethod
-    def of(cls, sums: Mapping[Name, Sums], newest: Mapping[Name, Array]) -> _Window:
-        """What ``sums`` of rows, and the ``newest`` of them (ROW_WIDTH,), say."""
-        names, total = list(sums), np.array(list(sums.values()))
-        variance = 1.0 / total[:, 0]
-        square = total[:, 4] - total[:, 3] ** 2 / total[:, 2]
-        scatter = np.column_stack([square, total[:, 2] - 1.0, total[:, 5]]).tolist()
-        rows = np.array([newest[name] for name in names])
-        distance = np.where(np.isin(rows[:, KIND], _STRETCHING), rows[:, VALUE], 0.0)
-        return cls(names, rows, total[:, 1] * variance, variance, distance, scatter)
+    def of(
+        cls, values: Sequence[_Value], gone: Array, ends: tuple[DeviceState, DeviceState]
+    ) -> _Window:
+        """What ``values`` say that were heard between the posteriors ``ends``; ``gone`` (3,): the
+        way until the second."""
+        of_name: dict[Name, list[int]] = {}
+        for k, value in enumerate(values):
+            of_name.setdefault(value.name, []).append(k)
+        weights = np.zeros((len(of_name), len(values)))
+        scatter = []
+        for i, of_it in enumerate(of_name.values()):
+            weights[i, of_it] = [values[k].information for k in of_it]
+            z = np.array([values[k].left for k in of_it])
+            square, steps = float(((z - z.mean()) ** 2).sum()), float((np.diff(z) ** 2).sum())
+            scatter.append((square, len(of_it) - 1.0, steps / 2.0))
+        information = weights.sum(axis=1)
+        weights /= information[:, None]
+        rows = np.array([value.row for value in values])
+        stamps_ns = np.array([value.stamp_ns for value in values])
+        to_go = gone - np.array([value.gone for value in values])
+        way = Way.of(rows, stamps_ns, weights, to_go, ends)
+        last = rows[[of_it[-1] for of_it in of_name.values()]]
+        distance = np.where(np.isin(last[:, KIND], _STRETCHING), last[:, VALUE], 0.0)
+        none = np.zeros_like(distance)
+        return cls(list(of_name), way, 1.0 / information, none, distance, scatter)
 
     def moved(self, share: float) -> _Window:
         """With the residuals where ``share`` of the distance more had been left in."""
-        return self._replace(residual=self.residual + share * self.distance)
+        return self._replace(more=self.more + share * self.distance)
 
 
-class _Left(NamedTuple):
-    """What the best shift of the device leaves of a window.
+class _Seen(NamedTuple):
+    """A window as the models of a hypothesis see it.
 
-    residual, distance : (m,) over the sd of the residual; independent : (m,) part of the variance
-    that is not the same from window to window; changed : whose models it changed
+    models : of each, with the scatter within the window; left : what a shift leaves of it;
+    independent : (m,) part of each variance that is not the same from window to window
     """
 
-    residual: Array
-    distance: Array
+    models: list[ErrorModel]
+    left: Left
     independent: Array
-    changed: list[Name]
+
+    @classmethod
+    def of(cls, models: Models, window: _Window) -> _Seen:
+        """What ``models`` see."""
+        mine = [
+            models[name].scattered(*of_it)
+            for name, of_it in zip(window.names, window.scatter, strict=True)
+        ]
+        noise = np.array([m.scale for m in mine]) * window.variance
+        slow = np.array([m.bias_sd for m in mine]) ** 2
+        sd = np.sqrt(noise + slow)
+        lasts = np.array([m.time_s(0.0) for m in mine]) * 2.0 / WINDOW_S
+        left = unshifted(window.way, window.more, sd, window.distance)
+        return cls(mine, left, sd**2 / (noise + slow * np.maximum(lasts, 1.0)))
 
 
 @dataclass(slots=True)
@@ -119,10 +168,14 @@ class LearnedErrors:
     """Whether it is likelier that there is one; rows leave it out then."""
     moved_m: float = 0.0
     moved_ns: int = -1
-    window_ns: int = -1
-    window: dict[Name, Sums] = field(default_factory=dict)
-    newest: dict[Name, Array] = field(default_factory=dict)
-    """The last row (ROW_WIDTH,) of each in the window."""
+    velocity: Array = field(default_factory=lambda: np.zeros(3))
+    gone: Array = field(default_factory=lambda: np.zeros(3))
+    """The way (3,) of the device and of its clock, by the velocities estimated."""
+    heard: list[_Value] = field(default_factory=list)
+    """In the window that goes on."""
+    before: DeviceState | None = None
+    """With which the window before ended."""
+    ends_ns: int = 0
 
     def copy(self) -> LearnedErrors:
         """An independent copy."""
@@ -130,8 +183,7 @@ class LearnedErrors:
             self,
             models=self.models.copy(),
             unlikelier=self.unlikelier.copy(),
-            window=self.window.copy(),
-            newest=self.newest.copy(),
+            heard=self.heard.copy(),
         )
 
     def model(
@@ -153,87 +205,84 @@ class LearnedErrors:
             _choose(self.unlikelier, name, [])
         return self.models[name]
 
-    def move(self, stamp_ns: int, speed_mps: float) -> None:
-        """Note the way since the last call."""
+    def move(self, stamp_ns: int, velocity: Array, still: bool) -> None:
+        """Note the way since the last call, by what is estimated of the velocity and of the drift
+        (3,)."""
         if self.moved_ns >= 0:
-            self.moved_m += speed_mps * (stamp_ns - self.moved_ns) * 1e-9
-        self.moved_ns = stamp_ns
+            dt = (stamp_ns - self.moved_ns) * 1e-9
+            self.gone = self.gone + 0.5 * dt * (self.velocity + velocity)
+            self.moved_m += 0.0 if still else math.hypot(*velocity[:2].tolist()) * dt
+        self.moved_ns, self.velocity = stamp_ns, velocity
 
-    def hear(self, name: Name, row: Array, left: list[float], stated: float) -> None:
-        """Note a row (ROW_WIDTH,), what is left of it by ``unexplained``, and the variance
-        stated."""
+    def hear(self, name: Name, row: Array, left: Sequence[float], stated: float) -> None:
+        """Note a row (ROW_WIDTH,) of where the device has moved to, what is left of it by
+        ``unexplained``, and the variance stated."""
         model = self.models[name]
-        information, r = model.scale / left[2], left[0]
-        z = r / math.sqrt(stated)
-        old = self.window.get(name)
-        step = 0.0 if old is None else 0.5 * (z - old[-1]) ** 2
-        new = (information, information * r, 1.0, z, z * z, step)
-        self.window[name] = (*(new if old is None else map(add, old, new)), z)
-        self.newest[name] = row
+        information, size = model.scale / left[2], left[0] / math.sqrt(stated)
+        self.heard.append(_Value(name, self.moved_ns, row, self.gone, information, size))
         self.models[name] = model.heard(left[1] / stated)
 
-    def conclude(self, stamp_ns: int, mean: Array, height_m: float) -> list[Name]:
-        """Weigh a window that is over, seen from the mean (n,) of the posterior; whose models
-        changed."""
-        if self.window_ns < 0:
-            self.window_ns = stamp_ns
-        if stamp_ns < self.window_ns + _WINDOW_NS:
+    def conclude(self, posterior: DeviceState) -> list[Name]:
+        """Weigh a window that is over with the epoch of a posterior; whose models changed."""
+        stamp_ns, values, before = posterior.stamp_ns, self.heard, self.before
+        if before is None or not values:
+            self._begin(posterior)
             return []
-        sums, newest = self.window, self.newest
-        self.window, self.newest, self.window_ns = {}, {}, stamp_ns
-        if not sums:
+        if stamp_ns < self.ends_ns:
             return []
-        heard, seen_from = _Window.of(sums, newest), (mean, height_m)
-        left = self._weigh(self.models, heard, stamp_ns, seen_from)
-        for name in left.changed:
+        window = _Window.of(values, self.gone, (before, posterior))
+        seen = _Seen.of(self.models, window)
+        others_come = any(more == 0.0 for _, more, _ in window.scatter)
+        goes_on = seen.left.checked.sum() < (_ENOUGH if others_come else _ALONE)
+        if goes_on and stamp_ns < before.stamp_ns + _LONGEST_NS:
+            self.ends_ns = stamp_ns + _WINDOW_NS
+            return []
+        self._begin(posterior)
+        changed = self._weigh(self.models, window, seen)
+        for name in changed:
             _choose(self.models, name, self._known(name, stamp_ns, self.models[name].unit))
-        if heard.distance.any():
-            self._weigh_stretch(heard, left, stamp_ns, seen_from)
-        for name in left.changed:
+        if window.distance.any():
+            self._weigh_stretch(window, seen)
+        for name in changed:
             self._tell(stamp_ns, name, self.models[name])
-        return left.changed
+        return changed
 
-    def _weigh(
-        self, models: Models, heard: _Window, stamp_ns: int, seen_from: tuple[Array, float]
-    ) -> _Left:
-        """Weigh the candidates of ``models`` by a window, as far as RSUs check each other."""
-        mine = [
-            models[name].scattered(*of_it)
-            for name, of_it in zip(heard.names, heard.scatter, strict=True)
-        ]
-        noise = np.array([m.scale for m in mine]) * heard.variance
-        slow = np.array([m.bias_sd for m in mine]) ** 2
-        sd = np.sqrt(noise + slow)
-        left, checked, distance = unshifted(
-            heard.rows, heard.residual, sd, *seen_from, heard.distance
-        )
-        changed = []
-        for i, name in enumerate(heard.names):
-            if checked[i] > _ALONE:
-                y = float(left[i] / math.sqrt(checked[i]))
-                models[name] = mine[i].weigh(
-                    stamp_ns, self.moved_m, y, float(heard.variance[i]), float(checked[i])
+    def _begin(self, posterior: DeviceState) -> None:
+        """Begin a window at a posterior."""
+        self.heard, self.before = [], posterior
+        self.ends_ns = posterior.stamp_ns + _WINDOW_NS
+
+    def _weigh(self, models: Models, window: _Window, seen: _Seen) -> list[Name]:
+        """Weigh the candidates of ``models`` by a window; whose changed."""
+        left, changed = seen.left, []
+        for i, name in enumerate(window.names):
+            if left.checked[i] > _ALONE:
+                of_it = left.residual[i], window.variance[i], left.checked[i]
+                models[name] = seen.models[i].weigh(
+                    window.way.after.stamp_ns, self.moved_m, *(float(value) for value in of_it)
                 )
                 changed.append(name)
-        lasts = np.array([m.time_s(0.0) for m in mine]) * 2.0 / WINDOW_S
-        independent = sd**2 / (noise + slow * np.maximum(lasts, 1.0))
-        return _Left(left / sd, distance / sd, independent, changed)
+        return changed
 
-    def _weigh_stretch(
-        self, heard: _Window, left: _Left, stamp_ns: int, seen_from: tuple[Array, float]
-    ) -> None:
-        """Weigh the two hypotheses on the stretch by a window; ``left``: of the likelier one."""
-        share = self.stretch.share
-        other = heard.moved(share if self.stretched else -share)
-        other_left = self._weigh(self.unlikelier, other, stamp_ns, seen_from)
-        for name in other_left.changed:
+    def _weigh_stretch(self, window: _Window, seen: _Seen) -> None:
+        """Weigh the two hypotheses on the stretch by a window, of which the likelier one has
+        ``seen`` that."""
+        share, stamp_ns = self.stretch.share, window.way.after.stamp_ns
+        other = window.moved(share if self.stretched else -share)
+        seen_by_other = _Seen.of(self.unlikelier, other)
+        for name in self._weigh(self.unlikelier, other, seen_by_other):
             _choose(self.unlikelier, name, [])
         without, stretched = self.models, self.unlikelier
         if self.stretched:
-            without, stretched, other_left = stretched, without, left
+            without, stretched = stretched, without
+        of_stretched = seen if self.stretched else seen_by_other
         gained = sum(stretched[name].log_fit - without[name].log_fit for name in stretched)
         self.own_stretch = self.own_stretch.seen(
-            other_left.residual, other_left.distance, other_left.independent, share, gained
+            of_stretched.left.white,
+            of_stretched.left.beside,
+            of_stretched.independent,
+            share,
+            gained,
         )
         self._decide(stamp_ns)
         self._tell(stamp_ns, _STRETCH, self.own_stretch)

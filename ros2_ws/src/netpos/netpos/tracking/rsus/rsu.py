@@ -34,6 +34,7 @@ from netpos.messages.values import (
 from netpos.tracking.rest import rests
 from netpos.tracking.rsus.error_model import ErrorModel
 from netpos.tracking.rsus.learning import WINDOW_S, LearnedErrors, Name
+from netpos.tracking.rsus.shift import CHANGE, DeviceState
 
 _RSU = "rsu/"
 REFERENCED = sum(int(r.field) for s, r in readings() if s.difference_of >= 0)
@@ -284,19 +285,18 @@ class BiasStates:
         return self._biases[name]
 
     def learn(
-        self,
-        stamp_ns: int,
-        fitted: tuple[Array, Array],
-        posterior: tuple[Array, Array],
-        height_m: float,
+        self, rows: Array, accepted: Array, posterior: DeviceState
     ) -> tuple[list[Name], list[PriorChange]]:
-        """Learn from what the ``posterior``, mean (n,) and covariance (n, n), leaves of the rows
-        ``fitted``, (m, ROW_WIDTH) and which groups were accepted (groups,). Returns what was
-        concluded of whom, and the bias states whose sd changed."""
+        """Learn from what the ``posterior`` leaves of ``rows`` (m, ROW_WIDTH), of which groups
+        were ``accepted`` (groups,). Returns what was concluded of whom, and the bias states whose
+        sd changed."""
         learned = self.learned
         if learned is None:
             return [], []
-        (rows, accepted), (mean, cov) = fitted, posterior
+        stamp_ns, mean, cov, height_m, _ = posterior
+        velocity = mean[VELOCITY].tolist()
+        still = rests(velocity, cov.diagonal()[VELOCITY].tolist())
+        learned.move(stamp_ns, mean[CHANGE], still)
         names = {biases: name for name, biases in self._biases.items()}
         left = unexplained(mean, cov, rows, height_m).tolist()
         for row, said in zip(rows, left, strict=True):
@@ -305,11 +305,8 @@ class BiasStates:
                 continue
             stated = float(row[GATE_VARIANCE]) / learned.models[name].gate_scale
             learned.hear(name, row, said, stated)
-        velocity = mean[VELOCITY].tolist()
-        still = rests(velocity, cov.diagonal()[VELOCITY].tolist())
         speed = 0.0 if still else math.hypot(*velocity)
-        learned.move(stamp_ns, speed)
-        concluded = learned.conclude(stamp_ns, mean, height_m)
+        concluded = learned.conclude(posterior)
         return concluded, self._take_learned(learned, concluded, speed)
 
     def _take_learned(

@@ -1,10 +1,14 @@
-"""What a shift of the position and of the clock leaves of the residuals of several RSUs."""
+"""What a shift of a device's way leaves of what several RSUs measured on it: generalised least
+squares, with a way that is known as well as the motion model says."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import numpy as np
 
-from netpos.estimation.measurement import BIAS, HEIGHT, REFERENCE, VALUE, linearise
+from netpos.estimation.measurement import BIAS, HEIGHT, REFERENCE, linearise
 from netpos.estimation.state import X
 from netpos.messages.values import Array
 
@@ -12,59 +16,146 @@ _STEPS = 10
 _HALVINGS = 4
 _SMALL = 1e-3  # sd: a step that changes no residual by more
 _UNSEEN = 1e-6  # of the largest singular value
+_PLACE = [int(X.PX), int(X.PY), int(X.CLOCK)]
+CHANGE = [int(X.VX), int(X.VY), int(X.DRIFT)]
 
 
-def unshifted(
-    rows: Array, residuals: Array, sd: Array, mean: Array, height_m: float, beside: Array
-) -> tuple[Array, Array, Array]:
-    """Residuals (m,) after the best shift, one minus the leverage of each (m,), and what such a
-    shift leaves of other residuals ``beside`` (m,).
+class DeviceState(NamedTuple):
+    """What a track believes at ``stamp_ns``: mean (n,), cov (n, n) of the state; ``height_m``:
+    nominal height in map; ``accel_density`` [m/s^2/sqrt(Hz)] of the white acceleration."""
 
-    rows : (m, ROW_WIDTH), one per RSU and quantity; their biases are in the residuals
-    residuals : (m,) at ``mean`` (n,); sd : (m,) of what is wrong with each
+    stamp_ns: int
+    mean: Array
+    cov: Array
+    height_m: float
+    accel_density: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Way:
+    """Means of values that m RSUs and quantities measured on the way of a device.
+
+    rows : (N, ROW_WIDTH) of the values, which no bias state explains; weights : (m, N) of means
+    begins : (E + 1,) with which row each instant begins
+    to_go : (E, 3) from there to the end, x, y and the clock [m]; after : the state at the end
+    since_s : (E,) since ``before``, the state of which the velocity was known
+    """
+
+    rows: Array
+    begins: list[int]
+    weights: Array
+    to_go: Array
+    since_s: Array
+    before: DeviceState
+    after: DeviceState
+
+    @classmethod
+    def of(
+        cls,
+        rows: Array,
+        stamps_ns: Array,
+        weights: Array,
+        to_go: Array,
+        ends: tuple[DeviceState, DeviceState],
+    ) -> Way:
+        """Of ``rows`` (N, ROW_WIDTH) in the order of their ``stamps_ns`` (N,), with ``weights``
+        (m, N), and what was ``to_go`` (N, 3) from each; ``ends``: before and after."""
+        rows = rows.copy()
+        rows[:, BIAS], rows[:, REFERENCE] = -1.0, 0.0
+        at_ns, begins = np.unique(stamps_ns, return_index=True)
+        since_s = (at_ns - ends[0].stamp_ns) * 1e-9
+        return cls(rows, [*begins.tolist(), len(rows)], weights, to_go[begins], since_s, *ends)
+
+    @property
+    def shifted(self) -> list[int]:
+        """The k states that may be wrong by the same all the way; a height that is unknown is one
+        of them."""
+        height = int(self.rows[:, HEIGHT].max())
+        return [*_PLACE, height] if height > 0 else _PLACE
+
+    def residuals(self, shift: Array) -> tuple[Array, Array]:
+        """What the means (m,) say more than would be measured on the way shifted by ``shift``
+        (k,), and the Jacobian (N, k) of the values."""
+        shifted, height_m = self.shifted, self.after.height_m
+        at_end = self.after.mean.copy()
+        at_end[shifted] += shift
+        left, H = np.empty(len(self.rows)), np.empty((len(self.rows), len(shifted)))
+        for begin, end, to_go in zip(self.begins, self.begins[1:], self.to_go, strict=False):
+            then = at_end.copy()
+            then[_PLACE] -= to_go
+            left[begin:end], of_all = linearise(self.rows[begin:end], then, height_m)
+            H[begin:end] = of_all[:, shifted]
+        return self.weights @ left, H
+
+    def covariance(self, H: Array) -> Array:
+        """Of the means, by how the device may have moved otherwise: (m, m), with the Jacobian
+        (N, k) of the values. The velocity was known as well as ``before`` says, and is a random
+        walk from then on."""
+        of_values = self.weights[:, :, None] * H[:, : len(_PLACE)]
+        of_epoch = np.add.reduceat(of_values, self.begins[:-1], axis=1)
+        by_change = np.einsum("mek,e->mk", of_epoch, self.since_s)
+        change = self.before.cov[np.ix_(CHANGE, CHANGE)]
+        early = np.minimum.outer(self.since_s, self.since_s)
+        late = np.maximum.outer(self.since_s, self.since_s)
+        wander = self.before.accel_density**2 * early**2 * (3.0 * late - early) / 6.0
+        x, y = of_epoch[:, :, 0], of_epoch[:, :, 1]
+        cov: Array = by_change @ change @ by_change.T + x @ wander @ x.T + y @ wander @ y.T
+        return cov
+
+
+class Left(NamedTuple):
+    """What the best shift of the device leaves of residuals.
+
+    residual : (m,) studentised, as if each scattered by its sd; checked : (m,) how much of a
+    measurement it counts for, one minus its leverage where the way is known
+    white, beside : (m,) residuals and others beside them, freed of the shift and decorrelated,
+    over their sd
+    """
+
+    residual: Array
+    checked: Array
+    white: Array
+    beside: Array
+
+
+def unshifted(way: Way, more: Array, sd: Array, beside: Array) -> Left:
+    """What the best shift of a way leaves of the residuals of its means and ``more`` (m,), and of
+    others ``beside`` (m,); sd : (m,) of what is wrong with each.
 
     Least squares by Gauss and Newton, with steps halved until they help. A linear projection would
     do near the truth only: two metres beside it an angle to an RSU three metres away has turned by
     a third, and what is left of it looks like an error of the RSU.
     """
-    rows = rows.copy()
-    rows[:, BIAS], rows[:, REFERENCE] = -1.0, 0.0
-    shifted = [int(X.PX), int(X.PY), int(X.CLOCK)]
-    height = int(rows[:, HEIGHT].max())
-    if height > 0:  # one that is unknown may explain a residual, too
-        shifted.append(height)
-    innovation, H = linearise(rows, mean, height_m)
-    rows[:, VALUE] += residuals - innovation
-    place, left = mean.copy(), residuals / sd
+    place = np.zeros(len(way.shifted))
+    said, H = way.residuals(place)
+    whiten = _whitening(way.covariance(H), sd)
     for _ in range(_STEPS):
-        step = _step(H[:, shifted] / sd[:, None], left)
-        if np.abs(H[:, shifted] @ step / sd).max() < _SMALL:
+        A, left = whiten @ way.weights @ H, whiten @ (said + more)
+        step = np.linalg.lstsq(A, left, rcond=_UNSEEN)[0]
+        if np.abs(A @ step).max() < _SMALL:
             break
         for halved in range(_HALVINGS):
-            trial = place.copy()
-            trial[shifted] += step / 2.0**halved
-            innovation, trial_H = linearise(rows, trial, height_m)
-            if innovation @ (innovation / sd**2) < left @ left:
+            trial = place + step / 2.0**halved
+            trial_said, trial_H = way.residuals(trial)
+            trial_left = whiten @ (trial_said + more)
+            if trial_left @ trial_left < left @ left:
                 break
         else:
             break
-        place, left, H = trial, innovation / sd, trial_H
-    U = _seen(H[:, shifted] / sd[:, None])[0]
-    left = left - U @ (U.T @ left)
-    other = beside / sd
-    other = other - U @ (U.T @ other)
-    return left * sd, 1.0 - np.square(U).sum(axis=1), other * sd
+        place, said, H = trial, trial_said, trial_H
+    whiten = _whitening(way.covariance(H), sd)
+    U, size, _ = np.linalg.svd(whiten @ way.weights @ H, full_matrices=False)
+    U = U[:, size > _UNSEEN * max(size.max(), 1e-12)]
+    left, other = (a - U @ (U.T @ a) for a in (whiten @ (said + more), whiten @ beside))
+    free = whiten - U @ (U.T @ whiten)
+    checked = sd**2 * (free**2).sum(axis=0)
+    student = sd**2 * (whiten.T @ left) / np.sqrt(np.maximum(checked, _UNSEEN))
+    return Left(student, checked, left, other)
 
 
-def _seen(A: Array) -> tuple[Array, Array, Array]:
-    """Singular value decomposition of A (m, k) without the directions that no row sees."""
-    U, size, Vt = np.linalg.svd(A, full_matrices=False)
-    kept = size > _UNSEEN * max(size.max(), 1e-12)
-    return U[:, kept], size[kept], Vt[kept]
-
-
-def _step(A: Array, left: Array) -> Array:
-    """Shift (k,) that explains ``left`` (m,) by A (m, k)."""
-    U, size, Vt = _seen(A)
-    step: Array = Vt.T @ ((U.T @ left) / size)
-    return step
+def _whitening(of_way: Array, sd: Array) -> Array:
+    """(m, m) that decorrelates residuals of ``sd`` (m,) that have a way of covariance (m, m) in
+    common, and changes each as little as that needs."""
+    size, vectors = np.linalg.eigh(of_way / np.outer(sd, sd))
+    shrunk: Array = vectors / np.sqrt(1.0 + np.maximum(size, 0.0)) @ vectors.T
+    return shrunk / sd
