@@ -11,11 +11,12 @@ from typing import Any
 from netpos.bags import BagReader
 from netpos.evaluation.contents import Contents, Delivery, Progress, Recording, contents_of
 from netpos.evaluation.metrics import SKIP_EPOCHS, Figures, Run, Scored, score
-from netpos.evaluation.pairing import at_stamps
+from netpos.evaluation.pairing import Poses, at_stamps
 from netpos.evaluation.recorded_bound import recorded_bound_m
 from netpos.evaluation.requirements import Verdict, judge
 from netpos.evaluation.residuals import Series, series_of
 from netpos.evaluation.survey import Survey, VueRecord, survey_vue
+from netpos.evaluation.truth_time import TimeOffset, time_offset
 from netpos.messages import topics
 from netpos.messages.values import (
     Array,
@@ -29,7 +30,8 @@ from netpos.tracking.config import TrackerConfig
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VueEvaluation:
     """One device: its run, the scored pairs with their figures, the verdicts, what was
-    delivered, and, where asked for, what each RSU measured minus what it should have.
+    delivered, and, where asked for, what each RSU measured minus what it should have, and how much
+    later the ground truth would have to be.
     """
 
     run: Run
@@ -37,6 +39,7 @@ class VueEvaluation:
     verdicts: tuple[Verdict, ...]
     delivery: Delivery
     series: tuple[Series, ...] = ()
+    truth_time: TimeOffset | None = None
 
     @property
     def figures(self) -> Figures:
@@ -88,6 +91,9 @@ class Evaluation:
                 for name, vue in self.vues.items()
             },
             "delivery": {name: asdict(vue.delivery) for name, vue in self.vues.items()},
+            "truth_time": {
+                name: asdict(vue.truth_time) for name, vue in self.vues.items() if vue.truth_time
+            },
             "topics": {
                 topic: {"type": type_name, "messages": count}
                 for topic, (type_name, count) in sorted(self.topics.items())
@@ -184,7 +190,13 @@ def assess_bag(
     path = Path(path)
     if truth is not None:
         return evaluate_bag(
-            path, skip=skip, vue=vue, truth=truth, residuals=residuals, progress=progress
+            path,
+            skip=skip,
+            vue=vue,
+            truth=truth,
+            residuals=residuals,
+            truth_time=True,
+            progress=progress,
         )
     with BagReader(path) as bag:
         has_truth = any(
@@ -192,7 +204,9 @@ def assess_bag(
             for topic, info in bag.topics.items()
         )
     if has_truth:
-        return evaluate_bag(path, skip=skip, vue=vue, residuals=residuals, progress=progress)
+        return evaluate_bag(
+            path, skip=skip, vue=vue, residuals=residuals, truth_time=True, progress=progress
+        )
     return survey_bag(path, vue=vue, progress=progress)
 
 
@@ -252,14 +266,16 @@ def evaluate_bag(
     vue: str | None = None,
     truth: TruthOf | None = None,
     residuals: bool = False,
+    truth_time: bool = False,
     progress: Progress | None = None,
 ) -> Evaluation:
     """Score every device of a bag that has ground truth, or only ``vue``; with ``truth`` one
     device against that.
 
     The first ``skip`` estimates of each device do not count (fokin2020 leaves out 20).
-    ``residuals``: with what each RSU measured against the truth. ``progress`` is called with the
-    number of messages read.
+    ``residuals``: with what each RSU measured against the truth. ``truth_time``: with the time
+    offset of the truth, by what RSUs measured (``truth_time.time_offset``); a note says it where
+    it matters. ``progress`` is called with the number of messages read.
 
     Raises
     ------
@@ -272,6 +288,7 @@ def evaluate_bag(
     if truth is not None:
         (name,) = held.names
         poses, sentence = truth(list(held.rsus), list(recording.measured[name]), name)
+        recording.truth[name] = Poses()  # one that the bag holds does not count beside it
         for pose in poses:
             recording.truth[name].append(pose)
         notes = (sentence, *notes)
@@ -280,8 +297,16 @@ def evaluate_bag(
     for network, name in held.networks:
         scored = score(recording.run(name, network), skip=skip)
         networks.setdefault(network, {})[name] = scored
-    vues = {name: _evaluated(held, path, name, skip, residuals=residuals) for name in held.names}
+    vues = {
+        name: _evaluated(held, path, name, skip, residuals=residuals, truth_time=truth_time)
+        for name in held.names
+    }
     covered = [text for name, vue in vues.items() for text in _covered(name, vue.scored.figures)]
+    late = [
+        vue.truth_time.sentence(name)
+        for name, vue in vues.items()
+        if vue.truth_time is not None and vue.truth_time.matters
+    ]
     return Evaluation(
         path=path,
         skip=skip,
@@ -290,13 +315,13 @@ def evaluate_bag(
         rsus=held.rsus,
         buildings=held.buildings,
         topics=held.topics,
-        notes=(*notes, *covered),
+        notes=(*notes, *covered, *late),
         facts=held.facts,
     )
 
 
 def _evaluated(
-    held: Contents, path: Path, name: str, skip: int, *, residuals: bool
+    held: Contents, path: Path, name: str, skip: int, *, residuals: bool, truth_time: bool
 ) -> VueEvaluation:
     """One device against its truth; what the recording holds of it is not needed after."""
     recording = held.recording
@@ -310,6 +335,9 @@ def _evaluated(
         stamps = run.estimate.stamp_ns
         there = at_stamps(run.truth, stamps)
         series = series_of(recording.measured[name], recording.rsus, there, clock.at(stamps))
+    offset = None
+    if truth_time:
+        offset = time_offset(list(recording.measured[name]), recording.rsus, run.truth)
     _, beacons = held.topics.get(topics.of_vue(name, topics.BEACON), ("", None))
     delivery = recording.delivery[name].result(beacons)
     recording.forget(name)
@@ -319,6 +347,7 @@ def _evaluated(
         verdicts=judge(scored.figures, scored.counted.horizontal_error),
         delivery=delivery,
         series=tuple(series),
+        truth_time=offset,
     )
 
 

@@ -3,8 +3,8 @@ plain Kalman filter, all from the same bag against the same truth."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -114,11 +114,35 @@ def recording_row(recording: Recording, folder: Path) -> Json:
     return {
         "name": recording.name,
         "reference": recording.reference,
+        "truth_time": _at_its_time(recording, folder / recording.name, ours, seen),
         **baselines,
         "ours": mine,
         "defaults": plain,
         "declared": changed_so if learning else mine,
         "learned": mine if learning else changed_so,
+    }
+
+
+def _at_its_time(
+    recording: Recording, replayed: Path, ours: Together, seen: Mapping[str, Observations]
+) -> Json | None:
+    """RMSE [m] where the ground truth is as much later as fits the measurements best, which is the
+    same for all columns; None where that changes little, or there are several devices."""
+    if len(ours.offset_ns) > 1:
+        return None
+    (vue,) = evaluate_bag(replayed, skip=recording.skip, truth_time=True).vues.values()
+    if vue.truth_time is None or not vue.truth_time.matters:
+        return None
+    offset_ns = round(1e9 * vue.truth_time.offset_s)
+    truth = replace(vue.run.truth, stamp_ns=vue.run.truth.stamp_ns + offset_ns)
+    mine = figures_of(score(replace(vue.run, truth=truth), skip=recording.skip).figures)
+    others = baseline_figures(
+        ours.observations(seen), recording.space, truth, ours.counted_ns, recording.skip
+    )
+    return {
+        **asdict(vue.truth_time),
+        **{name: {"rmse_m": figures["rmse_m"]} for name, figures in others.items()},
+        "ours": {key: mine[key] for key in ("rmse_m", "nees_mean", "nees_bounds")},
     }
 
 
