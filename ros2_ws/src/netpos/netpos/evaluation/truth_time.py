@@ -69,17 +69,31 @@ def time_offset(
     def seen(offset_s: float) -> dict[tuple[str, str], Series]:
         later = replace(truth, stamp_ns=truth.stamp_ns + round(offset_s * _NS))
         found = series_of(measurements, rsus, at_stamps(later, stamps), _NO_CLOCK)
-        return {(s.rsu_id, s.quantity): s for s in found}
+        return {(s.rsu_id, s.quantity): _finite(s) for s in found}
 
     at_first, offset_s = seen(0.0), 0.0
-    if sum(len(s.residual) for s in at_first.values()) < _FEWEST:
+    if _count(at_first) < _FEWEST:
         return None
     for _ in range(_ROUNDS):
         step = _step(seen(offset_s - _STEP_S), seen(offset_s), seen(offset_s + _STEP_S))
         offset_s += min(max(step, -_LONGEST_STEP_S), _LONGEST_STEP_S)
         if abs(step) < _SETTLED_S:
             break
-    return TimeOffset(offset_s, _scatter(seen(offset_s)) / _scatter(at_first))
+    at_last = seen(offset_s)
+    if _count(at_last) < _FEWEST:  # it has gone past the end of the truth
+        return None
+    return TimeOffset(offset_s, _scatter(at_last) / _scatter(at_first))
+
+
+def _finite(series: Series) -> Series:
+    """Without residuals of values that are no numbers."""
+    kept = np.isfinite(series.residual)
+    return replace(
+        series,
+        stamp_ns=series.stamp_ns[kept],
+        residual=series.residual[kept],
+        stated=series.stated[kept],
+    )
 
 
 def _step(
@@ -111,8 +125,13 @@ def _joined(earlier: Series, now: Series, later: Series) -> tuple[Array, Array]:
     return r, (b - a) / (2.0 * _STEP_S)
 
 
+def _count(seen: Mapping[tuple[str, str], Series]) -> int:
+    return sum(len(s.residual) for s in seen.values())
+
+
 def _scatter(seen: Mapping[tuple[str, str], Series]) -> float:
     """The geometric mean of all scatters, by the numbers of measurements."""
-    each = [(len(s.residual), max(summary(s).scatter, 1e-12)) for s in seen.values()]
+    heard = [s for s in seen.values() if len(s.residual)]
+    each = [(len(s.residual), max(summary(s).scatter, 1e-12)) for s in heard]
     counts, scatters = np.array(each).T
     return float(np.exp(counts @ np.log(scatters) / counts.sum()))

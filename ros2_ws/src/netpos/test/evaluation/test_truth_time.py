@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -98,6 +99,18 @@ def test_a_device_that_stands_tells_no_time() -> None:
     found = time_offset(at_rest, RSUS, standing)
     assert found is not None
     assert not found.matters
+
+
+def test_values_that_are_no_numbers_have_no_say() -> None:
+    spoilt = [
+        replace(m, range_m=math.nan if k % 5 == 0 else m.range_m)
+        for k, m in enumerate(measured(Field.RANGE, 1))
+    ]
+    nobody = [replace(m, range_m=math.nan) for m in spoilt]
+    found = time_offset(spoilt, RSUS, truth_of(-0.3))
+    assert found is not None
+    assert found.offset_s == pytest.approx(0.3, abs=0.02)
+    assert time_offset(nobody, RSUS, truth_of(-0.3)) is None
 
 
 def test_few_measurements_say_nothing() -> None:
