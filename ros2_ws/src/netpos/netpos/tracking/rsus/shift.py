@@ -38,7 +38,8 @@ class Way:
     rows : (N, ROW_WIDTH) of the values, which no bias state explains; weights : (m, N) of means
     begins : (E + 1,) with which row each instant begins
     to_go : (E, 3) from there to the end, x, y and the clock [m]; after : the state at the end
-    since_s : (E,) since ``before``, the state of which the velocity was known
+    since_s : (E,) since velocity and drift were known, with change_cov (3, 3)
+    wander : (E, E) covariance of what a coordinate may have gone otherwise by accelerating [m^2]
     """
 
     rows: Array
@@ -46,7 +47,8 @@ class Way:
     weights: Array
     to_go: Array
     since_s: Array
-    before: DeviceState
+    change_cov: Array
+    wander: Array
     after: DeviceState
 
     @classmethod
@@ -62,9 +64,13 @@ class Way:
         (m, N), and what was ``to_go`` (N, 3) from each; ``ends``: before and after."""
         rows = rows.copy()
         rows[:, BIAS], rows[:, REFERENCE] = -1.0, 0.0
-        at_ns, begins = np.unique(stamps_ns, return_index=True)
-        since_s = (at_ns - ends[0].stamp_ns) * 1e-9
-        return cls(rows, [*begins.tolist(), len(rows)], weights, to_go[begins], since_s, *ends)
+        before, after = ends
+        at_ns, first = np.unique(stamps_ns, return_index=True)
+        since_s = (at_ns - before.stamp_ns) * 1e-9
+        early, late = np.minimum.outer(since_s, since_s), np.maximum.outer(since_s, since_s)
+        wander = before.accel_density**2 * early**2 * (3.0 * late - early) / 6.0
+        change_cov, begins = before.cov[np.ix_(CHANGE, CHANGE)], [*first.tolist(), len(rows)]
+        return cls(rows, begins, weights, to_go[first], since_s, change_cov, wander, after)
 
     @property
     def shifted(self) -> list[int]:
@@ -89,18 +95,13 @@ class Way:
 
     def covariance(self, H: Array) -> Array:
         """Of the means, by how the device may have moved otherwise: (m, m), with the Jacobian
-        (N, k) of the values. The velocity was known as well as ``before`` says, and is a random
-        walk from then on."""
+        (N, k) of the values. The velocity is a random walk from when it was known."""
         of_values = self.weights[:, :, None] * H[:, : len(_PLACE)]
         of_epoch = np.add.reduceat(of_values, self.begins[:-1], axis=1)
         by_change = np.einsum("mek,e->mk", of_epoch, self.since_s)
-        change = self.before.cov[np.ix_(CHANGE, CHANGE)]
-        early = np.minimum.outer(self.since_s, self.since_s)
-        late = np.maximum.outer(self.since_s, self.since_s)
-        wander = self.before.accel_density**2 * early**2 * (3.0 * late - early) / 6.0
         x, y = of_epoch[:, :, 0], of_epoch[:, :, 1]
-        cov: Array = by_change @ change @ by_change.T + x @ wander @ x.T + y @ wander @ y.T
-        return cov
+        cov: Array = by_change @ self.change_cov @ by_change.T
+        return cov + x @ self.wander @ x.T + y @ self.wander @ y.T
 
 
 class Left(NamedTuple):
