@@ -141,7 +141,8 @@ def test_the_script_writes_one_row_per_recording(data: Path, tmp_path: Path) -> 
     assert street["snapshot"]["unscored_s"] is None  # the time between the devices is nobody's
     assert row["reference"] == 0.5
     figures = {"snapshot", "plain_ekf", "ours", "declared", "learned", "defaults"}
-    assert set(row) == {"name", "reference", *figures, "wall_s"}
+    assert set(row) == {"name", "reference", "truth_time", *figures, "wall_s"}
+    assert row["truth_time"] is None  # its clock is that of the ranges
     for name in figures - {"snapshot"}:
         assert 0.0 < row[name]["rmse_m"] < 0.3, name
         assert row[name]["nis_expected"] > 0.9
