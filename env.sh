@@ -22,6 +22,8 @@ _netpos_prepend() { # NAME FOLDER, once
 }
 
 _netpos_prepend PATH "$NETPOS_ROOT/.venv/bin"
+# Matrices are small: threads of the linear algebra library would only wait for each other.
+export OPENBLAS_NUM_THREADS="${OPENBLAS_NUM_THREADS:-1}"
 if grep -qx ros=wheels "$NETPOS_ROOT/.venv/.netpos-setup"; then
   export ROS_DISTRO=jazzy ROS_VERSION=2 ROS_PYTHON_VERSION=3
   _netpos_prepend AMENT_PREFIX_PATH "$NETPOS_ROOT/.venv"

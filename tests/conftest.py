@@ -12,7 +12,6 @@ import pytest
 os.environ.setdefault(
     "ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"
 )  # read once, by the first context
-os.environ.setdefault("OMP_NUM_THREADS", "1")
 # A background job of a shell ignores SIGINT, and so would every process started here.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -28,7 +28,7 @@ ODOMETRY, CLOCK_STATE, TRACK_STATUS, TRUTH = (
 )
 ESTIMATES = (ODOMETRY, CLOCK_STATE, TRACK_STATUS)
 COASTING = int(TrackState.COASTING)
-RUN_S = 280.0
+RUN_S = 120.0
 PATIENT = {"hold_s": 10.0}
 """Tracker parameters for a run compared bit by bit: longer than a busy machine stalls a node."""
 

@@ -50,9 +50,13 @@ def hear(
     learned: LearnedErrors, name: tuple[str, str], row: Array, stamp_ns: int, stated: float
 ) -> None:
     """Let a row (ROW_WIDTH,) of ``measured`` be heard of, with the variance stated."""
-    error = float(row[VALUE])
     learned.move(stamp_ns, np.zeros(3), True)
-    learned.hear(name, row, [error, error**2, stated], stated)
+    learned.hear([name], row[None], left_of(row[VALUE], stated), np.array([stated]))
+
+
+def left_of(error: float, variance: float) -> Array:
+    """What is left (1, 8) of a value at the true place, of an update with its ``variance``."""
+    return np.array([[error, error**2, variance, 0.0, 0.0, 0.0, 0.0, 0.0]])
 
 
 def learned_of(
@@ -72,8 +76,8 @@ def learned_of(
         learned.move(stamp_ns, np.array([speed, 0.0, 0.0]), speed == 0.0)
         for name, error, side in zip(NAMES, of_all.tolist(), SIDES, strict=True):
             variance = learned.models[name].scale * stated_sd**2 * rate_hz
-            row = measured(side, error, x)
-            learned.hear(name, row, [error, error**2, variance], stated_sd**2)
+            row, left = measured(side, error, x)[None], left_of(error, variance)
+            learned.hear([name], row, left, np.array([stated_sd**2]))
         learned.conclude(known(stamp_ns, x))
     return learned
 

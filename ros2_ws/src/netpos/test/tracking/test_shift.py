@@ -9,6 +9,7 @@ from netpos.estimation.rows import put_measurement
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.rsus.rsu import Rsu
 from netpos.tracking.rsus.shift import DeviceState, Way, unshifted
+from numpy.typing import NDArray
 
 PLACE = np.array([2.4, 3.6, 0.0, 0.0, 0.0, 0.0])
 WALLS = [(0.0, 3.0, 0.0), (6.0, 0.0, 90.0), (12.0, 3.0, 180.0), (6.0, 6.0, -90.0)]
@@ -52,8 +53,17 @@ def at(place: Array, stamp_ns: int = 0, velocity_sd: float = 0.0) -> DeviceState
 def one_instant(rows: Array, believed: Array) -> Way:
     """Of a device whose values (m, ROW_WIDTH) were all heard at one instant."""
     there = at(believed)
-    stamps_ns, to_go = np.zeros(len(rows), dtype=np.int64), np.zeros((len(rows), 3))
-    return Way.of(rows, stamps_ns, np.eye(len(rows)), to_go, (there, there))
+    return Way.of(rows, alone(len(rows)), [(0, len(rows))], np.zeros((1, 3)), (there, there))
+
+
+def alone(n: int) -> tuple[NDArray[np.int64], Array]:
+    """Means of one value each."""
+    return np.arange(n), np.ones(n)
+
+
+def one_each(stamps_ns: Array) -> list[tuple[int, int]]:
+    """Instants with one row."""
+    return [(int(stamp_ns), 1) for stamp_ns in stamps_ns]
 
 
 def left_of(biases: Array, believed: Array) -> tuple[Array, Array]:
@@ -112,11 +122,12 @@ def test_a_residual_is_what_all_others_do_not_foresee() -> None:
     rows, sd = rows_of(np.zeros(8)), np.linspace(0.05, 0.2, 8)
     stamps_ns = np.sort(np.round(1e9 * rng.uniform(0.0, 2.0, 8)).astype(np.int64))
     ends = at(PLACE, velocity_sd=0.3), at(PLACE, 2_000_000_000)
-    way = Way.of(rows, stamps_ns, np.eye(8), np.zeros((8, 3)), ends)
+    way = Way.of(rows, alone(8), one_each(stamps_ns), np.zeros((8, 3)), ends)
     residuals = 1e-3 * rng.normal(0.0, sd)  # so small that angles are linear
     left = unshifted(way, residuals, sd, np.zeros(8))
     _, H = linearise(rows, PLACE, 1.1)
-    V = np.diag(sd**2) + way.covariance(H) + 1e5 * H[:, :2] @ H[:, :2].T
+    _, jacobian = way.residuals(np.zeros(3))
+    V = np.diag(sd**2) + way.covariance(jacobian) + 1e5 * H[:, :2] @ H[:, :2].T
     for i in range(8):
         others = np.arange(8) != i
         gain = np.linalg.solve(V[np.ix_(others, others)], V[others, i])
@@ -140,14 +151,15 @@ def test_the_way_wanders_as_the_motion_model_says() -> None:
         states = [F @ column for column in states] + [P[:, 0]]
         joint[k, : k + 1] = joint[: k + 1, k] = [column[0] for column in states]
         x.append(P[0, 0])
-    H = np.zeros((3, 3))
-    H[:, 0] = 1.0
+    ends = at(PLACE, velocity_sd=velocity_sd), at(PLACE, 2_000_000_000)
+    stamps_ns = np.round(1e9 * times).astype(np.int64)
+    way = Way.of(rows_of(np.zeros(8))[:3], alone(3), one_each(stamps_ns), np.zeros((3, 3)), ends)
     means = np.array([[0.5, 0.5, 0.0], [0.0, 0.2, 0.8]])
     for weights in (np.eye(3), means):
-        ends = at(PLACE, velocity_sd=velocity_sd), at(PLACE, 2_000_000_000)
-        stamps_ns = np.round(1e9 * times).astype(np.int64)
-        way = Way.of(rows_of(np.zeros(8))[:3], stamps_ns, weights, np.zeros((3, 3)), ends)
-        np.testing.assert_allclose(way.covariance(H), weights @ joint @ weights.T, rtol=1e-9)
+        jacobian = np.zeros((len(weights), 3, 3))
+        jacobian[:, :, 0] = weights  # of positions along x, at each instant
+        found = way.covariance(jacobian)
+        np.testing.assert_allclose(found, weights @ joint @ weights.T, rtol=1e-9)
 
 
 def test_what_the_way_explains_is_in_no_residual() -> None:
@@ -165,12 +177,15 @@ def test_what_the_way_explains_is_in_no_residual() -> None:
         H.append(of_row[0, [0, 1, 4]])
     ends = at(PLACE), at(PLACE, 1_000_000_000)
     stamps_ns = np.array([1, 2, 3, 4]) * 200_000_000
-    weights = np.array([[0.3, 0.7, 0.0, 0.0], [0.0, 0.0, 0.5, 0.5]])
-    way = Way.of(np.concatenate(rows), stamps_ns, weights, np.array(to_go), ends)
-    said, of_values = way.residuals(np.zeros(3))
-    assert np.abs(said).max() < 1e-12
-    np.testing.assert_allclose(of_values, np.array(H))
-    shifted, _ = way.residuals(np.array([1e-4, -2e-4, 0.0]))
-    np.testing.assert_allclose(
-        shifted, -weights @ of_values @ np.array([1e-4, -2e-4, 0.0]), rtol=2e-3
+    means, weights = np.array([0, 0, 1, 1]), np.array([0.3, 0.7, 0.5, 0.5])
+    way = Way.of(
+        np.concatenate(rows), (means, weights), one_each(stamps_ns), np.array(to_go), ends
     )
+    said, jacobian = way.residuals(np.zeros(3))
+    assert np.abs(said).max() < 1e-12
+    expected = np.zeros((2, 4, 3))
+    expected[means, np.arange(4)] = weights[:, None] * np.array(H)
+    np.testing.assert_allclose(jacobian, expected)
+    step = np.array([1e-4, -2e-4, 0.0])
+    shifted, _ = way.residuals(step)
+    np.testing.assert_allclose(shifted, -expected.sum(axis=1) @ step, rtol=2e-3)

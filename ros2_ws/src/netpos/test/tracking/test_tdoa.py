@@ -355,7 +355,6 @@ def test_a_bag_written_before_there_were_differences_is_read(tmp_path: Path) -> 
     assert [m[1] for m in measurements[1]] != [m[1] for m in measurements[0]]
 
 
-@pytest.mark.timeout(900)  # 67,000 epochs, on a busy machine
 def test_a_real_drone(tmp_path: Path) -> None:
     """Eight anchors one after the other; a planar track of a flight whose height is a state, with
     the arm of the antenna that the authors use. Half of the vertical offset has no source."""

@@ -51,19 +51,20 @@ Models = dict[Name, ErrorModel]
 Learned = ErrorModel | Stretch
 
 
-class _Value(NamedTuple):
-    """A value as it was heard.
+class _Heard(NamedTuple):
+    """The values of an instant.
 
-    row : (ROW_WIDTH,); gone : (3,) the way of the device until then; information : one over the
-    variance that the update took; left : what the update left of it, over the sd stated
+    gone : (3,) the way of the device until then; names : of whom the k values are;
+    rows : (k, ROW_WIDTH); information : (k,) one over the variance of the update, by what is
+    stated; left : (k,) what the update left of them, over the sd stated
     """
 
-    name: Name
     stamp_ns: int
-    row: Array
     gone: Array
-    information: float
-    left: float
+    names: list[Name]
+    rows: Array
+    information: Array
+    left: Array
 
 
 class Others(Protocol):
@@ -93,30 +94,30 @@ class _Window(NamedTuple):
 
     @classmethod
     def of(
-        cls, values: Sequence[_Value], gone: Array, ends: tuple[DeviceState, DeviceState]
+        cls, heard: Sequence[_Heard], gone: Array, ends: tuple[DeviceState, DeviceState]
     ) -> _Window:
-        """What ``values`` say that were heard between the posteriors ``ends``; ``gone`` (3,): the
-        way until the second."""
+        """What was ``heard`` between the posteriors ``ends``; ``gone`` (3,): the way until the
+        second."""
         of_name: dict[Name, list[int]] = {}
-        for k, value in enumerate(values):
-            of_name.setdefault(value.name, []).append(k)
-        weights = np.zeros((len(of_name), len(values)))
-        scatter = []
+        for k, name in enumerate(name for instant in heard for name in instant.names):
+            of_name.setdefault(name, []).append(k)
+        rows, information, left = (
+            np.concatenate([getattr(instant, what) for instant in heard])
+            for what in ("rows", "information", "left")
+        )
+        mean_of, scatter = np.empty(len(rows), dtype=np.int64), []
         for i, of_it in enumerate(of_name.values()):
-            weights[i, of_it] = [values[k].information for k in of_it]
-            z = np.array([values[k].left for k in of_it])
+            mean_of[of_it], z = i, left[of_it]
             square, steps = float(((z - z.mean()) ** 2).sum()), float((np.diff(z) ** 2).sum())
             scatter.append((square, len(of_it) - 1.0, steps / 2.0))
-        information = weights.sum(axis=1)
-        weights /= information[:, None]
-        rows = np.array([value.row for value in values])
-        stamps_ns = np.array([value.stamp_ns for value in values])
-        to_go = gone - np.array([value.gone for value in values])
-        way = Way.of(rows, stamps_ns, weights, to_go, ends)
+        variance = 1.0 / np.bincount(mean_of, information)
+        means = mean_of, information * variance[mean_of]
+        instants = [(instant.stamp_ns, len(instant.names)) for instant in heard]
+        to_go = gone - np.array([instant.gone for instant in heard])
+        way = Way.of(rows, means, instants, to_go, ends)
         last = rows[[of_it[-1] for of_it in of_name.values()]]
         distance = np.where(np.isin(last[:, KIND], _STRETCHING), last[:, VALUE], 0.0)
-        none = np.zeros_like(distance)
-        return cls(list(of_name), way, 1.0 / information, none, distance, scatter)
+        return cls(list(of_name), way, variance, np.zeros_like(distance), distance, scatter)
 
     def moved(self, share: float) -> _Window:
         """With the residuals where ``share`` of the distance more had been left in."""
@@ -171,7 +172,7 @@ class LearnedErrors:
     velocity: Array = field(default_factory=lambda: np.zeros(3))
     gone: Array = field(default_factory=lambda: np.zeros(3))
     """The way (3,) of the device and of its clock, by the velocities estimated."""
-    heard: list[_Value] = field(default_factory=list)
+    heard: list[_Heard] = field(default_factory=list)
     """In the window that goes on."""
     before: DeviceState | None = None
     """With which the window before ended."""
@@ -214,23 +215,25 @@ class LearnedErrors:
             self.moved_m += 0.0 if still else math.hypot(*velocity[:2].tolist()) * dt
         self.moved_ns, self.velocity = stamp_ns, velocity
 
-    def hear(self, name: Name, row: Array, left: Sequence[float], stated: float) -> None:
-        """Note a row (ROW_WIDTH,) of where the device has moved to, what is left of it by
-        ``unexplained``, and the variance stated."""
-        model = self.models[name]
-        information, size = model.scale / left[2], left[0] / math.sqrt(stated)
-        self.heard.append(_Value(name, self.moved_ns, row, self.gone, information, size))
-        self.models[name] = model.heard(left[1] / stated)
+    def hear(self, names: list[Name], rows: Array, left: Array, stated: Array) -> None:
+        """Note the k values of an instant, to which the device has moved: whose they are, their
+        rows (k, ROW_WIDTH), what is ``left`` (k, 8) of them by ``unexplained``, and the variances
+        ``stated`` (k,)."""
+        scale = np.array([self.models[name].scale for name in names])
+        information, size = scale / left[:, 2], left[:, 0] / np.sqrt(stated)
+        self.heard.append(_Heard(self.moved_ns, self.gone, names, rows, information, size))
+        for name, ratio in zip(names, (left[:, 1] / stated).tolist(), strict=True):
+            self.models[name] = self.models[name].heard(ratio)
 
     def conclude(self, posterior: DeviceState) -> list[Name]:
         """Weigh a window that is over with the epoch of a posterior; whose models changed."""
-        stamp_ns, values, before = posterior.stamp_ns, self.heard, self.before
-        if before is None or not values:
+        stamp_ns, heard, before = posterior.stamp_ns, self.heard, self.before
+        if before is None or not heard:
             self._begin(posterior)
             return []
         if stamp_ns < self.ends_ns:
             return []
-        window = _Window.of(values, self.gone, (before, posterior))
+        window = _Window.of(heard, self.gone, (before, posterior))
         seen = _Seen.of(self.models, window)
         others_come = any(more == 0.0 for _, more, _ in window.scatter)
         goes_on = seen.left.checked.sum() < (_ENOUGH if others_come else _ALONE)

@@ -37,6 +37,7 @@ from netpos.tracking.rsus.learning import WINDOW_S, LearnedErrors, Name
 from netpos.tracking.rsus.shift import CHANGE, DeviceState
 
 _RSU = "rsu/"
+_WHOSE = [BIAS, REFERENCE, GROUP]
 REFERENCED = sum(int(r.field) for s, r in readings() if s.difference_of >= 0)
 """Fields that compare the RSU with a second one."""
 _RENEWED_S = 1e-6  # correlation time of what is new at every epoch
@@ -297,14 +298,17 @@ class BiasStates:
         velocity = mean[VELOCITY].tolist()
         still = rests(velocity, cov.diagonal()[VELOCITY].tolist())
         learned.move(stamp_ns, mean[CHANGE], still)
-        names = {biases: name for name, biases in self._biases.items()}
-        left = unexplained(mean, cov, rows, height_m).tolist()
-        for row, said in zip(rows, left, strict=True):
-            name = names.get(_Biases(int(row[BIAS]), int(row[REFERENCE])))
-            if name is None or not accepted[int(row[GROUP])]:
-                continue
-            stated = float(row[GATE_VARIANCE]) / learned.models[name].gate_scale
-            learned.hear(name, row, said, stated)
+        of_biases: dict[tuple[int, ...], Name] = {b: name for name, b in self._biases.items()}
+        named = [
+            (i, of_biases[own, reference])
+            for i, (own, reference, group) in enumerate(rows[:, _WHOSE].astype(np.int64).tolist())
+            if (own, reference) in of_biases and accepted[group]
+        ]
+        if named:
+            taken, names = [i for i, _ in named], [name for _, name in named]
+            gate = np.array([learned.models[name].gate_scale for name in names])
+            left = unexplained(mean, cov, rows, height_m)[taken]
+            learned.hear(names, rows[taken], left, rows[taken, GATE_VARIANCE] / gate)
         speed = 0.0 if still else math.hypot(*velocity)
         concluded = learned.conclude(posterior)
         return concluded, self._take_learned(learned, concluded, speed)

@@ -3,10 +3,12 @@ squares, with a way that is known as well as the motion model says."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from netpos.estimation.measurement import BIAS, HEIGHT, REFERENCE, linearise
 from netpos.estimation.state import X
@@ -35,7 +37,8 @@ class DeviceState(NamedTuple):
 class Way:
     """Means of values that m RSUs and quantities measured on the way of a device.
 
-    rows : (N, ROW_WIDTH) of the values, which no bias state explains; weights : (m, N) of means
+    rows : (N, ROW_WIDTH) of the values, which no bias state explains
+    mean_of, weights : (N,) in which of the means each value is, and with what weight
     begins : (E + 1,) with which row each instant begins
     to_go : (E, 3) from there to the end, x, y and the clock [m]; after : the state at the end
     since_s : (E,) since velocity and drift were known, with change_cov (3, 3)
@@ -43,8 +46,9 @@ class Way:
     """
 
     rows: Array
-    begins: list[int]
+    mean_of: NDArray[np.int64]
     weights: Array
+    begins: list[int]
     to_go: Array
     since_s: Array
     change_cov: Array
@@ -55,22 +59,24 @@ class Way:
     def of(
         cls,
         rows: Array,
-        stamps_ns: Array,
-        weights: Array,
+        means: tuple[NDArray[np.int64], Array],
+        instants: Sequence[tuple[int, int]],
         to_go: Array,
         ends: tuple[DeviceState, DeviceState],
     ) -> Way:
-        """Of ``rows`` (N, ROW_WIDTH) in the order of their ``stamps_ns`` (N,), with ``weights``
-        (m, N), and what was ``to_go`` (N, 3) from each; ``ends``: before and after."""
+        """Of ``rows`` (N, ROW_WIDTH), which are in ``means`` with their weights, (N,) each, in the
+        order of E ``instants``: the stamp [ns] of each and its number of rows. ``to_go`` (E, 3);
+        ``ends``: before and after."""
         rows = rows.copy()
         rows[:, BIAS], rows[:, REFERENCE] = -1.0, 0.0
         before, after = ends
-        at_ns, first = np.unique(stamps_ns, return_index=True)
-        since_s = (at_ns - before.stamp_ns) * 1e-9
+        stamps_ns, counts = np.array(instants).T
+        begins = [0, *np.cumsum(counts).tolist()]
+        since_s = (stamps_ns - before.stamp_ns) * 1e-9
         early, late = np.minimum.outer(since_s, since_s), np.maximum.outer(since_s, since_s)
         wander = before.accel_density**2 * early**2 * (3.0 * late - early) / 6.0
-        change_cov, begins = before.cov[np.ix_(CHANGE, CHANGE)], [*first.tolist(), len(rows)]
-        return cls(rows, begins, weights, to_go[first], since_s, change_cov, wander, after)
+        change_cov = before.cov[np.ix_(CHANGE, CHANGE)]
+        return cls(rows, *means, begins, to_go, since_s, change_cov, wander, after)
 
     @property
     def shifted(self) -> list[int]:
@@ -81,7 +87,8 @@ class Way:
 
     def residuals(self, shift: Array) -> tuple[Array, Array]:
         """What the means (m,) say more than would be measured on the way shifted by ``shift``
-        (k,), and the Jacobian (N, k) of the values."""
+        (k,), and the weighted Jacobian (m, E, k) of the values at each instant: its sum over all
+        instants is that of the means."""
         shifted, height_m = self.shifted, self.after.height_m
         at_end = self.after.mean.copy()
         at_end[shifted] += shift
@@ -91,15 +98,16 @@ class Way:
             then[_PLACE] -= to_go
             left[begin:end], of_all = linearise(self.rows[begin:end], then, height_m)
             H[begin:end] = of_all[:, shifted]
-        return self.weights @ left, H
+        instant = np.repeat(np.arange(len(self.to_go)), np.diff(self.begins))
+        jacobian = np.zeros((int(self.mean_of.max()) + 1, len(self.to_go), len(shifted)))
+        np.add.at(jacobian, (self.mean_of, instant), self.weights[:, None] * H)
+        return np.bincount(self.mean_of, self.weights * left), jacobian
 
-    def covariance(self, H: Array) -> Array:
-        """Of the means, by how the device may have moved otherwise: (m, m), with the Jacobian
-        (N, k) of the values. The velocity is a random walk from when it was known."""
-        of_values = self.weights[:, :, None] * H[:, : len(_PLACE)]
-        of_epoch = np.add.reduceat(of_values, self.begins[:-1], axis=1)
-        by_change = np.einsum("mek,e->mk", of_epoch, self.since_s)
-        x, y = of_epoch[:, :, 0], of_epoch[:, :, 1]
+    def covariance(self, jacobian: Array) -> Array:
+        """Of the means, by how the device may have moved otherwise: (m, m), with their Jacobian
+        (m, E, k) of ``residuals``. The velocity is a random walk from when it was known."""
+        by_change = np.einsum("mek,e->mk", jacobian[:, :, : len(_PLACE)], self.since_s)
+        x, y = jacobian[:, :, 0], jacobian[:, :, 1]
         cov: Array = by_change @ self.change_cov @ by_change.T
         return cov + x @ self.wander @ x.T + y @ self.wander @ y.T
 
@@ -128,24 +136,24 @@ def unshifted(way: Way, more: Array, sd: Array, beside: Array) -> Left:
     a third, and what is left of it looks like an error of the RSU.
     """
     place = np.zeros(len(way.shifted))
-    said, H = way.residuals(place)
-    whiten = _whitening(way.covariance(H), sd)
+    said, jacobian = way.residuals(place)
+    whiten = _whitening(way.covariance(jacobian), sd)
     for _ in range(_STEPS):
-        A, left = whiten @ way.weights @ H, whiten @ (said + more)
+        A, left = whiten @ jacobian.sum(axis=1), whiten @ (said + more)
         step = np.linalg.lstsq(A, left, rcond=_UNSEEN)[0]
         if np.abs(A @ step).max() < _SMALL:
             break
         for halved in range(_HALVINGS):
             trial = place + step / 2.0**halved
-            trial_said, trial_H = way.residuals(trial)
+            trial_said, trial_jacobian = way.residuals(trial)
             trial_left = whiten @ (trial_said + more)
             if trial_left @ trial_left < left @ left:
                 break
         else:
             break
-        place, said, H = trial, trial_said, trial_H
-    whiten = _whitening(way.covariance(H), sd)
-    U, size, _ = np.linalg.svd(whiten @ way.weights @ H, full_matrices=False)
+        place, said, jacobian = trial, trial_said, trial_jacobian
+    whiten = _whitening(way.covariance(jacobian), sd)
+    U, size, _ = np.linalg.svd(whiten @ jacobian.sum(axis=1), full_matrices=False)
     U = U[:, size > _UNSEEN * max(size.max(), 1e-12)]
     left, other = (a - U @ (U.T @ a) for a in (whiten @ (said + more), whiten @ beside))
     free = whiten - U @ (U.T @ whiten)
