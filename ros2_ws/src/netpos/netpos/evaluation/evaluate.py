@@ -188,26 +188,25 @@ def assess_bag(
         than are skipped
     """
     path = Path(path)
-    if truth is not None:
-        return evaluate_bag(
-            path,
-            skip=skip,
-            vue=vue,
-            truth=truth,
-            residuals=residuals,
-            truth_time=True,
-            progress=progress,
-        )
+    if truth is None and not _has_truth(path):
+        return survey_bag(path, vue=vue, progress=progress)
+    return evaluate_bag(
+        path,
+        skip=skip,
+        vue=vue,
+        truth=truth,
+        residuals=residuals,
+        truth_time=True,
+        progress=progress,
+    )
+
+
+def _has_truth(path: Path) -> bool:
     with BagReader(path) as bag:
-        has_truth = any(
+        return any(
             info.count and topics.split(topic)[1] == topics.GROUND_TRUTH
             for topic, info in bag.topics.items()
         )
-    if has_truth:
-        return evaluate_bag(
-            path, skip=skip, vue=vue, residuals=residuals, truth_time=True, progress=progress
-        )
-    return survey_bag(path, vue=vue, progress=progress)
 
 
 def survey_bag(path: Path, *, vue: str | None = None, progress: Progress | None = None) -> Survey:
@@ -303,7 +302,7 @@ def evaluate_bag(
     }
     covered = [text for name, vue in vues.items() for text in _covered(name, vue.scored.figures)]
     late = [
-        vue.truth_time.sentence(name)
+        vue.truth_time.sentence(name, path if truth is None else None)
         for name, vue in vues.items()
         if vue.truth_time is not None and vue.truth_time.matters
     ]

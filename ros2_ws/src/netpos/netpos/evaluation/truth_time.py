@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from netpos.evaluation.pairing import ClockOffsets, Trajectory, at_stamps
 from netpos.evaluation.residuals import Series, series_of, summary
+from netpos.messages import topics
 from netpos.messages.values import Array, RsuInfo, RsuMeasurement
 
 _NS = 1_000_000_000
@@ -41,14 +43,18 @@ class TimeOffset:
         """Whether it explains a tenth of the scatter."""
         return abs(self.offset_s) >= _LEAST_S and self.scatter < _SMALLER
 
-    def sentence(self, vue: str) -> str:
-        """For people."""
+    def sentence(self, vue: str, bag: Path | None) -> str:
+        """For people. ``bag``: that holds the ground truth, None: it comes from elsewhere."""
+        remedy = f"{self.offset_s:.2f} more in --truth-time-offset"
+        if bag is not None:
+            topic = topics.of_vue(vue, topics.GROUND_TRUTH)
+            offset = f"--truth-time-offset {self.offset_s:.2f}"
+            remedy = f"--truth {bag} --truth-topic {topic} {offset}"
         return (
             f"{vue}: the measurements fit the ground truth best if it is {self.offset_s:.2f} s "
             f"later (they scatter by {1.0 - self.scatter:.0%} less about it): do their clocks "
-            "agree? An error of speed times this offset is in all figures; "
-            f"--truth BAG --truth-topic /{vue}/ground_truth --truth-time-offset "
-            f"{self.offset_s:.2f} scores without it"
+            f"agree? An error of speed times this offset is in all figures; {remedy} scores "
+            "without it"
         )
 
 

@@ -138,14 +138,17 @@ def test_it_is_said_with_what_to_do(tmp_path: Path) -> None:
     replay_bag(bag, track)
 
     late, (note,) = evaluated(track)
-    said = re.search(r"--truth-topic (\S+) --truth-time-offset (\S+)", note)
+    said = re.search(r"(--truth \S+ --truth-topic \S+) --truth-time-offset (\S+)", note)
     assert said is not None
-    topic, offset_s = said.groups()
-    assert float(offset_s) == pytest.approx(0.4, abs=0.02)
-    options = ("--truth", track, "--truth-topic", topic, "--truth-time-offset", offset_s)
-    at_its_time, notes = evaluated(track, *options)
+    source, offset_s = said[1].split(), float(said[2])
+    assert offset_s == pytest.approx(0.4, abs=0.02)
+    at_its_time, notes = evaluated(track, *source, "--truth-time-offset", offset_s)
     assert not [text for text in notes if "fit the ground truth" in text]
     assert at_its_time["rmse_m"] < 0.7 * late["rmse_m"]
+
+    _, notes = evaluated(track, *source, "--truth-time-offset", 0.1)
+    (more,) = re.findall(r"(\S+) more in --truth-time-offset", " ".join(notes))
+    assert float(more) == pytest.approx(0.3, abs=0.02)
 
 
 def evaluated(bag: Path, *options: object) -> tuple[dict[str, Any], list[str]]:
