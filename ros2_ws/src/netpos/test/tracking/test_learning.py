@@ -262,19 +262,22 @@ def _measurements(seed: int, seconds: float, noise_sd: float, bias: Array) -> li
         t = k / RATE_HZ
         place = np.array([8.0 * math.cos(t / 8), 5.0 * math.sin(t / 8), 0.0])
         for i, rsu in enumerate(RSUS):
-            found.append(
-                RsuMeasurement(
-                    stamp_ns=round((1.0 + t) * 1e9),
-                    rsu_id=f"a{i}",
-                    vue_id="vue_1",
-                    sequence=k,
-                    expected=len(RSUS),
-                    fields=Field.RANGE,
-                    range_m=float(np.linalg.norm(place - rsu) + bias[i] + rng.normal(0, noise_sd)),
-                    range_var=0.01,
-                )
-            )
+            value = float(np.linalg.norm(place - rsu) + bias[i] + rng.normal(0, noise_sd))
+            found.append(_range(t, i, value, 0.1, sequence=k, expected=len(RSUS)))
     return found
+
+
+def _range(t: float, i: int, value: float, stated_sd: float, **epoch: int) -> RsuMeasurement:
+    """A range [m] of RSU i, t [s] after the start."""
+    return RsuMeasurement(
+        stamp_ns=round((1.0 + t) * 1e9),
+        rsu_id=f"a{i}",
+        vue_id="vue_1",
+        fields=Field.RANGE,
+        range_m=value,
+        range_var=stated_sd**2,
+        **epoch,  # type: ignore[arg-type]
+    )
 
 
 def _track(measurements: list[RsuMeasurement], **parameters: object) -> list[Odometry]:
@@ -342,19 +345,8 @@ def in_turn(seed: int, noise_sd: float) -> list[RsuMeasurement]:
     rng, found = np.random.default_rng(seed), []
     for k in range(4 * 240):
         t, i = k / 4.0, k // 2 % 4
-        distance = float(np.linalg.norm(on_circle(t) - FAR[i]))
-        found.append(
-            RsuMeasurement(
-                stamp_ns=round((1.0 + t) * 1e9),
-                rsu_id=f"a{i}",
-                vue_id="vue_1",
-                sequence=k,
-                expected=1,
-                fields=Field.RANGE,
-                range_m=distance + float(rng.normal(0.0, noise_sd)),
-                range_var=0.25,
-            )
-        )
+        value = float(np.linalg.norm(on_circle(t) - FAR[i]) + rng.normal(0.0, noise_sd))
+        found.append(_range(t, i, value, 0.5, sequence=k, expected=1))
     return found
 
 

@@ -99,9 +99,11 @@ class Way:
             left[begin:end], of_all = linearise(self.rows[begin:end], then, height_m)
             H[begin:end] = of_all[:, shifted]
         instant = np.repeat(np.arange(len(self.to_go)), np.diff(self.begins))
-        jacobian = np.zeros((int(self.mean_of.max()) + 1, len(self.to_go), len(shifted)))
+        m = int(self.mean_of.max()) + 1
+        said, jacobian = np.zeros(m), np.zeros((m, len(self.to_go), len(shifted)))
+        np.add.at(said, self.mean_of, self.weights * left)
         np.add.at(jacobian, (self.mean_of, instant), self.weights[:, None] * H)
-        return np.bincount(self.mean_of, self.weights * left), jacobian
+        return said, jacobian
 
     def covariance(self, jacobian: Array) -> Array:
         """Of the means, by how the device may have moved otherwise: (m, m), with their Jacobian
