@@ -23,7 +23,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import real_data_readers as readers
 from netpos.bags.importers import (
     ble_aoa,
@@ -44,7 +43,6 @@ Source = tuple[str, Path, Callable[[Path, Path], object], dict[str, Any]]
 DATA = Path(os.environ.get("NETPOS_DATA", Path(__file__).parents[2] / "shared" / "data")).resolve()
 BLE_RUNS = ("uc1_run1", "uc1_run2", "uc2_run1", "uc3_run1")
 UWB_RUNS = ("LOS", "NLOS", "LOS_gap")
-FEWEST_REPORTS = 2  # that have a direction
 AZIMUTHS = (Kind.AZIMUTH, Kind.AZIMUTH_CONE)
 
 
@@ -117,38 +115,7 @@ def measured(source: Source, folder: Path) -> Json:
     row = recording_row(recording, folder)
     if name.startswith("ble_"):
         row["azimuth_only"] = _azimuth_only(recording, folder / name)
-    if name == "adsb_mlat":
-        row["by_direction"] = _by_direction(folder / name)
     return row
-
-
-def _by_direction(replayed: Path) -> Json:
-    """Of the devices that were heard more than once, errors along the way that the truth reports
-    and across it: RMSE [m], mean of the squared error over its variance (1 expected), and by how
-    many seconds the estimate is ahead, in the median."""
-    errors, variances, speeds = [], [], []
-    for vue in evaluate_bag(replayed, skip=0).vues.values():
-        truth, pairs = vue.run.truth, vue.scored.counted
-        if len(truth) < FEWEST_REPORTS or not len(pairs):
-            continue
-        times_s = 1e-9 * (truth.stamp_ns - truth.stamp_ns[0])
-        velocity = np.gradient(truth.position[:, :2], times_s, axis=0)
-        velocity = velocity[np.searchsorted(truth.stamp_ns, pairs.estimate.stamp_ns)]
-        speed = np.linalg.norm(velocity, axis=1)
-        ahead = velocity / speed[:, None]
-        axes = np.stack([ahead, np.column_stack([-ahead[:, 1], ahead[:, 0]])], axis=1)
-        cov = axes @ pairs.estimate.position_cov[:, :2, :2] @ axes.transpose(0, 2, 1)
-        errors.append(np.einsum("nij,nj->ni", axes, pairs.error[:, :2]))
-        variances.append(np.diagonal(cov, axis1=1, axis2=2))
-        speeds.append(speed)
-    error, variance, speed = (np.concatenate(parts) for parts in (errors, variances, speeds))
-    rmse, nees = np.sqrt((error**2).mean(axis=0)), (error**2 / variance).mean(axis=0)
-    return {
-        "n": len(error),
-        "along": {"rmse_m": float(rmse[0]), "nees_mean": float(nees[0])},
-        "across": {"rmse_m": float(rmse[1]), "nees_mean": float(nees[1])},
-        "ahead_s": float(np.median(error[:, 0] / speed)),
-    }
 
 
 def _azimuth_only(recording: Recording, replayed: Path) -> Json:

@@ -17,7 +17,7 @@ import scipy.io
 from netpos import write_bag
 from netpos.bags.importers.own.columns import SPEED_OF_LIGHT_MPS, Columns
 from netpos.bags.importers.own.recording import Truth, import_csv, import_ros
-from netpos.bags.importers.own.truth import TruthColumns
+from netpos.bags.importers.own.truth import Poses, TruthColumns
 from netpos.messages.values import Array, Field, Odometry, RsuInfo, RsuMeasurement
 from netpos.world.geodesy import Datum
 
@@ -178,23 +178,24 @@ def import_adsb(folder: Path, bag: Path) -> object:
     places = dict(zip(on_earth, datum.to_map(np.array(list(on_earth.values()))), strict=True))
     near = {name for name, place in places.items() if np.linalg.norm(place[:2]) < FLAT_M}
     measured: list[RsuMeasurement] = []
-    truth: dict[tuple[int, str], Odometry] = {}
+    reports: dict[str, dict[int, Array]] = {}
     for number, row, found in messages:
         stamp_ns = min(found.values()) + number * ADSB_APART_NS
         vue = f"set_{number}_aircraft_{row['aircraft']}"
-        if not near.issuperset(found) or (stamp_ns, vue) in truth:
+        if not near.issuperset(found) or stamp_ns in reports.get(vue, {}):
             continue
         first, *others = found
         for name in others:
             late = difference(first, 1e-9 * (found[name] - found[first]), ARRIVAL_SD_M)
             measured.append(RsuMeasurement(stamp_ns=stamp_ns, rsu_id=name, vue_id=vue, **late))
         report = [float(row[name]) for name in ("latitude", "longitude", "geoAltitude")]
-        truth[stamp_ns, vue] = pose(stamp_ns, vue, datum.to_map(np.array([report]))[0])
+        reports.setdefault(vue, {})[stamp_ns] = datum.to_map(np.array([report]))[0]
+    truth = [pose for vue, places in reports.items() for pose in way(vue, places)]
     return write_bag(
         bag,
         rsus=rsus_at({name: places[name] for name in near}, measured),
         measurements=measured,
-        truth=list(truth.values()),
+        truth=truth,
         tracker=AIRCRAFT,
         metadata={
             "source": "LocaRDS",
@@ -263,6 +264,15 @@ def difference(reference: str, late_s: float, sd_m: float) -> dict[str, Any]:
         "tdoa_s": late_s,
         "tdoa_var": 2.0 * (sd_m / SPEED_OF_LIGHT_MPS) ** 2,
     }
+
+
+def way(vue: str, places: Mapping[int, Array]) -> list[Odometry]:
+    """Where a device truly was at stamps [ns], (3,) m each; with two places how it moved, too."""
+    if len(places) == 1:
+        return [pose(stamp_ns, vue, place) for stamp_ns, place in places.items()]
+    stamps_ns = np.array(sorted(places), dtype=np.int64)
+    values = [[*places[stamp_ns].tolist(), math.nan] for stamp_ns in stamps_ns.tolist()]
+    return Poses(stamps_ns, np.array(values)).odometry(vue)
 
 
 def pose(stamp_ns: int, vue: str, place: Array) -> Odometry:

@@ -30,7 +30,7 @@ from netpos.messages.values import Array, TrackStatus
 
 SKIP_EPOCHS = 20
 LARGE_ERROR_M = 5.0
-MIN_SPEED_FOR_HEADING_MPS = 0.5
+MIN_SPEED_MPS = 0.5
 CONVERGED_ERROR_M = 1.0
 CONVERGED_FOR_S = 1.0
 NS = 1e9
@@ -64,7 +64,10 @@ class Figures:
     state TRACKING. measured: the same of measurements of RSUs, without steps and IMU. rmse_m,
     p50..max: horizontal position error; mean_error_m: mean horizontal
     error, which fokin2020:eq.34 calls RMSE; rmse_3d_m with the vertical; north, east, down: by
-    axis, as deng2022 does. vertical_rmse_m: of the height, and vertical_error_m its mean, positive
+    axis, as deng2022 does. along_*, across_*: of the horizontal error along the true way and
+    across it, where the true speed exceeds 0.5 m/s; along_nees: mean of the square of that part
+    over its variance, 1 expected. A ground truth at the wrong time shows along the way alone.
+    vertical_rmse_m: of the height, and vertical_error_m its mean, positive
     above the truth; None where the truth has no height (``pairing.has_height``).
     velocity_rmse_mps: horizontal, map axes. heading_rmse_deg: where the true speed exceeds 0.5
     m/s. clock_offset_sd_ns: standard deviation of the clock offset error about its mean;
@@ -111,6 +114,10 @@ class Figures:
     north_rmse_m: float | None = None
     east_rmse_m: float | None = None
     down_rmse_m: float | None = None
+    along_rmse_m: float | None = None
+    across_rmse_m: float | None = None
+    along_nees: float | None = None
+    across_nees: float | None = None
     vertical_rmse_m: float | None = None
     vertical_error_m: float | None = None
     nees_n: int | None = None
@@ -221,10 +228,23 @@ def _initial(run: Run, pairs: Pairs, ready_ns: Stamps) -> Initial:
     )
 
 
-def _heading_errors_deg(pairs: Pairs) -> Array:
-    moving = np.linalg.norm(pairs.truth.velocity[:, :2], axis=1) > MIN_SPEED_FOR_HEADING_MPS
-    errors = wrap_angle(pairs.estimate.heading - pairs.truth.heading)
-    return np.asarray(np.rad2deg(errors[moving]))
+def _in_motion(pairs: Pairs) -> dict[str, Any]:
+    """Errors of the heading, along the true way and across it."""
+    velocity = pairs.truth.velocity[:, :2]
+    moving = np.linalg.norm(velocity, axis=1) > MIN_SPEED_MPS
+    turned = wrap_angle(pairs.estimate.heading - pairs.truth.heading)[moving]
+    figures = {"heading_rmse_deg": rms(np.rad2deg(turned))}
+    ahead = velocity[moving] / np.linalg.norm(velocity[moving], axis=1, keepdims=True)
+    aside = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+    cov = pairs.estimate.position_cov[moving, :2, :2]
+    for name, axis in (("along", ahead), ("across", aside)):
+        error = (axis * pairs.error[moving, :2]).sum(axis=1)
+        variance = np.einsum("ni,nij,nj->n", axis, cov, axis)
+        known = variance > 0.0
+        figures[f"{name}_rmse_m"] = rms(error)
+        nees = error[known] ** 2 / variance[known]
+        figures[f"{name}_nees"] = float(nees.mean()) if nees.size else None
+    return figures
 
 
 def _consistency(pairs: Pairs, statuses: Sequence[TrackStatus], from_ns: int) -> dict[str, Any]:
@@ -288,7 +308,7 @@ def _accuracy(scored: Pairs) -> dict[str, Any]:
         "max_m": worst,
         "share_above_5m": float((errors > LARGE_ERROR_M).mean()) if errors.size else None,
         "velocity_rmse_mps": rms(np.linalg.norm(velocity_errors, axis=1)),
-        "heading_rmse_deg": rms(_heading_errors_deg(scored)),
+        **_in_motion(scored),
     }
 
 

@@ -39,7 +39,10 @@ FACTS = frozenset(
     }
 )
 # Figures of an estimate's accuracy, and figures of a whole run.
-ACCURACY = ("n", "rmse_m", "p50_m", "p95_m", "max_m", "nees_mean", "nees_bounds", "share_above_5m")
+ACCURACY = (
+    *("n", "rmse_m", "p50_m", "p95_m", "max_m", "nees_mean", "nees_bounds", "share_above_5m"),
+    *("along_rmse_m", "across_rmse_m", "along_nees", "across_nees"),
+)
 WHOLE = (
     "availability",
     "measured",

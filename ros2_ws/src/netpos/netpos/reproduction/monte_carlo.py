@@ -14,7 +14,7 @@ from netpos.estimation.level.protection import gaussian_tail
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.estimation.state import POSITION, X
 from netpos.evaluation.consistency import MeanTest, nees_over_runs
-from netpos.evaluation.metrics import MIN_SPEED_FOR_HEADING_MPS, NS, SKIP_EPOCHS
+from netpos.evaluation.metrics import MIN_SPEED_MPS, NS, SKIP_EPOCHS
 from netpos.evaluation.work import Work
 from netpos.messages.values import Array
 from netpos.reproduction.experiment import Experiment, Track, setup_of
@@ -122,7 +122,7 @@ def _sums(
         out[2] += clock
         out[3] += clock * clock
         vx, vy = truth[i, X.VX], truth[i, X.VY]
-        if vx * vx + vy * vy > MIN_SPEED_FOR_HEADING_MPS**2:
+        if vx * vx + vy * vy > MIN_SPEED_MPS**2:
             wx, wy = mean[i, X.VX], mean[i, X.VY]
             turn = np.arctan2(vx * wy - vy * wx, vx * wx + vy * wy)
             out[4] += turn * turn

@@ -153,10 +153,33 @@ def test_velocity_is_compared_in_map_axes() -> None:
 
 
 @pytest.mark.parametrize(("speed", "known"), [(0.5, False), (0.51, True)])
-def test_heading_counts_only_in_motion(speed: float, known: bool) -> None:
+def test_heading_and_way_count_only_in_motion(speed: float, known: bool) -> None:
     truth = [pose(0, 0, speed=speed), pose(1, 0, speed=speed)]
-    heading = score(run_of(truth, [pose(0.5, 0, yaw=0.1)]), skip=0).figures.heading_rmse_deg
-    assert (heading is not None) is known
+    figures = score(run_of(truth, [pose(0.5, 0, yaw=0.1)]), skip=0).figures
+    assert (figures.heading_rmse_deg is not None) is known
+    assert (figures.along_rmse_m is not None) is known
+
+
+def test_errors_along_the_way_and_across_it() -> None:
+    """The device goes north-east. Its estimate is 3 m ahead with an sd of 1 m, and 0.5 m to the
+    left with an sd of 0.25 m."""
+    truth = [pose(0.1 * k, 0.2 * k, 0.2 * k, yaw=np.pi / 4, speed=2.8) for k in range(5)]
+    turn = np.array([[1.0, -1.0], [1.0, 1.0]]) / np.sqrt(2.0)
+    cov: Array = np.eye(6)
+    cov[:2, :2] = turn @ np.diag([1.0, 0.0625]) @ turn.T
+    estimate = [replace(moved(p, *(turn @ [3.0, 0.5])), pose_cov=cov) for p in truth]
+    figures = score(run_of(truth, estimate), skip=0).figures
+    assert figures.along_rmse_m == pytest.approx(3.0)
+    assert figures.across_rmse_m == pytest.approx(0.5)
+    assert figures.along_nees == pytest.approx(9.0)
+    assert figures.across_nees == pytest.approx(4.0)
+
+
+def test_an_error_of_no_variance_has_no_nees() -> None:
+    truth = [pose(0, 0, speed=1.0), pose(1, 1, speed=1.0)]
+    figures = score(run_of(truth, [replace(pose(0.5, 0.7), pose_cov=np.zeros((6, 6)))]), skip=0)
+    assert figures.figures.along_rmse_m == pytest.approx(0.2)
+    assert figures.figures.along_nees is None
 
 
 def test_heading_error_wraps() -> None:

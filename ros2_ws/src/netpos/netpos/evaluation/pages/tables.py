@@ -45,9 +45,11 @@ class Column:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
     """A line per experiment that matches ``rows`` as a whole, in the order they were recorded.
-    Groups of the expression name the line. Without columns: a line per figure."""
+    Groups of the expression name the line. ``having``: regular expression of a figure that a line
+    must have. Without columns: a line per figure."""
 
     rows: str
+    having: str = ""
     heading: str = "experiment"
     columns: tuple[Column, ...] = ()
 
@@ -109,6 +111,12 @@ def _experiments(table: Table, recorded: Recorded) -> dict[str, list[Entry]]:
         if match:
             groups = [text for text in match.groups() if text]
             chosen.setdefault(", ".join(groups) or entry.experiment, []).append(entry)
+    if table.having:
+        chosen = {
+            title: entries
+            for title, entries in chosen.items()
+            if any(entry.ours is not None for entry in _matching(table.having, entries))
+        }
     if not chosen:
         raise TableError(f"nothing recorded for {recorded.name} matches {table.rows!r}")
     return chosen

@@ -39,6 +39,16 @@ def test_several_figures_of_a_column_are_joined() -> None:
     assert render(table, RECORDED) == "| drive | RMS |\n| --- | --- |\n| B | 1 / **2** |\n"
 
 
+def test_lines_without_a_figure_that_they_must_have_are_left_out() -> None:
+    nothing = Entry(experiment="C", figure="RMSE", ours=None)
+    recorded = Recorded(name="some2000", entries=(*ENTRIES, nothing), method="By hand.")
+    table = Table(rows="(.*)", having="RMSE", columns=(Column(title="RMSE", figure="RMSE"),))
+    assert render(table, recorded).splitlines()[2:] == [
+        "| A, slow | **1.5** |",
+        "| A, fast | 0.5 |",
+    ]
+
+
 def test_a_table_without_columns_lists_every_figure() -> None:
     assert render(Table(rows="A, fast|B"), RECORDED) == (
         "| figure | unit | paper | ours |\n| --- | --- | --- | --- |\n"
@@ -55,6 +65,7 @@ def test_a_table_without_columns_lists_every_figure() -> None:
         Table(rows="A"),  # an experiment must match as a whole
         Table(rows="B", columns=(Column(title="RMSE", figure="RMSE"),)),
         Table(rows="B", columns=(Column(title="RMS", figure="RMS"),)),
+        Table(rows="B", having="RMSE", columns=(Column(title="RMS", figure="RMS .*"),)),
         Table(rows="B", columns=(Column(title="RMS", figure="RMS .*", bounds="NEES.*"),)),
     ],
 )
