@@ -5,8 +5,8 @@ Nothing is tuned for these networks; without one of four anchors on a car the th
 may stand in one line, whose two sides nothing tells apart. Printed for each: the share of the
 estimates that are TRACKING, how often the state changes, their RMSE and largest error [m], their
 median level [m], how many errors are above it, the largest error over its level, and the RMSE [m]
-of the plain Kalman filter at the same stamps from the same measurements. The misses come first;
-at the end a table of the recordings.
+of the plain Kalman filter at the same stamps from the same measurements. The misses come first.
+The file has the parts of each recording together, and one by one.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from netpos.evaluation.guarded_runs import Material, material_of, outputs_of, thinned
@@ -140,35 +141,22 @@ def text_of(row: Row) -> str:
     return text if row.plain_m is None else f"{text}  plain {row.plain_m:.3f}"
 
 
-COLUMNS = (
-    "recording",
-    "networks",
-    "with errors above the level",
-    "such errors",
-    "largest, over the level",
-    "RMSE above the plain filter's",
-    "RMSE over it, median",
-)
-
-
-def summary_of(recording: str, rows: list[Row]) -> tuple[int, str]:
-    """How many errors of all parts of a recording are above their levels, and its line."""
+def summary_of(recording: str, rows: list[Row]) -> dict[str, Any]:
+    """Of all parts of a recording together; ``over_plain``: the RMSE of each over that of the
+    plain filter."""
     scored = round(sum(row.tracking * row.estimates for row in rows))
-    missed, above = sum(row.exceeded > 0 for row in rows), sum(row.exceeded for row in rows)
-    worst = max(row.worst_ratio or 0.0 for row in rows)
+    above = sum(row.exceeded for row in rows)
     ratios = [row.rmse_m / row.plain_m for row in rows if row.rmse_m and row.plain_m]
-    beaten = sum(ratio > 1.0 for ratio in ratios)
-    ratio = f"{np.median(ratios):.2f}" if ratios else "–"
-    cells = [recording, len(rows), missed, f"{above:,} of {scored:,}", f"{worst:.2f}"]
-    return above, f"| {' | '.join(map(str, [*cells, beaten, ratio]))} |"
-
-
-def table_of(rows: list[Row]) -> str:
-    """What came of the parts of each recording, in Markdown, the misses first."""
-    names = sorted({row.recording for row in rows})
-    found = [summary_of(name, [row for row in rows if row.recording == name]) for name in names]
-    lines = [text for _, text in sorted(found, key=lambda pair: -pair[0])]
-    return "\n".join([f"| {' | '.join(COLUMNS)} |", len(COLUMNS) * "| --- " + "|", *lines])
+    return {
+        "name": recording,
+        "networks": len(rows),
+        "networks_above": sum(row.exceeded > 0 for row in rows),
+        "errors_above": f"{above:,} of {scored:,}",
+        "largest_over_level": max(row.worst_ratio or 0.0 for row in rows),
+        "worse_than_plain": sum(ratio > 1.0 for ratio in ratios),
+        "over_plain": float(np.median(ratios)) if ratios else None,
+        "parts": [asdict(row) for row in rows],
+    }
 
 
 def main() -> None:
@@ -190,9 +178,12 @@ def main() -> None:
     rows.sort(key=lambda row: -row.exceeded)
     for row in rows:
         print(text_of(row))
-    print(table_of(rows))
     if args.json is not None:
-        args.json.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+        names = dict.fromkeys(row.recording for row in rows)
+        found = [
+            summary_of(name, [row for row in rows if row.recording == name]) for name in names
+        ]
+        args.json.write_text(json.dumps({"rows": found}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

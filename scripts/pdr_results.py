@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from netpos.evaluation.pedestrian import (
@@ -145,10 +146,10 @@ def main() -> None:
         for rows in (step_rows, contact_rows, walk_rows, attitude_rows):
             for name, text, error, aim, met in rows(data):
                 print(f"| {name} | {text} | {error} | {aim} | {'yes' if met else '**no**'} |")
-                ok = bool(met) if aim else None
-                recorded.append(
-                    {"name": name, "ours": text, "error": error, "target": aim, "ok": ok}
-                )
+                row: dict[str, Any] = {"name": name, "ours": text, "error": error}
+                if aim:
+                    row["targets"] = {"ours": {"ok": bool(met), "target": aim}}
+                recorded.append(row)
     except FileNotFoundError as error:
         sys.exit(f"netpos: {error}")
     if arguments.json is not None:

@@ -214,9 +214,3 @@ def run(case: Case, seed: int, *, told: bool, learn: bool) -> tuple[Array, Array
                 means[k] = output.odometry.position[:2]
                 covs[k] = output.odometry.pose_cov[:2, :2]
     return places, means, covs
-
-
-def nees_of(errors: Array, covs: Array) -> Array:
-    """Squared errors (n, 2) over their covariances (n, 2, 2): (n,), 2 is expected."""
-    nees: Array = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covs), errors)
-    return nees

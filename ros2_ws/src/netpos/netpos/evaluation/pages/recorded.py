@@ -123,12 +123,16 @@ def _read_paper(data: Mapping[str, Any]) -> tuple[list[Entry], str]:
         values = {key: row.get(key) for key in ("unit", "paper", "baseline", "ours", "defaults")}
         entries.append(Entry(experiment=named[0], figure=named[1], ok=row["ok"], **values))
     known = {(entry.experiment, entry.figure): entry for entry in entries}
-    paper, runs, seed = data["paper"], data["runs"], data["seed"]
     method = (
-        f"Measured by `netpos reproduce {paper} --runs {runs} --seed {seed}` in "
-        f"{data['wall_s']:.0f} s: {runs} runs (seeds {seed} to {seed + runs - 1})."
+        f"Measured by `netpos reproduce {data['paper']} --runs {data['runs']} --seed "
+        f"{data['seed']}` in {data['wall_s']:.0f} s: {_seeds(data)}."
     )
     return [replace(entry, target=_target(entry, known)) for entry in entries], method
+
+
+def _seeds(data: Mapping[str, Any]) -> str:
+    runs, seed = data["runs"], data["seed"]
+    return f"{runs} runs (seeds {seed} to {seed + runs - 1})"
 
 
 def _target(entry: Entry, known: Mapping[tuple[str, str], Entry]) -> str:
@@ -190,18 +194,18 @@ def _flat(value: object, key: str = "") -> Iterator[tuple[str, Value]]:
 
 def _read_table(command: str) -> Callable[[Mapping[str, Any]], tuple[list[Entry], str]]:
     """A reader of rows that are not judged here: ``{"rows": [{"name": ..., figures}]}``; a row
-    may have ``ok``, which then judges its figure ``ours`` against its ``target``."""
+    may have ``targets``, by figure whether it is ``ok`` and the ``target`` in words."""
 
     def read(data: Mapping[str, Any]) -> tuple[list[Entry], str]:
         entries = []
         for row in data["rows"]:
-            target = str(row.get("target") or "")
+            name, targets = row["name"], row.get("targets", {})
             for figure, value in _flat(row):
-                judged = {"ok": row.get("ok"), "target": target} if figure == "ours" else {}
                 if figure != "name":
-                    name = row["name"]
+                    judged = targets.get(figure, {})
                     entries.append(Entry(experiment=name, figure=figure, ours=value, **judged))
-        return entries, f"Measured by `{command}`."
+        seeds = f": {_seeds(data)}" if "seed" in data else ""
+        return entries, f"Measured by `{command}`{seeds}."
 
     return read
 
@@ -267,5 +271,7 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any]], tuple[list[Entry], str]]] =
     "real_data": _read_recordings,
     "scenarios": _read_table("netpos run SCENARIO --offline, netpos evaluate"),
     "learned": _read_table("python scripts/learned_papers.py"),
+    "error_grid": _read_table("python scripts/error_grid.py"),
+    "fewer_rsus": _read_table("python scripts/fewer_rsus.py"),
     "walking": _read_table("python scripts/pdr_results.py"),
 }

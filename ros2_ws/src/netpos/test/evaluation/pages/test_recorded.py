@@ -137,11 +137,27 @@ def test_a_speed_ratio_is_judged_and_what_is_left_out_is_named(tmp_path: Path) -
 
 
 def test_a_walking_row_is_judged_by_its_own_verdict(tmp_path: Path) -> None:
-    rows = [{"name": "steps", "ours": "9 of 10", "error": "-10 %", "target": "1 %", "ok": False}]
+    few = {"ours": {"ok": False, "target": "1 %"}}
+    rows = [{"name": "steps", "ours": "9 of 10", "error": "-10 %", "targets": few}]
     recorded = read(tmp_path, "walking", {"rows": rows})
     assert [(e.name, e.ours, e.target) for e in recorded.missed] == [
         ("steps: ours", "9 of 10", "1 %")
     ]
+    assert recorded.judged == 1
+
+
+def test_a_row_may_have_several_targets_of_figures_within(tmp_path: Path) -> None:
+    targets = {
+        "ratio": {"ok": True, "target": "≤ 1.15"},
+        "learned.nees_mean": {"ok": False, "target": "1 to 3"},
+    }
+    row = {"name": "a", "ratio": 1.1, "learned": {"nees_mean": 4.0}, "targets": targets}
+    recorded = read(tmp_path, "error_grid", {"runs": 10, "seed": 5, "rows": [row]})
+    assert (
+        recorded.method == "Measured by `python scripts/error_grid.py`: 10 runs (seeds 5 to 14)."
+    )
+    assert [(e.name, e.target) for e in recorded.missed] == [("a: learned.nees_mean", "1 to 3")]
+    assert recorded.judged == 2
 
 
 def test_a_note_is_part_of_the_method(tmp_path: Path) -> None:
