@@ -233,18 +233,24 @@ def test_the_first_fix_is_that_of_least_squares(seed: int) -> None:
     said = fed(tracker(), items)[-1].odometry
     assert said is not None
 
-    def residuals(p: Array) -> Array:
-        left = [(np.linalg.norm(p - HALL[m.rsu_id]) - m.range_m) / SD_M for m in items]
+    def residuals(p: Array, sd_m: float) -> Array:
+        left = [(np.linalg.norm(p - HALL[m.rsu_id]) - m.range_m) / sd_m for m in items]
         return np.array([*left, (p[2] - MEAN_M) / HEIGHT_SD_M, *(p[:2] - [4.0, 3.0]) / 20.0])
 
-    found = least_squares(residuals, [4.0, 3.0, MEAN_M])
-    misfit = max(1.0, 2.0 * found.cost / len(items))
+    # Ranges that do not meet are less certain than stated, by as much as makes them meet.
+    sd_m, worse = SD_M, 1.0
+    for _ in range(5):
+        sd_m *= math.sqrt(worse)
+        found = least_squares(residuals, [4.0, 3.0, MEAN_M], args=(sd_m,))
+        worse = float((found.fun[: len(items)] ** 2).mean())
+        if worse < 1.1:
+            break
     # The posterior about it, summed over samples: where it bends, its mean is not its top.
-    width = 1.5 * np.linalg.cholesky(misfit * np.linalg.inv(found.jac.T @ found.jac))
+    width = 1.5 * np.linalg.cholesky(np.linalg.inv(found.jac.T @ found.jac))
     unit = rng.normal(size=(20000, 3))
     points = found.x + unit @ width.T
-    cost = np.array([(residuals(p) ** 2).sum() for p in points])
-    weights = np.exp(-0.5 * (cost - cost.min()) / misfit + 0.5 * (unit**2).sum(axis=1))
+    cost = np.array([(residuals(p, sd_m) ** 2).sum() for p in points])
+    weights = np.exp(-0.5 * (cost - cost.min()) + 0.5 * (unit**2).sum(axis=1))
     mean = np.average(points, axis=0, weights=weights)
     cov = np.cov(points.T, aweights=weights)
     sd = np.sqrt(np.diag(cov))

@@ -306,6 +306,58 @@ def test_inconsistent_measurements_widen_the_covariance() -> None:
     assert error @ np.linalg.solve(results[1][1][:2, :2], error) < 9.0
 
 
+def test_a_misfit_says_nothing_of_speeds_and_slow_errors() -> None:
+    """Ranges that do not meet are worse than stated; biases and speeds are as declared. An error
+    of one epoch is a part of the noise and grows with it."""
+    stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40), rsu(40, 40)]
+    rows = np.vstack([measure(s, at(20.0, 21.0), Field.RANGE) for s in stations])
+    rows[:2, 1] += 6.0
+    rows[:, BIAS], rows[:, COMMON] = (6, 7, 8, 9), 10
+    slow = SlowErrors(6, np.array([0.2] * 4 + [0.1]), np.array([True] * 4 + [False]))
+    config = TrackerConfig(initial_position_sd_max_m=50.0, initial_speed_sd_mps=1.5)
+    initialiser = Initialiser(config)
+    initialiser.add(T0, rows, tuple(stations))
+    solution = fix_of(initialiser, slow)
+    assert solution is not None
+    mean, cov = solution
+    assert math.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]) > 1.5
+    np.testing.assert_allclose(cov.diagonal()[2:4], 1.5**2)
+    assert (cov.diagonal()[6:10] <= 0.2**2).all()
+    assert (np.abs(mean[6:10]) < 0.05).all()
+
+
+def test_two_late_ranges_at_the_start_are_forgotten_with_the_next_epoch() -> None:
+    """A device that stands among five anchors of slow errors of 0.1 m, of which the first epoch
+    hears two over detours of 5 and 6 m."""
+    sites = 15.0 * np.array([(math.cos(a), math.sin(a)) for a in np.arange(5) * 0.4 * math.pi])
+    tracker = Tracker(TrackerConfig(hold_s=0.0, device_height_m=0.0, initial_speed_sd_mps=1.0))
+    for i, site in enumerate(sites):
+        declared = {"range_bias_sd_m": 0.1, "bias_correlation_time_s": 60.0}
+        info = RsuInfo(rsu_id=f"a{i}", position=np.array([*site, 0.0]), **declared)
+        tracker.add_rsu(info)
+    rng, place, errors = np.random.default_rng(1), np.array([2.0, -1.5]), []
+    for k in range(10):
+        detour = np.array([6.0, 0.0, 5.0, 0.0, 0.0]) * (k == 0)
+        seen = np.linalg.norm(place - sites, axis=1) + detour + rng.normal(0.0, 0.1, 5)
+        for i, value in enumerate(seen.tolist()):
+            tracker.add(
+                RsuMeasurement(
+                    stamp_ns=T0 + k * 200_000_000,
+                    rsu_id=f"a{i}",
+                    vue_id="v",
+                    sequence=k,
+                    expected=5,
+                    fields=Field.RANGE,
+                    range_m=value,
+                    range_var=0.01,
+                )
+            )
+        found = [o.odometry for o in tracker.process() if o.odometry is not None]
+        errors += [float(np.linalg.norm(o.position[:2] - place)) for o in found]
+    assert errors[0] > 1.0
+    assert max(errors[2:]) < 0.4
+
+
 @pytest.mark.parametrize("liar", range(4))
 def test_the_one_of_four_that_contradicts_the_others_is_left_out(liar: int) -> None:
     """The fix is that of the three others, with the covariance of three."""

@@ -61,6 +61,7 @@ _ATTEMPT_NS = 100_000_000
 _RIVAL_COST, _RIVAL_SHARE = 9.21, 0.01
 _ANY_CLOCK_S = 1.0
 _CONTRADICTS = 9.0  # mean squared residual over variance
+_RELAXATIONS, _FITS = 5, 1.1
 _NEAREST_M = 1.0
 _HEADINGS = 16
 _HEADING_SD_MAX = 0.5
@@ -86,16 +87,53 @@ class _Solution(NamedTuple):
     fits: list[Fit]
     log_odds: float = 0.0
 
-    def mixture(self, misfit: float, is_possible: Callable[[Array], bool]) -> Mixture:
-        """The posterior of all states; a ``misfit`` above 1 enlarges all variances."""
+    @property
+    def misfit(self) -> float:
+        """Cost for each row where it is more than the 1 of true measurements, or 1."""
+        return max(1.0, self.fits[0][0] / len(self.problem.window.rows))
+
+    def mixture(self, is_possible: Callable[[Array], bool]) -> Mixture:
+        """The posterior of all states."""
 
         def equations(state: Array) -> tuple[float, Array, Array]:
-            cost, b, A = normal_equations(state, *self.problem)
-            return cost / misfit, b / misfit, A / misfit
+            found: tuple[float, Array, Array] = normal_equations(state, *self.problem)
+            return found
 
-        fits = [(cost / misfit, mean, cov * misfit) for cost, mean, cov in self.fits]
-        means, covs, log_weights = components_of(equations, fits, is_possible)
+        means, covs, log_weights = components_of(equations, self.fits, is_possible)
         return Mixture(means, covs, log_weights + self.log_odds)
+
+    def relaxed(self, lasting: int) -> _Solution:
+        """With variances so much larger that nothing contradicts: of the measurements, and of the
+        place, the velocity and the clock beforehand, each by its own misfit. Slow errors, which
+        end with the first ``lasting`` states, are as certain as before; the states behind are
+        errors of one epoch, a part of the measurements."""
+        solution, factors = self, np.ones(1 + N_CORE)
+        for _ in range(_RELAXATIONS):
+            more = solution._misfits(lasting)
+            if more.max() < _FITS:
+                break
+            factors *= more
+            rows, prior_var = self.problem.window.rows.copy(), self.problem.prior_var.copy()
+            rows[:, VARIANCE] *= factors[0]
+            prior_var[:N_CORE] *= factors[1:]
+            prior_var[lasting:] *= factors[0]
+            window = self.problem.window._replace(rows=rows)
+            problem = self.problem._replace(window=window, prior_var=prior_var)
+            fits = [_solve(mean, problem) for _, mean, _ in solution.fits]
+            fits = sorted((fit for fit in fits if _is_sound(fit)), key=lambda fit: fit[0])
+            if not fits:
+                break
+            solution = self._replace(problem=problem, fits=fits)
+        return solution
+
+    def _misfits(self, lasting: int) -> Array:
+        """Cost of the measurements for each row, and of place, velocity and clock for each of
+        their states, where that is more than 1 (1 + N_CORE,)."""
+        cost, state, _ = self.fits[0]
+        known = (state - self.problem.prior) ** 2 / self.problem.prior_var
+        of_rows = (cost - known[:lasting].sum()) / len(self.problem.window.rows)
+        pairs = known[:N_CORE].reshape(-1, 2).mean(axis=1)
+        return np.maximum([of_rows, *np.repeat(pairs, 2)], 1.0)
 
 
 def joined(mixtures: Sequence[Mixture]) -> Mixture:
@@ -176,17 +214,17 @@ class Initialiser:
                 or self._any_clock(rows, ages, errors_sd)
                 or solutions
             )
-        cost, _, cov = solutions[0].fits[0]
-        misfit = max(1.0, cost / len(rows))
-        lacks = self._lacks(rows, cov, misfit)
+        misfit = solutions[0].misfit
+        if misfit > 1.0:
+            lasting = N_CORE + int(slow.lasts.sum())
+            solutions = [solution.relaxed(lasting) for solution in solutions]
+        lacks = self._lacks(rows, solutions[0].fits[0][2], misfit)
         if lacks:
             self.missing = lacks
             return None
         if agrees and self._config.isolate_rsus:
-            solutions += self._one_errs(rows, agreed.problem)
-        mixture = joined(
-            [self._of_track(s.mixture(misfit, self._plausible), slow) for s in solutions]
-        )
+            solutions += self._one_errs(rows, solutions[0].problem)
+        mixture = joined([self._of_track(s.mixture(self._plausible), slow) for s in solutions])
         waited_s = (newest - self._window[0][0]) * 1e-9
         waits = waited_s < 0.8 * self._config.initial_window_s or not carries_modes(self._config)
         if waits and has_modes(mixture, _RIVAL_SHARE):
@@ -213,7 +251,7 @@ class Initialiser:
                 f"{self._heard(rows)} leave a position sd of {sd_m:.1f} m "
                 f"(initial_position_sd_max_m: {limit_m:g}); another RSU or quantity is needed"
             )
-        if sd_m * math.sqrt(misfit) > limit_m:
+        if sd_m > limit_m:
             return (
                 f"{self._heard(rows)} contradict each other by {math.sqrt(misfit):.3g} sd; are"
                 " they in m, rad and s, and the RSUs where RsuInfo says?"
