@@ -195,7 +195,8 @@ class Initialiser:
         Of three or more RSUs one may err grossly: what the others say is a part of the posterior.
         Where the measurements contradict each other and leaving out one RSU makes them agree, the
         fix is that of the others. Otherwise another clock offset may make them agree: the declared
-        one is that of a device just switched on.
+        one is that of a device just switched on. Where nothing does, they are less certain than
+        stated.
         """
         newest = self._window[-1][0]
         if newest < self._next_attempt_ns:
