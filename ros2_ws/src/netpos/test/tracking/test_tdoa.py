@@ -277,6 +277,21 @@ def test_differences_to_several_references_at_one_stamp_are_no_duplicates() -> N
     assert made.add(items[1]) == "duplicate"
 
 
+def test_paths_of_ranges_that_may_be_blocked_change_nothing_of_differences() -> None:
+    """No difference is late by a blocked path: all of an epoch are taken at once, as without one,
+    and outvote one that is 6 m off."""
+    tracks = []
+    for share in (0.0, 0.3):
+        made, rng, found = tracker(nlos_probability=share), np.random.default_rng(4), []
+        for k in range(60):
+            items = star(START_NS + 500_000_000 * k, rng)
+            if k % 6 == 5:
+                items[k % 4] = replace(items[k % 4], tdoa_s=items[k % 4].tdoa_s + 6.0 / C)
+            found += [fix_of([o]) for o in said(made, items)]
+        tracks.append(np.array([fix.position for fix in found]))
+    np.testing.assert_array_equal(tracks[1], tracks[0])
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [

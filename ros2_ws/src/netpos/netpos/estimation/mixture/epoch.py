@@ -232,12 +232,11 @@ def apply_epoch(
 ) -> Update:
     """The components, moved to the epoch already, after it; ``accepted`` (groups,) is filled with
     0 or 1. ``open_s``: the last seconds of which no component says whether the device turned."""
-    rows, blocked = epoch.rows, options.robust.nlos_probability > 0.0
-    at = ambiguous_phase(rows, options)
-    if options.models == 1 and at < 0 and (blocked or any_divides(components, rows, options)):
+    rows, at = epoch.rows, ambiguous_phase(epoch.rows, options)
+    if options.models == 1 and at < 0 and any_divides(components, rows, options):
         found: Update = in_turn(components, epoch, options, open_s, accepted)
         return found
-    if blocked:
+    if options.robust.nlos_probability > 0.0:
         reweight_by_best(components, rows, options.height_m, by_path(options.robust))
     at_once: Update = _at_once(components, epoch, at, options, open_s, accepted)
     return at_once
