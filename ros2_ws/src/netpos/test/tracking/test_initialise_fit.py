@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from error_cases import Case, message, tracker_of, true_values, walk
 from first_fix import at, fix_of, measure, rsu, solve
 from netpos.estimation.measurement import BIAS, COMMON, REFERENCE, VARIANCE, linearise
 from netpos.estimation.mixture.gaussians import Mixture
@@ -329,29 +330,14 @@ def test_a_misfit_says_nothing_of_speeds_and_slow_errors() -> None:
 def test_two_late_ranges_at_the_start_are_forgotten_with_the_next_epoch() -> None:
     """A device that stands among five anchors of slow errors of 0.1 m, of which the first epoch
     hears two over detours of 5 and 6 m."""
-    sites = 15.0 * np.array([(math.cos(a), math.sin(a)) for a in np.arange(5) * 0.4 * math.pi])
-    tracker = Tracker(TrackerConfig(hold_s=0.0, device_height_m=0.0, initial_speed_sd_mps=1.0))
-    for i, site in enumerate(sites):
-        declared = {"range_bias_sd_m": 0.1, "bias_correlation_time_s": 60.0}
-        info = RsuInfo(rsu_id=f"a{i}", position=np.array([*site, 0.0]), **declared)
-        tracker.add_rsu(info)
-    rng, place, errors = np.random.default_rng(1), np.array([2.0, -1.5]), []
-    for k in range(10):
-        detour = np.array([6.0, 0.0, 5.0, 0.0, 0.0]) * (k == 0)
-        seen = np.linalg.norm(place - sites, axis=1) + detour + rng.normal(0.0, 0.1, 5)
-        for i, value in enumerate(seen.tolist()):
-            tracker.add(
-                RsuMeasurement(
-                    stamp_ns=T0 + k * 200_000_000,
-                    rsu_id=f"a{i}",
-                    vue_id="v",
-                    sequence=k,
-                    expected=5,
-                    fields=Field.RANGE,
-                    range_m=value,
-                    range_var=0.01,
-                )
-            )
+    case, times = Case(moving=False), np.arange(10) / 5.0
+    places, rng, errors = walk(case, times), np.random.default_rng(1), []
+    tracker, variance = tracker_of(case, places, told=True, learn=False)
+    seen = true_values(case, places) + rng.normal(0.0, 0.1, (10, 5, 1))
+    seen[0, [0, 2], 0] += 6.0, 5.0
+    for k, place in enumerate(places):
+        for i in range(5):
+            tracker.add(message(case, T0 + k * 200_000_000, k, i, seen[k, i], variance))
         found = [o.odometry for o in tracker.process() if o.odometry is not None]
         errors += [float(np.linalg.norm(o.position[:2] - place)) for o in found]
     assert errors[0] > 1.0

@@ -33,7 +33,7 @@ def fused(bag: Path) -> list[str]:
     with BagReader(bag) as reader:
         found = [topic.split("/")[1] for topic in reader.topics if topic.endswith("/odometry")]
     vues = sorted(set(found) - {"networks"})
-    assert set(vues) <= {"vue_1", "vue_2", "wifi_wifi_1", "wifi_wifi_2"}
+    assert {"vue_1", "vue_2"} <= set(vues) <= {"vue_1", "vue_2", "wifi_wifi_1", "wifi_wifi_2"}
     return vues
 
 
