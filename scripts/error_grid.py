@@ -2,8 +2,9 @@
 
     python scripts/error_grid.py [--seeds N] [--first-seed N] [--only ROW...] [--json FILE]
 
-RSUs around a yard, or four on a car, measure ranges of one device 5 times a second; or four arrays
-on the walls of a room of 12 m by 6 m measure two direction cosines of a person 10 times a second.
+RSUs around a yard, or four on a car, measure ranges of one device 5 times a second, or times while
+its clock is unknown, or time differences; or four arrays on the walls of a room of 12 m by 6 m
+measure two direction cosines of a person 10 times a second.
 Their errors are white noise, a first-order Gauss-Markov bias each, and late paths; what they
 declare is wrong.
 ``told`` is the tracker that was told noise, bias and correlation time (the mean one, where the
@@ -38,6 +39,7 @@ from error_cases import (  # noqa: E402
     DEVICE_M,
     FACING_RAD,
     Case,
+    Measures,
     anchors,
     measured,
     run,
@@ -50,8 +52,8 @@ Json = dict[str, Any]
 
 
 def cases() -> Iterator[Case]:
-    """One error at a time around the middle, for a device that moves and one that stands; then
-    arrays; then a car."""
+    """One error at a time around the middle, for a device that moves and one that stands; times
+    and time differences that are late; then arrays; then a car."""
     for moving in (True, False):
         middle = Case(moving=moving)
         yield middle
@@ -64,12 +66,19 @@ def cases() -> Iterator[Case]:
         }.items():
             for value in values:
                 yield replace(middle, **{name: value})
+    for measures in (Measures.TIMES, Measures.DIFFERENCES):
+        for moving in (True, False):
+            middle = Case(moving=moving, measures=measures)
+            yield middle
+            yield replace(middle, blocked=0.1)
+            yield replace(middle, blocked=0.2)
+            yield replace(middle, blocked=0.2, rsus=8)
     yield Case(variance=4.0, bias=5.0, rsus=8)
     yield Case(variance=0.25, bias=5.0, rsus=4)
     yield Case(variance=4.0, bias=0.0, rsus=3, moving=False)
     for bias in (1.0, 2.0, 5.0):
         yield Case(bias=bias, length_m=1.0, stops=True)
-    room = Case(variance=0.1, bias=2.5, rsus=4, arrays=True)
+    room = Case(variance=0.1, bias=2.5, rsus=4, measures=Measures.COSINES)
     yield replace(room, time_s=math.inf, moving=False)
     yield replace(room, time_s=math.inf)
     yield replace(room, moving=False)
@@ -100,25 +109,30 @@ def figures(case: Case, seeds: range, *, told: bool, learn: bool) -> Json:
 
 
 def observed(case: Case, seen: Array) -> Observations:
-    """What was measured (n, rsus, k) as the yardstick takes it, in order of time."""
-    n, rsus, quantities = seen.shape
-    kinds = [Kind.AZIMUTH_CONE, Kind.ELEVATION] if case.arrays else [Kind.RANGE]
-    axes = np.tile(np.eye(3), (rsus, 1, 1))
+    """What was measured (n, rsus, k) as the yardstick takes it, in order of time; times of an
+    unknown clock by their differences to the first."""
+    n, sites = len(seen), anchors(case)
+    axes = np.tile(np.eye(3), (len(sites), 1, 1))
+    kinds, values, sd = [Kind.RANGE], seen, np.full_like(seen, case.noise_sd)
     if case.arrays:
-        c, s, o = np.cos(FACING_RAD), np.sin(FACING_RAD), np.zeros(rsus)
+        kinds = [Kind.AZIMUTH_CONE, Kind.ELEVATION]
+        values, sd = np.arcsin(seen), sd / np.sqrt(1.0 - seen**2)
+        c, s, o = np.cos(FACING_RAD), np.sin(FACING_RAD), np.zeros(len(sites))
         axes = np.array([[c, s, o], [-s, c, o], [o, o, o + 1.0]]).transpose(2, 0, 1)
+    elif case.measures is not Measures.RANGES:
+        kinds, values, sd = [Kind.TDOA], seen[:, :1] - seen[:, 1:], math.sqrt(2.0) * sd[:, 1:]
+    rsus = range(len(sites) - values.shape[1], len(sites))
     stamps = np.round(1e9 * (1.0 + np.arange(n) / case.rate_hz)).astype(np.int64)
-    sd = np.full_like(seen, case.noise_sd)
-    values, sd = (np.arcsin(seen), sd / np.sqrt(1.0 - seen**2)) if case.arrays else (seen, sd)
+    each = np.tile(np.repeat(np.array(rsus), len(kinds)), n)
     return Observations(
-        stamp_ns=np.repeat(stamps, rsus * quantities),
-        kind=np.tile(np.array(kinds, dtype=np.int64), n * rsus),
+        stamp_ns=np.repeat(stamps, len(each) // n),
+        kind=np.tile(np.array(kinds, dtype=np.int64), len(each) // len(kinds)),
         value=values.reshape(-1),
         sd=sd.reshape(-1),
-        rsu=np.tile(np.repeat(anchors(case), quantities, axis=0), (n, 1)),
-        other=np.zeros((seen.size, 3)),
-        axes=np.tile(np.repeat(axes, quantities, axis=0), (n, 1, 1)),
-        lever_arm=np.zeros((seen.size, 3)),
+        rsu=sites[each],
+        other=np.tile(sites[0], (len(each), 1)),
+        axes=axes[each],
+        lever_arm=np.zeros((len(each), 3)),
     )
 
 
@@ -139,7 +153,7 @@ def snapshot_rmse(case: Case, seeds: range) -> float:
 
 def described(case: Case) -> str:
     """A case in words."""
-    what = f"{case.rsus} arrays" if case.arrays else f"{case.rsus} ranges"
+    what = f"{case.rsus} {case.measures}"
     what += " of a car" if case.on_a_car else ""
     how = "stops and goes" if case.stops else "moves" if case.moving else "stands"
     parts = [what, how, f"variance {case.variance:g}"]

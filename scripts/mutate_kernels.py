@@ -121,12 +121,6 @@ EQUIVALENT = {
     ("estimation/forms/sigma", "_regress", "left out: E[i, n] *= _SHIFT_WEIGHT"),  # is 1
     ("estimation/forms/sigma", "_regress", "operator swapped: E[i, n] *= _SHIFT_WEIGHT"),
     ("estimation/forms/ekf", "_passes", "operator swapped: stop - start"),
-    # its mirror
-    (
-        "estimation/level/manoeuvre",
-        "detection_delay_s",
-        "operator swapped: xy += h[X.PX] * h[X.PY] / variance",
-    ),
     (
         "estimation/spatial/error_state",
         "correct",

@@ -216,7 +216,7 @@ def open_velocity(cov_or_sqrt: Array, sd: float, unheard_s: float, options: Filt
     choice.add_velocity_step(options.filter, sd, unheard_s, 0.0, cov_or_sqrt)
 
 
-@leaf
+@kernel
 def manoeuvre_s(
     cov: Array, rows: Array, predicted: PredictedRows, unheard_s: float, options: FilterOptions
 ) -> float:
@@ -226,7 +226,7 @@ def manoeuvre_s(
     speed, gate = options.manoeuvre_speed_sd, options.gate_nis[2]
     if 2.0 * speed * speed <= cov[X.VX, X.VX] + cov[X.VY, X.VY]:
         return unheard_s
-    typical_s, _ = detection_delay_s(rows, predicted, gate, speed)
+    typical_s, _ = detection_delay_s(rows, predicted, cov.shape[0], gate, speed)
     return max(unheard_s, typical_s if math.isfinite(typical_s) else 0.0)
 
 

@@ -7,25 +7,22 @@ import numpy as np
 from netpos.estimation.compile import kernel
 from netpos.estimation.measurement import (
     BIAS,
-    HEIGHT,
     REFERENCE,
     VARIANCE,
     curvature_mean,
     curvature_variance,
     innovation_row,
 )
-from netpos.estimation.state import X
 from netpos.messages.values import Array
 
 
 @kernel
 def unexplained(mean: Array, cov: Array, rows: Array, height_m: float) -> Array:
-    """What the posterior mean (n,), cov (n, n) leaves of each row (m, 8): the residual with the
-    bias of the RSU in it, less that of the reference; its expected square, without; the variance
-    of the update; the derivatives of the row by position x, y and clock offset; that bias; and the
-    derivative by the height, 0 where that is known."""
+    """What the posterior mean (n,), cov (n, n) leaves of each row (m, 3): the residual with the
+    bias of the RSU in it, less that of the reference; its expected square, without; and the
+    variance of the update."""
     n = mean.size
-    h, out = np.empty(n), np.zeros((rows.shape[0], 8))
+    h, out = np.empty(n), np.empty((rows.shape[0], 3))
     for i in range(rows.shape[0]):
         row = rows[i]
         residual = innovation_row(row, mean, height_m, h)
@@ -39,8 +36,4 @@ def unexplained(mean: Array, cov: Array, rows: Array, height_m: float) -> Array:
         bias -= mean[reference] if reference > 0 else 0.0
         out[i, 0], out[i, 1] = residual + bias, residual * residual + q
         out[i, 2] = row[VARIANCE] + curvature_variance(row, mean, cov, height_m)
-        out[i, 3], out[i, 4], out[i, 5] = h[X.PX], h[X.PY], h[X.CLOCK]
-        out[i, 6] = bias
-        height = int(row[HEIGHT])
-        out[i, 7] = h[height] if height > 0 else 0.0
     return out

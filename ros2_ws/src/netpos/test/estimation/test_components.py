@@ -453,7 +453,8 @@ def test_a_refused_fix_is_an_outlier_a_tail_or_a_turn(
 
 def test_a_fix_within_the_gate_leaves_one_component_and_without_manoeuvres_so_does_any() -> None:
     x, P = prior((1.0, 2.0), (0.2, 0.3))
-    for options, off_m in ((TURNING, 0.5), (OPTIONS, 6.0)):
+    straight = options_of(TrackerConfig(filter="ekf", manoeuvre_speed_sd_mps=0.0))
+    for options, off_m in ((TURNING, 0.5), (straight, 6.0)):
         rows = linear_rows(x[:2] + off_m * np.array([1.0, 0.0]), R, H, 0)
         rows = np.vstack([rows, linear_rows(x[:2], R, H, 1)])
         epoch = EpochInput(0.1, 0.1, 0, rows)

@@ -14,7 +14,14 @@ from netpos.estimation.level.manoeuvre import (
     side_turns,
     turn_to_side,
 )
-from netpos.estimation.measurement import GATE_VARIANCE, Kind, curvature_variance, linearise
+from netpos.estimation.measurement import (
+    AXES,
+    COMMON,
+    GATE_VARIANCE,
+    Kind,
+    curvature_variance,
+    linearise,
+)
 from netpos.estimation.rows import linear_rows
 from netpos.estimation.update.predicted import predicted_rows
 from netpos.messages.values import Array
@@ -37,16 +44,14 @@ def known(cov: Array, rows: Array) -> Array:
     """What rows tell of the place (2, 2), the prior's own uncertainty taken for noise."""
     _, H = linearise(rows, MEAN, 1.0)
     noise = rows[:, GATE_VARIANCE] + [curvature_variance(r, MEAN, cov, 1.0) for r in rows]
-    variance = np.einsum("ij,jk,ik->i", H, cov, H) + noise
-    information: Array = (H[:, :2] / variance[:, None]).T @ H[:, :2]
+    information: Array = H[:, :2].T @ np.linalg.inv(H @ cov @ H.T + np.diag(noise)) @ H[:, :2]
     return information
 
 
 def delay_s(cov: Array, rows: Array) -> tuple[float, float]:
     """``detection_delay_s`` of rows that MEAN predicts."""
-    found: tuple[float, float] = detection_delay_s(
-        rows, predicted_rows(MEAN, cov, rows, 1.0), GATE, SPEED
-    )
+    predicted = predicted_rows(np.resize(MEAN, len(cov)), cov, rows, 1.0)
+    found: tuple[float, float] = detection_delay_s(rows, predicted, len(cov), GATE, SPEED)
     return found
 
 
@@ -71,6 +76,36 @@ def test_what_no_row_tells_is_never_noticed() -> None:
     assert math.isfinite(some_s)
     assert longest_s == math.inf
     assert delay_s(cov, rows[:0]) == (math.inf, math.inf)
+
+
+def test_an_unknown_clock_hides_no_step_that_several_times_show() -> None:
+    """Two RSUs on either side: of a step along the line between them the difference of the two
+    times, of 0.2 m, tells what ranges of so much noise would; of one across it nothing does."""
+    rows = [
+        filter_rows.row(Kind.TOA, 0.0, 0.02, 0, (MEAN[0] + side, MEAN[1], 1.0))
+        for side in (-100.0, 100.0)
+    ]
+    cov = np.diag([0.0, 0.0, 0.0, 0.0, 1e8, 0.0])
+    typical_s, longest_s = delay_s(cov, np.array(rows))
+    along_s = math.sqrt(GATE * 0.02 / 2.0) / SPEED
+    assert typical_s == pytest.approx(2.0 * math.sqrt(2.0) * along_s, rel=1e-3)
+    assert longest_s > 1e3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_differences_show_a_step_as_soon_as_times_with_an_unknown_clock(seed: int) -> None:
+    """The noise of the reference, a state, is in all differences and tells of no step."""
+    rng, variance = np.random.default_rng(seed), 0.09
+    reference, *others = rng.uniform(-60.0, 60.0, (5, 3))
+    times = [filter_rows.row(Kind.TOA, 0.0, variance, 0, at) for at in (reference, *others)]
+    differences = np.array([filter_rows.row(Kind.TDOA, 0.0, variance, 0, at) for at in others])
+    differences[:, AXES : AXES + 3] = reference - np.array(others)
+    differences[:, COMMON] = 6
+    cov = np.zeros((7, 7))
+    cov[4, 4], cov[6, 6] = 1e8, variance
+    np.testing.assert_allclose(
+        delay_s(cov, differences), delay_s(cov[:6, :6], np.array(times)), rtol=1e-5
+    )
 
 
 def test_a_step_at_any_time_moves_the_place_by_half_of_it() -> None:

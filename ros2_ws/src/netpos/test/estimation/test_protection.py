@@ -176,7 +176,7 @@ def test_a_manoeuvre_is_noticed_where_the_gate_begins_to_refuse() -> None:
     rows = np.vstack([azimuth_row(0.0, 0.0, sd, mean), azimuth_row(100.0, 40.0, sd, mean)])
     speed = 2.5
     predicted = predicted_rows(mean, cov, rows, 0.0)
-    typical, longest = detection_delay_s(rows, predicted, gate, speed)
+    typical, longest = detection_delay_s(rows, predicted, 6, gate, speed)
     assert longest == pytest.approx(3.0 * sd * 100.0 / speed, rel=1e-9)
     moved = mean.copy()
     moved[1] += longest * speed
@@ -185,7 +185,7 @@ def test_a_manoeuvre_is_noticed_where_the_gate_begins_to_refuse() -> None:
     a, b = 100.0 * sd, 40.0 * sd
     expected = 2.0 * math.sqrt(gate / ((1 / a**2 + 1 / b**2) / 2)) / speed
     assert typical == pytest.approx(expected, rel=1e-9)
-    wider = detection_delay_s(rows, predicted_rows(mean, np.eye(6), rows, 0.0), gate, speed)
+    wider = detection_delay_s(rows, predicted_rows(mean, np.eye(6), rows, 0.0), 6, gate, speed)
     assert wider[0] > typical
     assert wider[1] > longest
 
@@ -208,7 +208,7 @@ def level_of(epoch: FusedEpoch, said: FilterOptions) -> float:
     """``manoeuvre_level`` of an epoch."""
     predicted = predicted_rows(epoch.prior_mean, epoch.prior_cov, epoch.rows, said.height_m)
     _, longest_s = detection_delay_s(
-        epoch.rows, predicted, said.gate_nis[2], said.manoeuvre_speed_sd
+        epoch.rows, predicted, epoch.mean.size, said.gate_nis[2], said.manoeuvre_speed_sd
     )
     memory = level_scratch(epoch.mean.size, len(epoch.rows))
     return float(manoeuvre_level(epoch, longest_s, said, memory))
@@ -224,7 +224,7 @@ def test_level_of_a_manoeuvre_is_a_second_answer_and_how_far_it_is(unheard_s: fl
     second = linear_rows(fix + 100.0, R, np.eye(2, 6), 1)
     rows, accepted, mean = np.vstack([first, second]), np.array([1.0, 0.0]), prior + 0.1
     gate = stats.chi2.ppf(0.9999, 2)
-    information = np.diag([2.0 / (0.04 + 0.25), 2.0 / (0.09 + 0.16)])
+    information = np.diag([1.0 / (0.04 + 0.25 / 2.0), 1.0 / (0.09 + 0.16 / 2.0)])
     within_s = max(unheard_s, math.sqrt(gate / information.diagonal().min()) / 4.0)
     wide = cov.copy()
     for p in (0, 1):
@@ -275,7 +275,7 @@ def test_level_of_a_manoeuvre_is_linearised_at_its_own_answer() -> None:
     rows[1, SAME_BEND] = 1.0
     accepted, mean, height_m = np.array([1.0, 1.0, 0.0]), prior + 0.4, said.height_m
     predicted = predicted_rows(prior, cov, rows, height_m)
-    _, longest_s = detection_delay_s(rows, predicted, said.gate_nis[2], 4.0)
+    _, longest_s = detection_delay_s(rows, predicted, mean.size, said.gate_nis[2], 4.0)
     nodes, weights = np.polynomial.legendre.leggauss(3)
     times_s = longest_s * (nodes + 1.0) / 2.0
     wide = sum(w / 2.0 * opened(cov, 4.0, s) for s, w in zip(times_s, weights, strict=True))

@@ -1,13 +1,15 @@
-"""Simulated errors of ranges around a yard or from the corners of a car, and of arrays on the
-walls of a room: white noise, a first-order Gauss-Markov bias each, and late paths, against what is
-declared."""
+"""Simulated errors of ranges, times and time differences around a yard or from the corners of a
+car, and of arrays on the walls of a room: white noise, a first-order Gauss-Markov bias each, and
+late paths, against what is declared."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
 import numpy as np
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.tracker import Tracker
@@ -15,17 +17,28 @@ from netpos.tracking.tracker import Tracker
 DURATION_S = 90.0
 GO_S, STOP_AND_GO_S = 5.0, 20.0
 WALK_MPS = 1.3
+CLOCK_M, DRIFT_MPS = 30.0, 3.0  # sd of the device's: 100 ns, 10 ns/s
 DEVICE_M = {False: 0.0, True: 1.13}  # height, for ranges and for arrays
 FACING_RAD = np.radians([0.0, 90.0, 180.0, 270.0])  # of the arrays
 ON_A_CAR_M = np.array([[0.7, 0.9, -0.6], [2.6, -0.9, -0.6], [2.6, -0.9, 0.9], [2.6, 0.9, 0.9]])
 INWARDS_M = np.array([[0.0, 3.0, 2.3], [6.0, 0.0, 2.3], [12.0, 3.0, 2.3], [6.0, 6.0, 2.3]])
 
 
+class Measures(StrEnum):
+    """What RSUs measure: times of arrival while the clock of the device is unknown, time
+    differences to the first of them, or, arrays, two direction cosines."""
+
+    RANGES = "ranges"
+    TIMES = "times"
+    DIFFERENCES = "time differences"
+    COSINES = "arrays"
+
+
 @dataclass(frozen=True, slots=True)
 class Case:
     """True errors: variance over the one declared, bias [sd of the noise declared], correlation
     time [s] and length [m], share of blocked paths; RSUs; whether the device moves, and whether it
-    stops in between; whether the RSUs are arrays, or close together on a car."""
+    stops in between; what the RSUs measure, or whether they are close together on a car."""
 
     variance: float = 1.0
     bias: float = 1.0
@@ -35,8 +48,13 @@ class Case:
     rsus: int = 5
     moving: bool = True
     stops: bool = False
-    arrays: bool = False
+    measures: Measures = Measures.RANGES
     on_a_car: bool = False
+
+    @property
+    def arrays(self) -> bool:
+        """Whether the RSUs are arrays."""
+        return self.measures is Measures.COSINES
 
     @property
     def noise_sd(self) -> float:
@@ -104,7 +122,8 @@ def true_values(case: Case, places: Array) -> Array:
 
 
 def measured(case: Case, seed: int) -> tuple[Array, Array]:
-    """True places (n, 2) and what is measured there (n, rsus, k) in one run."""
+    """True places (n, 2) and what is measured there (n, rsus, k), of time
+    differences the times [m], in one run."""
     rng = np.random.default_rng(seed)
     times = np.arange(0.0, DURATION_S, 1.0 / case.rate_hz)
     places = walk(case, times)
@@ -117,6 +136,8 @@ def measured(case: Case, seed: int) -> tuple[Array, Array]:
         bias[k] = decay * bias[k - 1] + rng.normal(0.0, step_sd, values.shape[1:])
     late = rng.exponential(3.0, values.shape) * (rng.random(values.shape) < case.blocked)
     seen = values + bias + rng.normal(0.0, noise_sd, values.shape) + late
+    if case.measures is Measures.TIMES:
+        seen += (rng.normal(0.0, CLOCK_M) + rng.normal(0.0, DRIFT_MPS) * times)[:, None, None]
     return places, np.clip(seen, -0.99, 0.99) if case.arrays else seen
 
 
@@ -130,11 +151,12 @@ def tracker_of(case: Case, places: Array, *, told: bool, learn: bool) -> tuple[T
         time_s = 1.0 / max(rate, 1e-6)
     elif told:
         variance += bias_sd**2
+    of_ranges = case.measures is Measures.RANGES
     config = TrackerConfig(
         accel_density_mps2_sqrthz=0.3,
         initial_speed_sd_mps=1.0,
         learn_errors=learn,
-        nlos_probability=0.2 if case.blocked > 0.0 else 0.0,
+        nlos_probability=0.2 if of_ranges and case.blocked > 0.0 else 0.0,
         nlos_mean_excess_m=3.0,
     )
     if case.arrays:
@@ -179,24 +201,40 @@ def rsus_of(case: Case) -> list[RsuInfo]:
     ]
 
 
-def message(
-    case: Case, stamp_ns: int, k: int, i: int, values: Array, var: float
-) -> RsuMeasurement:
-    """What the RSU ``i`` measures, ``values`` (k,), each of variance ``var``."""
-    bare = RsuMeasurement(
-        stamp_ns=stamp_ns, rsu_id=f"a{i}", vue_id="vue_1", sequence=k, expected=case.rsus
-    )
-    if not case.arrays:
-        return replace(bare, fields=Field.RANGE, range_m=float(values[0]), range_var=var)
-    angles, angle_vars = np.arcsin(values), var / (1.0 - values**2)
-    return replace(
-        bare,
-        fields=Field.AZIMUTH | Field.ELEVATION,
-        azimuth_rad=float(angles[0]),
-        azimuth_var=float(angle_vars[0]),
-        elevation_rad=float(angles[1]),
-        elevation_var=float(angle_vars[1]),
-    )
+def messages(case: Case, stamp_ns: int, k: int, values: Array, var: float) -> list[RsuMeasurement]:
+    """What the RSUs measure, ``values`` (rsus, k), each of variance ``var``."""
+    return [
+        replace(
+            _message(case, values, i, var),
+            stamp_ns=stamp_ns,
+            sequence=k,
+            expected=case.rsus - (case.measures is Measures.DIFFERENCES),
+        )
+        for i in range(case.measures is Measures.DIFFERENCES, case.rsus)
+    ]
+
+
+def _message(case: Case, values: Array, i: int, var: float) -> RsuMeasurement:
+    """What the RSU ``i`` measures."""
+    bare = RsuMeasurement(stamp_ns=0, rsu_id=f"a{i}", vue_id="vue_1")
+    if case.arrays:
+        angles, angle_vars = np.arcsin(values[i]), var / (1.0 - values[i] ** 2)
+        return replace(
+            bare,
+            fields=Field.AZIMUTH | Field.ELEVATION,
+            azimuth_rad=float(angles[0]),
+            azimuth_var=float(angle_vars[0]),
+            elevation_rad=float(angles[1]),
+            elevation_var=float(angle_vars[1]),
+        )
+    metres, c = float(values[i, 0]), SPEED_OF_LIGHT_MPS
+    if case.measures is Measures.TIMES:
+        return replace(bare, fields=Field.TOA, toa_s=metres / c, toa_var=var / c**2)
+    if case.measures is Measures.DIFFERENCES:
+        later_s = (metres - float(values[0, 0])) / c
+        of_pair = {"tdoa_s": later_s, "tdoa_var": 2.0 * var / c**2, "reference_rsu_id": "a0"}
+        return replace(bare, fields=Field.TDOA, **of_pair)
+    return replace(bare, fields=Field.RANGE, range_m=metres, range_var=var)
 
 
 def run(case: Case, seed: int, *, told: bool, learn: bool) -> tuple[Array, Array, Array]:
@@ -207,8 +245,8 @@ def run(case: Case, seed: int, *, told: bool, learn: bool) -> tuple[Array, Array
     means, covs = np.full_like(places, math.nan), np.full((len(places), 2, 2), math.nan)
     for k, values in enumerate(seen):
         stamp_ns = round(1e9 * (1.0 + k / case.rate_hz))
-        for i in range(case.rsus):
-            tracker.add(message(case, stamp_ns, k, i, values[i], variance))
+        for item in messages(case, stamp_ns, k, values, variance):
+            tracker.add(item)
         for output in tracker.process():
             if output.odometry is not None:
                 means[k] = output.odometry.position[:2]

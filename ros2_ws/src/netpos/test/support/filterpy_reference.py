@@ -217,15 +217,19 @@ def _update(
         fit = fused(mean, cov, some, GATE_VARIANCE, height_m)
         return float(fit.mahalanobis**2)
 
+    def misfit(chosen: Array) -> float:
+        return together(chosen) - float(gate_nis[chosen.sum()])
+
+    if keep.sum() < len(gate_nis) and misfit(keep) > 0.0:
+        rest, most = keep, (np.unique(rows[keep, GROUP]).size - 1) // 2
+        for _ in range(most):
+            rests = [rest & (rows[:, GROUP] != g) for g in np.unique(rows[rest, GROUP])]
+            rest = min(rests, key=misfit)
+            if misfit(rest) <= 0.0:
+                accepted[rows[keep & ~rest, GROUP].astype(int)] = 0.0
+                keep = rest
+                break
     nis = together(keep)
-    groups = np.unique(rows[keep, GROUP])
-    if keep.sum() < len(gate_nis) and nis > gate_nis[keep.sum()] and groups.size > 2:
-        rests = [(together(keep & (rows[:, GROUP] != g)), g) for g in groups]
-        best = [(d, g) for d, g in rests if d <= gate_nis[(keep & (rows[:, GROUP] != g)).sum()]]
-        if best:
-            nis, odd = min(best)
-            accepted[int(odd)] = 0.0
-            keep &= rows[:, GROUP] != odd
     kept = rows[keep]
     posterior = fused(mean, cov, kept, VARIANCE, height_m)
     mean[:], cov[:] = posterior.x, posterior.P

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from error_cases import Case, message, tracker_of, true_values, walk
+from error_cases import Case, messages, tracker_of, true_values, walk
 from first_fix import at, fix_of, measure, rsu, solve
 from netpos.estimation.measurement import BIAS, COMMON, REFERENCE, VARIANCE, linearise
 from netpos.estimation.mixture.gaussians import Mixture
@@ -336,8 +336,8 @@ def test_two_late_ranges_at_the_start_are_forgotten_with_the_next_epoch() -> Non
     seen = true_values(case, places) + rng.normal(0.0, 0.1, (10, 5, 1))
     seen[0, [0, 2], 0] += 6.0, 5.0
     for k, place in enumerate(places):
-        for i in range(5):
-            tracker.add(message(case, T0 + k * 200_000_000, k, i, seen[k, i], variance))
+        for item in messages(case, T0 + k * 200_000_000, k, seen[k], variance):
+            tracker.add(item)
         found = [o.odometry for o in tracker.process() if o.odometry is not None]
         errors += [float(np.linalg.norm(o.position[:2] - place)) for o in found]
     assert errors[0] > 1.0

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from error_cases import Case, run
+from error_cases import Case, Measures, run
 from netpos.messages.values import Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.tracker import Tracker
@@ -104,7 +104,9 @@ def test_person_who_stands_is_not_placed_more_surely_than_the_angles_allow(
 def test_minute_of_the_same_values_tells_nothing() -> None:
     """Four arrays in a room, the direction cosines of which are off by 0.22 for ever: once the
     noise is averaged out, neither place nor covariance has a reason to change."""
-    room = Case(variance=0.1, bias=2.5, rsus=4, arrays=True, time_s=math.inf, moving=False)
+    room = Case(
+        variance=0.1, bias=2.5, rsus=4, measures=Measures.COSINES, time_s=math.inf, moving=False
+    )
     runs = [run(room, seed, told=True, learn=False) for seed in range(700, 708)]
     errors = np.array([np.linalg.norm(means - places, axis=1) for places, means, _ in runs])
     sd = np.array([np.sqrt(np.trace(covs, axis1=1, axis2=2)) for *_, covs in runs])

@@ -17,7 +17,15 @@ from netpos.bags.importers.own.recording import Truth, import_csv
 from netpos.bags.importers.own.truth import TruthColumns
 from netpos.bags.recording import number_beacons
 from netpos.evaluation import evaluate_bag
-from netpos.messages.values import Array, Field, InitialPose, Odometry, RsuInfo, RsuMeasurement
+from netpos.messages.values import (
+    Array,
+    Field,
+    InitialPose,
+    Odometry,
+    RsuInfo,
+    RsuMeasurement,
+    TrackState,
+)
 from netpos.scenario import load_scenario
 from netpos.scenario.offline import simulate_to_bag
 from netpos.scenario.replay import replay_bag
@@ -290,6 +298,74 @@ def test_paths_of_ranges_that_may_be_blocked_change_nothing_of_differences() -> 
             found += [fix_of([o]) for o in said(made, items)]
         tracks.append(np.array([fix.position for fix in found]))
     np.testing.assert_array_equal(tracks[1], tracks[0])
+
+
+def late_paths(seed: int, late: Sequence[str], share: float) -> list[dict[str, float]]:
+    """The arrivals [m] of two minutes at 2 Hz; those of the ``late`` RSUs are that often, all at
+    once, 3 to 8 m too late."""
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(240):
+        arrival = {n: distance(n) + rng.normal(scale=SD_M / math.sqrt(2.0)) for n in SITES}
+        are_late = rng.random() < share
+        for name in late:
+            arrival[name] += rng.uniform(3.0, 8.0) * are_late
+        found.append(arrival)
+    return found
+
+
+def as_differences(stamp_ns: int, arrival: dict[str, float]) -> list[Any]:
+    return [tdoa(stamp_ns, n, "a", arrival[n] - arrival["a"]) for n in list(SITES)[1:]]
+
+
+def as_times(stamp_ns: int, arrival: dict[str, float]) -> list[Any]:
+    return [
+        RsuMeasurement(
+            stamp_ns=stamp_ns,
+            rsu_id=name,
+            vue_id="v",
+            fields=Field.TOA,
+            toa_s=m / C,
+            toa_var=0.5 * (SD_M / C) ** 2,
+        )
+        for name, m in arrival.items()
+    ]
+
+
+def errors_m(arrivals: Sequence[dict[str, float]], read: Any) -> Array:
+    """Errors of a device that stands, after the first 20 s, while its state is TRACKING: most of
+    the time, and never above its level."""
+    made, errors = tracker(), []
+    for k, arrival in enumerate(arrivals):
+        (output,) = said(made, number_beacons(read(START_NS + 500_000_000 * k, arrival)))
+        apart = float(np.linalg.norm((fix_of([output]).position - PLACE)[:2]))
+        assert output.status is not None
+        if output.status.state == TrackState.TRACKING and k >= 40:
+            assert apart < output.status.protection_level_m
+            errors.append(apart)
+    assert len(errors) > 0.95 * (len(arrivals) - 40)
+    return np.array(errors)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("read", [as_times, as_differences])
+def test_one_late_path_moves_nothing(seed: int, read: Any) -> None:
+    """A sixth of the time the RSU that differences count from hears the device late: all of them
+    are as much too small, by one late path and no turn. Of times of an emission that nobody knows
+    one is late, and no clock or turn."""
+    clean = errors_m(late_paths(seed, (), 0.0), read)
+    late = errors_m(late_paths(seed, ("a",), 1.0 / 6.0), read)
+    assert np.sqrt(np.mean(late**2)) < 1.2 * np.sqrt(np.mean(clean**2))
+    assert late.max() < 1.3 * clean.max()
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("read", [as_times, as_differences])
+def test_two_late_paths_at_once_are_outvoted(seed: int, read: Any) -> None:
+    """Of five RSUs two hear the device late, a tenth of the time: none of the times is off by
+    itself while nobody knows when it was sent, and three agree."""
+    clean = errors_m(late_paths(seed, (), 0.0), read)
+    late = errors_m(late_paths(seed, ("b", "d"), 0.1), read)
+    assert np.sqrt(np.mean(late**2)) < 1.5 * np.sqrt(np.mean(clean**2))
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ from netpos.estimation.update.fusion import (
     predicted_in,
     workspace,
 )
-from netpos.estimation.update.gate import leave_odd_out
+from netpos.estimation.update.gate import leave_minority_out
 from netpos.estimation.update.iteration import (
     is_curved,
     is_wide,
@@ -249,7 +249,7 @@ def update(
     work: Array,
 ) -> tuple[float, int]:
     """One epoch, in place: gate each group as a whole, fuse what passed. Where three or more pass
-    one by one but not together, one without which the others agree is left out.
+    one by one but not together, a minority without which the others agree is left out.
 
     rows : (m, ROW_WIDTH), rows of a group adjacent, groups numbered 0, 1, ... in order
     gate_nis : (d + 1,) largest accepted squared Mahalanobis distance for d degrees of freedom
@@ -285,7 +285,7 @@ def update_predicted(
         return 0.0, 0, False
     nis = _fuse_used(mean, cov, rows, work)
     if used < gate_nis.size and nis > gate_nis[used]:
-        dropped = _odd_one_out(rows, mean.size, gate_nis, accepted, work)
+        dropped = _minority_out(rows, mean.size, gate_nis, accepted, work)
         if dropped > 0:
             used -= dropped
             for a in range(mean.size):
@@ -329,14 +329,14 @@ def _fuse_used(mean: Array, cov: Array, rows: Array, work: Array) -> float:
 
 
 @kernel
-def _odd_one_out(rows: Array, n: int, gate_nis: Array, accepted: Array, work: Array) -> int:
-    """``gate.leave_odd_out`` of the rows in the workspace; the number of rows taken out."""
+def _minority_out(rows: Array, n: int, gate_nis: Array, accepted: Array, work: Array) -> int:
+    """``gate.leave_minority_out`` of the rows in the workspace; the number of rows taken out."""
     m = rows.shape[0]
     H = work[W_COV + n : W_COV + n + m, :n].copy()
     S = H @ work[W_COV : W_COV + n, :n].copy() @ H.T
     for i in range(m):
         S[i, i] += work[W_GATE_VARIANCE, i]
-    if not leave_odd_out(rows, work[W_INNOVATION, :m].copy(), S, gate_nis, accepted):
+    if not leave_minority_out(rows, work[W_INNOVATION, :m].copy(), S, gate_nis, accepted):
         return 0
     taken_out = 0
     for i in range(m):

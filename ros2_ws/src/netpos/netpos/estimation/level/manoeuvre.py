@@ -16,11 +16,11 @@ import math
 import numpy as np
 
 from netpos.estimation.compile import kernel, leaf
-from netpos.estimation.factor import eigenvalues
+from netpos.estimation.factor import eigenvalues, factor, solve_factored
 from netpos.estimation.measurement import GATE_VARIANCE
 from netpos.estimation.motion import add_velocity_step
 from netpos.estimation.state import POSITION, VELOCITY, X
-from netpos.estimation.update.predicted import PredictedRows
+from netpos.estimation.update.predicted import PredictedRows, prior_cov_of
 from netpos.messages.values import Array
 
 # The filter follows a manoeuvre as long as its gate passes it, so that it is noticed later.
@@ -32,26 +32,34 @@ TURN_ANGLE_SD = math.radians(25.0)
 TURN_SPEED_SD = 0.25  # of the speed
 
 
-@leaf
+@kernel
+def _information(rows: Array, predicted: PredictedRows, n: int) -> Array:
+    """What ``rows`` (m, ROW_WIDTH) together tell of a change of x, y, vx and vy (4, 4) that the
+    prediction of ``n`` states does not foresee. Its own uncertainty is noise, and what rows share
+    of it, a clock or the error of a common reference, is one noise."""
+    m = rows.shape[0]
+    S = prior_cov_of(predicted, np.arange(m), n)
+    for i in range(m):
+        S[i, i] += rows[i, GATE_VARIANCE] + predicted.second_order_var[i]
+    H = predicted.H[:m, X.PX : X.VY + 1].copy()
+    weighed = H.copy()
+    solve_factored(factor(S), weighed)
+    information: Array = H.T @ weighed
+    return information
+
+
+@kernel
 def detection_delay_s(
-    rows: Array, predicted: PredictedRows, gate: float, speed: float
+    rows: Array, predicted: PredictedRows, n: int, gate: float, speed: float
 ) -> tuple[float, float]:
     """Time [s] until a velocity step of ``speed`` [m/s] takes ``rows`` (m, ROW_WIDTH) as far off
-    where they are ``predicted`` as ``gate``, a squared Mahalanobis distance, allows: for a step in
-    any direction, and for one in the direction they know least (inf: not at all). A measured
-    velocity shows the step at once, the longest time is then an upper bound."""
-    xx = xy = yy = 0.0
-    velocity_xx = velocity_xy = velocity_yy = 0.0
-    for i in range(rows.shape[0]):
-        h = predicted.H[i]
-        known = predicted.prior_var[i] + predicted.second_order_var[i]
-        variance = rows[i, GATE_VARIANCE] + known
-        xx += h[X.PX] * h[X.PX] / variance
-        xy += h[X.PX] * h[X.PY] / variance
-        yy += h[X.PY] * h[X.PY] / variance
-        velocity_xx += h[X.VX] * h[X.VX] / variance
-        velocity_xy += h[X.VX] * h[X.VY] / variance
-        velocity_yy += h[X.VY] * h[X.VY] / variance
+    where ``n`` states ``predicted`` them as ``gate``, a squared Mahalanobis distance, allows: for
+    a step in any direction, and for one in the direction they know least (inf: not at all). A
+    measured velocity shows the step at once, the longest time is then an upper bound."""
+    information = _information(rows, predicted, n)
+    xx, xy, yy = information[0, 0], information[0, 1], information[1, 1]
+    velocity_xx, velocity_xy = information[2, 2], information[2, 3]
+    velocity_yy = information[3, 3]
     least, _ = eigenvalues(xx, xy, yy)
     least_velocity, _ = eigenvalues(velocity_xx, velocity_xy, velocity_yy)
     step2 = speed * speed

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netpos.estimation.compile import kernel
+from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.engine import (
     FilterOptions,
     cov_of,
@@ -25,8 +25,11 @@ from netpos.estimation.update.gate import accepted_rows
 from netpos.estimation.update.predicted import PredictedRows, predict_rows
 from netpos.messages.values import Array
 
-_OUTLIERS = 1e-2  # of all values
+OUTLIERS = 1e-2
+"""Share of all values that are wrong by nobody knows how much."""
 _FARTHEST_OUTLIER = 1e3  # standard deviations
+TAIL_LOG = -math.log(2.0 * (1.0 + math.log(_FARTHEST_OUTLIER)))
+"""Log density of such an error, times its size: each octave is as likely."""
 
 
 class Update(NamedTuple):
@@ -97,11 +100,11 @@ def outlier_log(rows: Array, predicted: PredictedRows, start: int, stop: int) ->
     """Log density of the rows ``start`` to ``stop`` of one measurement that is wrong by nobody
     knows how much: beyond the standard deviation of what is ``predicted`` each octave is as
     likely."""
-    total = math.log(_OUTLIERS)
+    total = math.log(OUTLIERS)
     for i in range(start, stop):
         known = predicted.prior_var[i] + predicted.second_order_var[i]
         off = max(abs(predicted.innovation[i]), math.sqrt(rows[i, GATE_VARIANCE] + known))
-        total -= math.log(2.0 * (1.0 + math.log(_FARTHEST_OUTLIER)) * off)
+        total += TAIL_LOG - math.log(off)
     return total
 
 
@@ -170,3 +173,30 @@ def apply_predicted(
     likelihood = log_likelihood(prior_mean, prior_cov, rows, height_m, predicted, accepted)
     sound = math.isfinite(likelihood) and is_sound(mean, cov)
     found.log_weights[k] = log_weight + likelihood if sound else -math.inf
+
+
+@leaf
+def contradicts(nis: float, used: float, options: FilterOptions) -> bool:
+    """Whether rows that were accepted one by one, ``used`` of them, fail the gate together."""
+    limits = options.gate_nis
+    return bool(used < limits.size and nis > limits[int(used)])
+
+
+@kernel
+def add_gated(
+    limit: float,
+    parent: int,
+    end: int,
+    prior: Mixture,
+    rows: Array,
+    options: FilterOptions,
+    found: Candidates,
+    work: Array,
+) -> int:
+    """Add the component ``parent`` of ``prior`` with the same ``limit`` for every group of
+    ``rows``: all are accepted (inf), from the tail of their errors, or all are wrong (-1); the
+    number of candidates then. ``work`` holds the rows as ``parent`` predicts them."""
+    found.means[end], found.covs[end] = prior.means[parent], prior.covs[parent]
+    gate, log_weight = np.full_like(options.gate_nis, limit), prior.log_weights[parent]
+    apply_predicted(end, log_weight, rows, options, gate, found, work)
+    return end + 1

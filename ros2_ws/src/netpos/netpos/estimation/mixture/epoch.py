@@ -41,11 +41,14 @@ from netpos.estimation.mixture import mixing
 from netpos.estimation.mixture.candidates import (
     Candidates,
     Update,
+    add_gated,
     apply,
     candidates,
+    contradicts,
     first_of,
     mixture_of,
 )
+from netpos.estimation.mixture.common_error import add_common_errors
 from netpos.estimation.mixture.gaussians import Mixture, leaders, moments, one_component
 from netpos.estimation.mixture.in_turn import in_turn
 from netpos.estimation.mixture.reduction import reduced
@@ -62,6 +65,7 @@ from netpos.estimation.mixture.turns import (
     TURNS_MAX,
     add_explanations,
     add_turns,
+    add_turns_since,
     leaves_turns_open,
     may_have_turned,
     may_turn,
@@ -166,9 +170,14 @@ def _add_candidates(
         apply(k, prior.log_weights[k], rows, options, found, work)
     if opens and found.used[k] == 0:
         found.covs[k] = cov
-    refuses = found.accepted[k].sum() < found.accepted.shape[1]
-    if refuses and options.manoeuvre_speed_sd > 0.0:
+    if options.manoeuvre_speed_sd <= 0.0:
+        return int(end)
+    if contradicts(found.nis[k], found.used[k], options):
+        end = add_gated(-1.0, k, end, prior, rows, options, found, work)
+        end = add_turns_since(k, 0.0, end, prior, epoch, options, found, work)
+    elif found.accepted[k].sum() < found.accepted.shape[1]:
         end = add_explanations(k, k, end, prior, epoch, options, found, work)
+        end = add_common_errors(k, end, prior, rows, options, found, work)
     return int(end)
 
 
@@ -186,8 +195,8 @@ def _at_once(
     rows = epoch.rows
     count, groups = prior.log_weights.size, int(rows[rows.shape[0] - 1, GROUP]) + 1
     sectors = 2 * most_turns(rows[at]) + 1 if at >= 0 else 0
-    size = 2 * (1 + TURNS_MAX) * count + (sectors + 1) * (count + 1)
     m, n = rows.shape[0], prior.means.shape[1]
+    size = (2 * (1 + TURNS_MAX) + m // 2) * count + (sectors + 1) * (count + 1)
     found, work = candidates(size, n, groups), workspace(n, m)
     end = np.int64(count)
     for k in range(count):
@@ -291,7 +300,8 @@ def _by_one(
 ) -> tuple[bool, float, int]:
     """One epoch of the one component ``x`` (n,), ``S`` (n, n), in place: whether that is enough,
     NIS and number of the rows accepted. It is not where a measurement divides it, something is
-    refused, or nothing tells that the device has not turned; the rows are as they were then."""
+    refused or contradicts the rest, or nothing tells that the device has not turned; the rows are
+    as they were then."""
     rows, motion, n = epoch.rows, dynamics.motions[0], x.size
     groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
     predict_epoch(x, S, epoch, motion, dynamics.bias, options, memory)
@@ -302,7 +312,7 @@ def _by_one(
     raw = rows.copy() if changes else rows
     result = update_epoch(x, S, epoch, motion, options, memory)
     if options.manoeuvre_speed_sd > 0.0:
-        refused = result.groups < groups
+        refused = result.groups < groups or contradicts(result.nis, result.used, options)
         if refused or may_turn(predicted.H, groups, open_s, options):
             if changes:
                 rows[:] = raw
@@ -338,7 +348,7 @@ def _finish(
         return 0.0, open_s
     groups, accepted = int(rows[rows.shape[0] - 1, GROUP]) + 1, step.accepted
     gate = options.gate_nis[2]
-    _, longest_s = detection_delay_s(rows, predicted, gate, speed)
+    _, longest_s = detection_delay_s(rows, predicted, x.size, gate, speed)
     is_open = leaves_turns_open(predicted.H, groups)
     if math.isinf(longest_s) and (is_open or math.isfinite(gate)):
         several = components.log_weights.size > 1

@@ -15,7 +15,7 @@ from netpos.estimation.level.manoeuvre import (
     side_turns,
     turn_to_side,
 )
-from netpos.estimation.mixture.candidates import Candidates, apply, apply_predicted
+from netpos.estimation.mixture.candidates import Candidates, add_gated, apply
 from netpos.estimation.mixture.gaussians import Mixture, together
 from netpos.estimation.update.fusion import predicted_in, workspace
 from netpos.messages.values import Array
@@ -74,6 +74,27 @@ def add_turns(
 
 
 @kernel
+def add_turns_since(
+    parent: int,
+    more_than: float,
+    end: int,
+    prior: Mixture,
+    epoch: EpochInput,
+    options: FilterOptions,
+    found: Candidates,
+    work: Array,
+) -> int:
+    """Add the component ``parent``, turned since the last measurement or for as long as that goes
+    unnoticed, if it accepts ``more_than`` so many groups; the number of candidates then. ``work``
+    holds the rows as ``parent`` predicts them."""
+    predicted = predicted_in(work, prior.means.shape[1], epoch.rows.shape[0])
+    within_s = manoeuvre_s(prior.covs[parent], epoch.rows, predicted, epoch.unheard_s, options)
+    if within_s <= 0.0:
+        return end
+    return int(add_turns(parent, end, prior, within_s, epoch.rows, options, found, more_than))
+
+
+@kernel
 def add_explanations(
     parent: int,
     refused_by: int,
@@ -87,19 +108,11 @@ def add_explanations(
     """Where a manoeuvre explains what the candidate ``refused_by``, made of the component
     ``parent``, refuses, add it, and the same measurements from the tail of their errors; the
     number of candidates then. ``work`` holds the rows as ``parent`` predicts them."""
-    mean, cov, rows = prior.means[parent], prior.covs[parent], epoch.rows
-    predicted = predicted_in(work, mean.size, rows.shape[0])
-    within_s = manoeuvre_s(cov, rows, predicted, epoch.unheard_s, options)
-    if within_s <= 0.0:
-        return end
     first, refused = end, found.accepted[refused_by].sum()
-    end = add_turns(parent, first, prior, within_s, rows, options, found, refused)
+    end = add_turns_since(parent, refused, end, prior, epoch, options, found, work)
     if end == first:
         return end
-    found.means[end], found.covs[end] = mean, cov
-    no_gate = np.full_like(options.gate_nis, np.inf)
-    apply_predicted(end, prior.log_weights[parent], rows, options, no_gate, found, work)
-    return int(end + 1)
+    return int(add_gated(math.inf, parent, end, prior, epoch.rows, options, found, work))
 
 
 @leaf

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from netpos.estimation.compile import kernel
 from netpos.estimation.factor import factor
@@ -15,10 +14,14 @@ from netpos.estimation.measurement import (
     same_bend_variance,
     second_order_variance,
 )
-from netpos.estimation.update.predicted import PredictedRows, note_innovations, predicted_rows
+from netpos.estimation.update.predicted import (
+    Ints,
+    PredictedRows,
+    note_innovations,
+    predicted_rows,
+    prior_cov_of,
+)
 from netpos.messages.values import Array
-
-Ints = npt.NDArray[np.int64]
 
 
 @kernel
@@ -76,14 +79,7 @@ def neg2_log_likelihood(
     In the determinant it is that of a single value: a wide prior does not fit worse because there
     are more of them.
     """
-    innovation, S = predicted.innovation[index], np.empty((index.size, index.size))
-    for a in range(index.size):
-        i = index[a]
-        for b in range(a + 1):
-            total = 0.0
-            for c in range(mean.size):
-                total += predicted.H[i, c] * predicted.HP[index[b], c]
-            S[a, b] = S[b, a] = total
+    innovation, S = predicted.innovation[index], prior_cov_of(predicted, index, mean.size)
     single = S.copy()
     for a in range(index.size):
         row = rows[index[a]]

@@ -53,41 +53,44 @@ def select_rows(
 ) -> tuple[Indices, float]:
     """Indices of the rows to fuse, (used,), and their squared Mahalanobis distance together.
 
-    Where three or more groups pass one by one but not together, one without which the others agree
-    is left out, and its entry of ``accepted`` set to 0. Arguments as of ``gate_groups``.
+    Where three or more groups pass one by one but not together, a minority without which the
+    others agree is left out, and its entries of ``accepted`` set to 0. Arguments as of
+    ``gate_groups``.
     """
     index = accepted_rows(rows, accepted)
     nis = joint_nis(innovation, S, index)
     contradict = index.size < gate_nis.size and nis > gate_nis[index.size]
-    if contradict and leave_odd_out(rows, innovation, S, gate_nis, accepted):
+    if contradict and leave_minority_out(rows, innovation, S, gate_nis, accepted):
         index = accepted_rows(rows, accepted)
         nis = joint_nis(innovation, S, index)
     return index, nis
 
 
 @kernel
-def leave_odd_out(
+def leave_minority_out(
     rows: Array, innovation: Array, S: Array, gate_nis: Array, accepted: Array
 ) -> bool:
-    """Of three or more accepted groups, take the one out without which the others agree best;
-    False, and nothing done, where leaving one out does not bring them within their limit."""
+    """Of the accepted groups, take out one after the other, always that without which the rest
+    agree best, until they do, but fewer than half of them; False, and nothing done, where that
+    does not bring them within their limit."""
     groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
-    if accepted[:groups].sum() < 3.0:
-        return False
-    odd, least = -1, np.inf
-    for group in range(groups):
-        if accepted[group] == 0.0:
-            continue
-        accepted[group] = 0.0
-        index = accepted_rows(rows, accepted)
-        accepted[group] = 1.0
-        nis = joint_nis(innovation, S, index)
-        if nis < least and nis <= gate_nis[index.size]:
-            odd, least = group, nis
-    if odd < 0:
-        return False
-    accepted[odd] = 0.0
-    return True
+    before = accepted[:groups].copy()
+    for _ in range((int(before.sum()) - 1) // 2):
+        odd, least, limit = -1, np.inf, 0.0
+        for group in range(groups):
+            if accepted[group] == 0.0:
+                continue
+            accepted[group] = 0.0
+            index = accepted_rows(rows, accepted)
+            accepted[group] = 1.0
+            nis = joint_nis(innovation, S, index)
+            if nis - gate_nis[index.size] < least - limit:
+                odd, least, limit = group, nis, gate_nis[index.size]
+        accepted[odd] = 0.0
+        if least <= limit:
+            return True
+    accepted[:groups] = before
+    return False
 
 
 @kernel

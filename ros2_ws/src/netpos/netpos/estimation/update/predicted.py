@@ -7,6 +7,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from netpos.estimation.compile import inlined, kernel, leaf
 from netpos.estimation.measurement import (
@@ -17,6 +18,8 @@ from netpos.estimation.measurement import (
 )
 from netpos.estimation.state import N_CORE, X
 from netpos.messages.values import Array
+
+Ints = npt.NDArray[np.int64]
 
 
 class PredictedRows(NamedTuple):
@@ -74,6 +77,20 @@ def predict_rows(
         predicted.second_order_var[i] = variance
         predicted.innovation[i] = innovation_row(rows[i], mean, height_m, h) - bend
         predicted.prior_var[i] = along_gradient(n, cov, h, hp)
+
+
+@kernel
+def prior_cov_of(predicted: PredictedRows, index: Ints, n: int) -> Array:
+    """Covariance (k, k) that a prediction of ``n`` states gives the values of the rows ``index``
+    (k,), without their noise: H P H'."""
+    cov = np.empty((index.size, index.size))
+    for a in range(index.size):
+        for b in range(a + 1):
+            total = 0.0
+            for c in range(n):
+                total += predicted.H[index[a], c] * predicted.HP[index[b], c]
+            cov[a, b] = cov[b, a] = total
+    return cov
 
 
 @leaf

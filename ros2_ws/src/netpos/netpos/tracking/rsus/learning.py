@@ -217,7 +217,7 @@ class LearnedErrors:
 
     def hear(self, names: list[Name], rows: Array, left: Array, stated: Array) -> None:
         """Note the k values of an instant, to which the device has moved: whose they are, their
-        rows (k, ROW_WIDTH), what is ``left`` (k, 8) of them by ``unexplained``, and the variances
+        rows (k, ROW_WIDTH), what is ``left`` (k, 3) of them by ``unexplained``, and the variances
         ``stated`` (k,)."""
         scale = np.array([self.models[name].scale for name in names])
         information, size = scale / left[:, 2], left[:, 0] / np.sqrt(stated)
