@@ -424,7 +424,7 @@ def test_a_refused_fix_is_an_outlier_a_tail_or_a_turn(
     epoch = EpochInput(0.1, unheard_s, 0, rows)
     found = epochs.apply_epoch(one_component(x, P), epoch, TURNING, 0.0, accepted)
     S = H @ P @ H.T + R
-    delay_s = 2.0 * np.sqrt(2.0 * TURNING.gate_nis[2] / np.trace(np.linalg.inv(S))) / 5.0
+    delay_s = np.sqrt(2.0 * TURNING.gate_nis[2] / np.trace(np.linalg.inv(S))) / 5.0
     within_s = max(unheard_s, delay_s)
     whitened = np.linalg.slogdet(np.linalg.cholesky(R))[1]  # rows are decorrelated fixes
     root = np.linalg.cholesky(R)

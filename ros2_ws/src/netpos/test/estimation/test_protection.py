@@ -181,9 +181,9 @@ def test_a_manoeuvre_is_noticed_where_the_gate_begins_to_refuse() -> None:
     moved = mean.copy()
     moved[1] += longest * speed
     assert ((linearise(rows, moved, 0.0)[0] / sd) ** 2).sum() == pytest.approx(gate, rel=5e-3)
-    # in no known direction: gate = speed^2 t^2 (1/a^2 + 1/b^2) / 2, and the filter follows
+    # in no known direction: gate = speed^2 t^2 (1/a^2 + 1/b^2) / 2
     a, b = 100.0 * sd, 40.0 * sd
-    expected = 2.0 * math.sqrt(gate / ((1 / a**2 + 1 / b**2) / 2)) / speed
+    expected = math.sqrt(gate / ((1 / a**2 + 1 / b**2) / 2)) / speed
     assert typical == pytest.approx(expected, rel=1e-9)
     wider = detection_delay_s(rows, predicted_rows(mean, np.eye(6), rows, 0.0), 6, gate, speed)
     assert wider[0] > typical

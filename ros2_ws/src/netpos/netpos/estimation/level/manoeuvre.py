@@ -2,7 +2,8 @@
 
 A device that turns leaves its prediction slowly at first. Until a measurement fails its gate the
 filter follows in part, in the directions that are measured, and goes on straight in the others.
-The step of the velocity lies anywhere in the time in which it stays unnoticed, not in the last
+Where measurements see it, the device is no farther from the prediction than their gate allows. The
+step of the velocity lies anywhere in the time in which it stays unnoticed, not in the last
 interval.
 
 Most devices that turn keep their speed and turn to a side, where a street or a corridor crosses
@@ -23,8 +24,6 @@ from netpos.estimation.state import POSITION, VELOCITY, X
 from netpos.estimation.update.predicted import PredictedRows, prior_cov_of
 from netpos.messages.values import Array
 
-# The filter follows a manoeuvre as long as its gate passes it, so that it is noticed later.
-_FOLLOWED = 2.0
 # A turn to a side: steps of the velocity from 0.65 to 1.35 times its size are taken for such
 # turns; its speed and its angle differ by so much.
 TURN_SIZES = 0.7
@@ -70,7 +69,7 @@ def detection_delay_s(
         typical = math.sqrt(left / (xx + yy)) / speed if left > 0.0 else 0.0
     if left_least == 0.0 or least > 1e-12 * (xx + yy):
         longest = math.sqrt(left_least / least) / speed if left_least > 0.0 else 0.0
-    return _FOLLOWED * typical, longest
+    return typical, longest
 
 
 @leaf
