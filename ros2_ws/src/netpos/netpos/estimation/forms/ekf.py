@@ -33,7 +33,7 @@ from netpos.estimation.update.fusion import (
     predicted_in,
     workspace,
 )
-from netpos.estimation.update.gate import leave_minority_out
+from netpos.estimation.update.gate import fail_together, leave_minority_out
 from netpos.estimation.update.iteration import (
     is_curved,
     is_wide,
@@ -42,7 +42,7 @@ from netpos.estimation.update.iteration import (
     iterate_used,
     refine_used,
 )
-from netpos.estimation.update.predicted import predict_rows
+from netpos.estimation.update.predicted import predict_rows, prior_cov_of
 from netpos.estimation.update.slow_errors import follow_tangents
 from netpos.messages.values import Array
 
@@ -284,7 +284,7 @@ def update_predicted(
     if used == 0:
         return 0.0, 0, False
     nis = _fuse_used(mean, cov, rows, work)
-    if used < gate_nis.size and nis > gate_nis[used]:
+    if fail_together(nis, used, gate_nis):
         dropped = _minority_out(rows, mean.size, gate_nis, accepted, work)
         if dropped > 0:
             used -= dropped
@@ -332,8 +332,7 @@ def _fuse_used(mean: Array, cov: Array, rows: Array, work: Array) -> float:
 def _minority_out(rows: Array, n: int, gate_nis: Array, accepted: Array, work: Array) -> int:
     """``gate.leave_minority_out`` of the rows in the workspace; the number of rows taken out."""
     m = rows.shape[0]
-    H = work[W_COV + n : W_COV + n + m, :n].copy()
-    S = H @ work[W_COV : W_COV + n, :n].copy() @ H.T
+    S = prior_cov_of(predicted_in(work, n, m), np.arange(m), n)
     for i in range(m):
         S[i, i] += work[W_GATE_VARIANCE, i]
     if not leave_minority_out(rows, work[W_INNOVATION, :m].copy(), S, gate_nis, accepted):

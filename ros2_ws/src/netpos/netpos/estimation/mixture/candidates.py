@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netpos.estimation.compile import kernel, leaf
+from netpos.estimation.compile import kernel
 from netpos.estimation.engine import (
     FilterOptions,
     cov_of,
@@ -173,13 +173,6 @@ def apply_predicted(
     likelihood = log_likelihood(prior_mean, prior_cov, rows, height_m, predicted, accepted)
     sound = math.isfinite(likelihood) and is_sound(mean, cov)
     found.log_weights[k] = log_weight + likelihood if sound else -math.inf
-
-
-@leaf
-def contradicts(nis: float, used: float, options: FilterOptions) -> bool:
-    """Whether rows that were accepted one by one, ``used`` of them, fail the gate together."""
-    limits = options.gate_nis
-    return bool(used < limits.size and nis > limits[int(used)])
 
 
 @kernel

@@ -12,7 +12,8 @@ from netpos.estimation.engine import FilterOptions
 from netpos.estimation.measurement import COMMON, GROUP
 from netpos.estimation.mixture.candidates import OUTLIERS, TAIL_LOG, Candidates, apply
 from netpos.estimation.mixture.gaussians import Mixture
-from netpos.estimation.update.fusion import predicted_in, workspace
+from netpos.estimation.update.fusion import workspace
+from netpos.estimation.update.predicted import predicted_rows
 from netpos.messages.values import Array
 
 # The log density of an outlier over that of a Gaussian as wide as the outlier is large.
@@ -21,28 +22,23 @@ _OVER_GAUSSIAN_LOG = math.log(OUTLIERS) + TAIL_LOG + 0.5 * (1.0 + math.log(2.0 *
 
 @kernel
 def add_common_errors(
-    parent: int,
-    end: int,
-    prior: Mixture,
-    rows: Array,
-    options: FilterOptions,
-    found: Candidates,
-    work: Array,
+    k: int, end: int, prior: Mixture, rows: Array, options: FilterOptions, found: Candidates
 ) -> int:
-    """For each state that several ``rows`` (m, ROW_WIDTH) share, of which the candidate ``parent``
-    refuses one, add the component ``parent`` of ``prior`` with an error there as large as the rows
-    are off, if it accepts more; the number of candidates then. Such errors are as frequent as
-    outliers. ``work`` holds the rows as ``parent`` predicts them."""
-    m, n, accepted = rows.shape[0], prior.means.shape[1], found.accepted[parent]
-    off, own = predicted_in(work, n, m).innovation[:m], workspace(n, m)
+    """For each state that several ``rows`` (m, ROW_WIDTH) share, of which the candidate ``k``
+    refuses one, add the component ``k`` of ``prior`` with an error there as large as the rows are
+    off, if it accepts more; the number of candidates then. Such errors are as frequent as
+    outliers."""
+    mean, cov, accepted = prior.means[k], prior.covs[k], found.accepted[k]
+    work = workspace(mean.size, rows.shape[0])
+    off = predicted_rows(mean, cov, rows, options.height_m).innovation
     is_refused = accepted[rows[:, GROUP].astype(np.int64)] == 0.0
     for common in np.unique(rows[:, COMMON][is_refused]):
         shares, state = rows[:, COMMON] == common, int(common)
         if state <= 0 or shares.sum() < 2:
             continue
-        found.means[end], found.covs[end] = prior.means[parent], prior.covs[parent]
+        found.means[end], found.covs[end] = mean, cov
         found.covs[end, state, state] += np.median(off[shares]) ** 2
-        apply(end, prior.log_weights[parent] + _OVER_GAUSSIAN_LOG, rows, options, found, own)
+        apply(end, prior.log_weights[k] + _OVER_GAUSSIAN_LOG, rows, options, found, work)
         if found.accepted[end].sum() > accepted.sum():
             end += 1
     return int(end)

@@ -44,7 +44,6 @@ from netpos.estimation.mixture.candidates import (
     add_gated,
     apply,
     candidates,
-    contradicts,
     first_of,
     mixture_of,
 )
@@ -65,14 +64,15 @@ from netpos.estimation.mixture.turns import (
     TURNS_MAX,
     add_explanations,
     add_turns,
-    add_turns_since,
     leaves_turns_open,
     may_have_turned,
     may_turn,
+    unnoticed_s,
 )
 from netpos.estimation.motion import Parameter, add_velocity_step
 from netpos.estimation.update.conditioning import Robust, by_fit, by_path
 from netpos.estimation.update.fusion import predicted_in, workspace
+from netpos.estimation.update.gate import fail_together
 from netpos.estimation.update.predicted import note_innovations, predict_rows
 from netpos.messages.values import Array
 
@@ -172,12 +172,13 @@ def _add_candidates(
         found.covs[k] = cov
     if options.manoeuvre_speed_sd <= 0.0:
         return int(end)
-    if contradicts(found.nis[k], found.used[k], options):
+    if fail_together(found.nis[k], int(found.used[k]), options.gate_nis):
         end = add_gated(-1.0, k, end, prior, rows, options, found, work)
-        end = add_turns_since(k, 0.0, end, prior, epoch, options, found, work)
+        within_s = unnoticed_s(cov, epoch, options, work)
+        end = add_turns(k, end, prior, within_s, rows, options, found, 0.0)
     elif found.accepted[k].sum() < found.accepted.shape[1]:
         end = add_explanations(k, k, end, prior, epoch, options, found, work)
-        end = add_common_errors(k, end, prior, rows, options, found, work)
+        end = add_common_errors(k, end, prior, rows, options, found)
     return int(end)
 
 
@@ -312,8 +313,9 @@ def _by_one(
     raw = rows.copy() if changes else rows
     result = update_epoch(x, S, epoch, motion, options, memory)
     if options.manoeuvre_speed_sd > 0.0:
-        refused = result.groups < groups or contradicts(result.nis, result.used, options)
-        if refused or may_turn(predicted.H, groups, open_s, options):
+        refused = result.groups < groups
+        contradict = fail_together(result.nis, result.used, options.gate_nis)
+        if refused or contradict or may_turn(predicted.H, groups, open_s, options):
             if changes:
                 rows[:] = raw
             return False, 0.0, 0

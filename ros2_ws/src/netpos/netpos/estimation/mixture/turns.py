@@ -61,7 +61,10 @@ def add_turns(
     more_than: float,
 ) -> int:
     """Add the component ``parent`` of ``prior``, ``turned``, as candidates that have had the
-    ``rows``, if they accept ``more_than`` so many groups; the number of candidates then."""
+    ``rows``, if they accept ``more_than`` so many groups; the number of candidates then. None
+    where ``within_s`` is 0."""
+    if within_s <= 0.0:
+        return end
     parts: Mixture = turned(prior, parent, within_s, options)
     own = workspace(found.means.shape[1], rows.shape[0])
     for k in range(parts.log_weights.size):
@@ -74,24 +77,11 @@ def add_turns(
 
 
 @kernel
-def add_turns_since(
-    parent: int,
-    more_than: float,
-    end: int,
-    prior: Mixture,
-    epoch: EpochInput,
-    options: FilterOptions,
-    found: Candidates,
-    work: Array,
-) -> int:
-    """Add the component ``parent``, turned since the last measurement or for as long as that goes
-    unnoticed, if it accepts ``more_than`` so many groups; the number of candidates then. ``work``
-    holds the rows as ``parent`` predicts them."""
-    predicted = predicted_in(work, prior.means.shape[1], epoch.rows.shape[0])
-    within_s = manoeuvre_s(prior.covs[parent], epoch.rows, predicted, epoch.unheard_s, options)
-    if within_s <= 0.0:
-        return end
-    return int(add_turns(parent, end, prior, within_s, epoch.rows, options, found, more_than))
+def unnoticed_s(cov: Array, epoch: EpochInput, options: FilterOptions, work: Array) -> float:
+    """``manoeuvre_s`` of a component with ``cov`` (n, n), whose prediction ``work`` holds."""
+    rows = epoch.rows
+    predicted = predicted_in(work, cov.shape[0], rows.shape[0])
+    return float(manoeuvre_s(cov, rows, predicted, epoch.unheard_s, options))
 
 
 @kernel
@@ -108,8 +98,9 @@ def add_explanations(
     """Where a manoeuvre explains what the candidate ``refused_by``, made of the component
     ``parent``, refuses, add it, and the same measurements from the tail of their errors; the
     number of candidates then. ``work`` holds the rows as ``parent`` predicts them."""
+    within_s = unnoticed_s(prior.covs[parent], epoch, options, work)
     first, refused = end, found.accepted[refused_by].sum()
-    end = add_turns_since(parent, refused, end, prior, epoch, options, found, work)
+    end = add_turns(parent, first, prior, within_s, epoch.rows, options, found, refused)
     if end == first:
         return end
     return int(add_gated(math.inf, parent, end, prior, epoch.rows, options, found, work))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from netpos.estimation.compile import kernel
+from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.sensors.row import group_end
 from netpos.estimation.update.fit import distance2
@@ -47,6 +47,13 @@ def accepted_rows(rows: Array, accepted: Array) -> Indices:
     return index[:used]
 
 
+@leaf
+def fail_together(nis: float, used: int, gate_nis: Array) -> bool:
+    """Whether ``used`` rows, accepted one by one, are farther off together (``nis``) than their
+    limit; more rows than ``gate_nis`` has limits for are not judged together."""
+    return bool(used < gate_nis.size and nis > gate_nis[used])
+
+
 @kernel
 def select_rows(
     rows: Array, innovation: Array, S: Array, gate_nis: Array, accepted: Array
@@ -59,7 +66,7 @@ def select_rows(
     """
     index = accepted_rows(rows, accepted)
     nis = joint_nis(innovation, S, index)
-    contradict = index.size < gate_nis.size and nis > gate_nis[index.size]
+    contradict = fail_together(nis, index.size, gate_nis)
     if contradict and leave_minority_out(rows, innovation, S, gate_nis, accepted):
         index = accepted_rows(rows, accepted)
         nis = joint_nis(innovation, S, index)
@@ -86,6 +93,8 @@ def leave_minority_out(
             nis = joint_nis(innovation, S, index)
             if nis - gate_nis[index.size] < least - limit:
                 odd, least, limit = group, nis, gate_nis[index.size]
+        if odd < 0:
+            break
         accepted[odd] = 0.0
         if least <= limit:
             return True
