@@ -63,6 +63,27 @@ def tdoa(stamp_ns: int, name: str, reference: str, value_m: float, sd_m: float =
     )
 
 
+def times(stamp_ns: int, arrival: dict[str, float], sd_m: float = SD_M / math.sqrt(2.0)) -> Any:
+    """Times of arrival, ``arrival`` in metres."""
+    return [
+        RsuMeasurement(
+            stamp_ns=stamp_ns,
+            rsu_id=name,
+            vue_id="v",
+            fields=Field.TOA,
+            toa_s=value_m / C,
+            toa_var=(sd_m / C) ** 2,
+        )
+        for name, value_m in arrival.items()
+    ]
+
+
+def differences(stamp_ns: int, arrival: dict[str, float], sd_m: float = SD_M) -> Any:
+    """Differences of all others to the first."""
+    first, *others = arrival
+    return [tdoa(stamp_ns, n, first, arrival[n] - arrival[first], sd_m) for n in others]
+
+
 def tracker(names: Sequence[str] = tuple(SITES), bias_sd_m: float = 0.0, **config: Any) -> Tracker:
     made = Tracker(TrackerConfig(**{"hold_s": 0.0, **config}))
     for name in names:
@@ -205,25 +226,15 @@ def test_its_twin_is_a_time_of_arrival_with_unknown_emission(
     where each has a bias."""
     sd = FINE_M / np.sqrt(2)
     late = {name: distance(name) + 0.01 * k for k, name in enumerate(names)}
-    times = [
-        RsuMeasurement(
-            stamp_ns=START_NS,
-            rsu_id=name,
-            vue_id="v",
-            fields=Field.TOA,
-            toa_s=(late[name] + 1234.5) / C,
-            toa_var=(sd / C) ** 2,
-        )
-        for name in names
-    ]
-    differences = [
-        tdoa(START_NS, n, names[0], late[n] - late[names[0]], FINE_M) for n in names[1:]
-    ]
+    sent_later = {name: value_m + 1234.5 for name, value_m in late.items()}
     # The offset's prior is what is not known: 3 km.
     timed = tracker(bias_sd_m=bias_sd_m, clock_offset_sd_s=1e-5, **ONE_STEP)
     compared = tracker(bias_sd_m=bias_sd_m, **ONE_STEP)
-    by_time = fix_of(said(timed, [prior(START_NS), *number_beacons(times)]))
-    by_difference = fix_of(said(compared, [prior(START_NS), *number_beacons(differences)]))
+    by_time = fix_of(
+        said(timed, [prior(START_NS), *number_beacons(times(START_NS, sent_later, sd))])
+    )
+    compare = number_beacons(differences(START_NS, late, FINE_M))
+    by_difference = fix_of(said(compared, [prior(START_NS), *compare]))
     np.testing.assert_allclose(by_time.position, by_difference.position, rtol=1e-6)
     np.testing.assert_allclose(by_time.pose_cov, by_difference.pose_cov, rtol=1e-6, atol=1e-9)
 
@@ -253,19 +264,9 @@ def test_an_emission_that_is_unknown_every_time_tracks_like_differences(bias_sd_
             late = {n: late[n] + e for n, e in zip(SITES, noise, strict=True)}
             emission_m = float(rng.normal(scale=1000.0))
             if kind == "time":
-                items = [
-                    RsuMeasurement(
-                        stamp_ns=stamp_ns,
-                        rsu_id=n,
-                        vue_id="v",
-                        fields=Field.TOA,
-                        toa_s=(late[n] + emission_m) / C,
-                        toa_var=0.5 * (SD_M / C) ** 2,
-                    )
-                    for n in SITES
-                ]
+                items = times(stamp_ns, {n: value_m + emission_m for n, value_m in late.items()})
             else:
-                items = [tdoa(stamp_ns, n, "a", late[n] - late["a"]) for n in list(SITES)[1:]]
+                items = differences(stamp_ns, late)
             outputs += said(made, number_beacons(items))
         found[kind] = fix_of(outputs)
     np.testing.assert_allclose(
@@ -313,27 +314,10 @@ def late_paths(seed: int, late: Sequence[str], share: float) -> list[dict[str, f
     return found
 
 
-def as_differences(stamp_ns: int, arrival: dict[str, float]) -> list[Any]:
-    return [tdoa(stamp_ns, n, "a", arrival[n] - arrival["a"]) for n in list(SITES)[1:]]
-
-
-def as_times(stamp_ns: int, arrival: dict[str, float]) -> list[Any]:
-    return [
-        RsuMeasurement(
-            stamp_ns=stamp_ns,
-            rsu_id=name,
-            vue_id="v",
-            fields=Field.TOA,
-            toa_s=m / C,
-            toa_var=0.5 * (SD_M / C) ** 2,
-        )
-        for name, m in arrival.items()
-    ]
-
-
 def errors_m(arrivals: Sequence[dict[str, float]], read: Any) -> Array:
-    """Errors of a device that stands, after the first 20 s, while its state is TRACKING: most of
-    the time, and never above its level."""
+    """Errors of a device that stands, after the first 20 s, while its state is TRACKING: always,
+    but for half of the tenth of the time in which two RSUs hear it late, and never above its
+    level."""
     made, errors = tracker(), []
     for k, arrival in enumerate(arrivals):
         (output,) = said(made, number_beacons(read(START_NS + 500_000_000 * k, arrival)))
@@ -347,7 +331,7 @@ def errors_m(arrivals: Sequence[dict[str, float]], read: Any) -> Array:
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("read", [as_times, as_differences])
+@pytest.mark.parametrize("read", [times, differences])
 def test_one_late_path_moves_nothing(seed: int, read: Any) -> None:
     """A sixth of the time the RSU that differences count from hears the device late: all of them
     are as much too small, by one late path and no turn. Of times of an emission that nobody knows
@@ -359,13 +343,29 @@ def test_one_late_path_moves_nothing(seed: int, read: Any) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("read", [as_times, as_differences])
+@pytest.mark.parametrize("read", [times, differences])
 def test_two_late_paths_at_once_are_outvoted(seed: int, read: Any) -> None:
     """Of five RSUs two hear the device late, a tenth of the time: none of the times is off by
     itself while nobody knows when it was sent, and three agree."""
     clean = errors_m(late_paths(seed, (), 0.0), read)
     late = errors_m(late_paths(seed, ("b", "d"), 0.1), read)
     assert np.sqrt(np.mean(late**2)) < 1.5 * np.sqrt(np.mean(clean**2))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_times_no_two_of_which_agree_move_nothing(seed: int) -> None:
+    """Each passes its gate by the unknown clock, all together contradict each other, and nobody
+    is in the majority: all are wrong."""
+    made, arrivals = tracker(), late_paths(seed, (), 0.0)[:60]
+    for k, arrival in enumerate(arrivals):
+        found = fix_of(said(made, number_beacons(times(START_NS + 500_000_000 * k, arrival))))
+    off = dict(zip(SITES, (0.0, 7.0, 15.0, 25.0, 40.0), strict=True))
+    contradicting = {name: value_m + off[name] for name, value_m in arrivals[-1].items()}
+    items = number_beacons(times(START_NS + 30_000_000_000, contradicting))
+    (output,) = said(made, items)
+    assert output.status is not None
+    assert np.linalg.norm((fix_of([output]).position - found.position)[:2]) < 0.1
+    assert output.status.rejected == {"gate": len(SITES)}
 
 
 @pytest.mark.parametrize(
