@@ -272,6 +272,7 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any]], tuple[list[Entry], str]]] =
     "scenarios": _read_table("netpos run SCENARIO --offline, netpos evaluate"),
     "learned": _read_table("python scripts/learned_papers.py"),
     "error_grid": _read_table("python scripts/error_grid.py"),
+    "random_networks": _read_table("python scripts/random_networks.py"),
     "fewer_rsus": _read_table("python scripts/fewer_rsus.py"),
     "walking": _read_table("python scripts/pdr_results.py"),
 }
