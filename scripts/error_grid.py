@@ -10,7 +10,8 @@ declare is wrong.
 ``told`` is the tracker that was told noise, bias and correlation time (the mean one, where the
 bias changes with the place), ``learned`` the one that learns from what is declared, ``declared``
 the one that believes it, ``snapshot`` least squares of the last second. Figures are of the time
-after 30 s: RMSE and NEES of the position (2 is expected), all seeds together.
+after 30 s: RMSE and NEES of the position (2 is expected), and errors above the protection level
+while the state is TRACKING, all seeds together.
 """
 
 from __future__ import annotations
@@ -90,11 +91,13 @@ def cases() -> Iterator[Case]:
 
 
 def figures(case: Case, seeds: range, *, told: bool, learn: bool) -> Json:
-    """RMSE [m], NEES with its bounds, and share of epochs without an estimate, after 30 s."""
+    """RMSE [m], NEES with its bounds, share of epochs without an estimate, and how many errors
+    are above the level while the state is TRACKING, after 30 s."""
     settled = round(SETTLED_S * case.rate_hz)
     runs = [run(case, seed, told=told, learn=learn) for seed in seeds]
-    errors = np.concatenate([(means - places)[settled:] for places, means, _ in runs])
-    covs = np.concatenate([covs[settled:] for _, _, covs in runs])
+    errors = np.concatenate([(r.means - r.places)[settled:] for r in runs])
+    covs = np.concatenate([r.covs[settled:] for r in runs])
+    levels = np.concatenate([r.levels[settled:] for r in runs])
     known = np.isfinite(errors[:, 0])
     normalised, _ = whitened(errors[known], covs[known])
     nees = nees_test(normalised)
@@ -105,6 +108,8 @@ def figures(case: Case, seeds: range, *, told: bool, learn: bool) -> Json:
         "nees_mean": nees.mean,
         "nees_bounds": list(nees.bounds),
         "without_estimate": 1.0 - float(known.mean()),
+        "tracking": int(np.isfinite(levels).sum()),
+        "above": int((np.linalg.norm(errors, axis=1) > levels).sum()),
     }
 
 
@@ -204,7 +209,11 @@ def main() -> None:
             rows.append(row)
             rmse = " ".join(f"{row[of]['rmse_m']:.3f}" for of in COMPARED)
             nees = " ".join(f"{row[of]['nees_mean']:.2f}" for of in COMPARED[1:])
-            print(f"{row['name']} | RMSE [m] {rmse} ratio {row['ratio']:.2f} | NEES {nees}")
+            above = " ".join(str(row[of]["above"]) for of in COMPARED[1:])
+            print(
+                f"{row['name']} | RMSE [m] {rmse} ratio {row['ratio']:.2f} | NEES {nees}"
+                f" | above the level {above} of {row['learned']['tracking']}"
+            )
             sys.stdout.flush()
     if args.json is not None:
         document = {"runs": args.seeds, "seed": args.first_seed, "rows": rows}

@@ -44,7 +44,7 @@ class FilterOptions(NamedTuple):
     models: int  # motion models that interact; 1: none
     first_slow_error: int  # index of the state from which on the form follows slow errors
     sector_slip: float  # least probability of a sector of a phase; 0: they are no components
-    learns_density: bool  # of the white acceleration (``accel_density``)
+    learns_density: tuple[bool, bool]  # the densities of acceleration and clock (``densities``)
     of_form: Array  # what the form has of its own (``FilterForm.parameters``)
     gate_nis: Array  # (GATE_SIZE,) largest accepted NIS for 0, 1, ... degrees of freedom
 
@@ -93,7 +93,8 @@ class Run(NamedTuple):
     """What a filter made of N epochs: means (N, n), covs (N, n, n) of the mixture; of the accepted
     rows nis (N,), dof (N,) their number and groups (N,) that of their groups; radius (N,) [m] that
     a mixture leaves with the integrity risk, 0 where there is one component; undetected_m (N,) how
-    far a manoeuvre that an epoch does not show may have taken the device."""
+    far a manoeuvre that an epoch does not show may have taken the device; densities (N, 2) of the
+    process noise (``densities``)."""
 
     means: Array
     covs: Array
@@ -102,7 +103,14 @@ class Run(NamedTuple):
     groups: Array
     radius: Array
     undetected_m: Array
-    accel_density: Array
+    densities: Array
+
+
+def empty_run(epochs: int, n: int) -> Run:
+    """A run of ``epochs`` and ``n`` states, to be filled."""
+    means, covs = np.full((epochs, n), np.nan), np.full((epochs, n, n), np.nan)
+    nis, dof, groups, radius, undetected_m = np.zeros((5, epochs))
+    return Run(means, covs, nis, dof, groups, radius, undetected_m, np.zeros((epochs, 2)))
 
 
 @kernel

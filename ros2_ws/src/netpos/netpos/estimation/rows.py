@@ -25,6 +25,7 @@ from netpos.estimation.measurement import (
     KIND,
     LEVER,
     ORIGIN,
+    OUTLIER_SHARE,
     REFERENCE,
     ROW_WIDTH,
     SAME_BEND,
@@ -175,7 +176,7 @@ def put_scalars(
         row[VARIANCE] = row[GATE_VARIANCE] = variance
         row[BIAS] = row[COMMON] = -1.0
         row[GROUP], row[HEADING] = group, heading
-        row[BLOCKED] = row[HEIGHT] = row[REFERENCE] = row[SAME_BEND] = 0.0
+        row[BLOCKED] = row[HEIGHT] = row[REFERENCE] = row[SAME_BEND] = row[OUTLIER_SHARE] = 0.0
         for i in range(HEADING - AXES):
             row[AXES + i] = place[_POSE + i]
         for i in range(3):

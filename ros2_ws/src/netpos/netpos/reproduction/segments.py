@@ -8,12 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from netpos.estimation import engine
+from netpos.estimation.densities import PARAMETERS
 from netpos.estimation.engine import Run
 from netpos.estimation.level.report import run_levels
 from netpos.estimation.measurement import BIAS
 from netpos.estimation.mixture.epoch import run_epochs
 from netpos.estimation.mixture.gaussians import Mixture, one_component
-from netpos.estimation.motion import Parameter
 from netpos.estimation.state import N_CORE
 from netpos.evaluation.metrics import NS
 from netpos.messages.values import Array, ImuSample
@@ -79,11 +79,6 @@ class Followed(NamedTuple):
     losses: int
 
 
-def _empty_run(epochs: int, n: int) -> Run:
-    figures = np.zeros((6, epochs))
-    return Run(np.full((epochs, n), np.nan), np.full((epochs, n, n), np.nan), *figures)
-
-
 def _part(run: Run, first: int, end: int | None = None) -> Run:
     return Run(*(array[first:end] for array in run))
 
@@ -125,7 +120,7 @@ class Follower:
         ``samples`` of the IMU for a motion model that uses one, None for every other.
         """
         count = epochs.stamps_ns.size
-        run = _empty_run(count, self.first_bias + epochs.bias.shape[1])
+        run = engine.empty_run(count, self.first_bias + epochs.bias.shape[1])
         level, tracked = np.full(count, np.nan), np.zeros(count, dtype=np.bool_)
         motions, imu = self._run_motions(count, samples is not None), _buffer(samples)
         varies = len(motions) > 1
@@ -140,8 +135,8 @@ class Follower:
             else:
                 done = self._stepped(part, fix, part_run, imu, part_motions)
             end = first + done
-            if self._options.learns_density:
-                part_motions[:done, Parameter.ACCEL] = part_run.accel_density[:done]
+            if any(self._options.learns_density):
+                part_motions[:done, list(PARAMETERS)] = part_run.densities[:done]
             whole = _part(part_run, 0, done)
             level[first:end] = run_levels(part.measured, whole, self._options)
             lost = end < count
@@ -158,7 +153,7 @@ class Follower:
         """(1 or N, Parameter): the N of a run that the IMU drives, or the density of which is
         learned, are filled on the way. Of models that interact, bound and level know one:
         straight on."""
-        if driven or self._options.learns_density:
+        if driven or any(self._options.learns_density):
             return np.tile(self._motions[0], (count, 1))
         return self._motions[1:2] if self._config.interacts else self._motions
 
@@ -201,7 +196,7 @@ class Follower:
                 heard_ns = stamp if run.dof[k] else heard_ns
             run.means[k], run.covs[k] = augmented(estimate.mean, estimate.cov, sd)
             run.radius[k] = estimate.radius(0.0)
-            run.accel_density[k] = estimate.motion[Parameter.ACCEL]
+            run.densities[k] = estimate.motion[list(PARAMETERS)]
             if imu is not None:
                 motions[k] = estimate.motion
             if rejected >= config.max_rejected_epochs:

@@ -126,7 +126,11 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
         1e-10, 0.0, 1.0, "continuous: clock white frequency noise [s/sqrt(s)]"
     )
     clock_walk_density: float = real(
-        5e-7, 0.0, 1.0, "continuous: clock random-walk frequency noise [(s/s)/sqrt(s)]"
+        0.0,
+        0.0,
+        1.0,
+        "continuous: clock random-walk frequency noise [(s/s)/sqrt(s)]; 0: learned on the way,"
+        " from 5e-7 on; interacting, strapdown: 5e-7",
     )
     clock_offset_sd_s: float = real(
         1e-4,
@@ -367,14 +371,15 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
             )
 
     @property
-    def learns_density(self) -> bool:
-        """Whether the density of the white acceleration is learned on the way: of one model that
-        has one and no IMU."""
-        models = self.motion_models
-        if self.accel_density_mps2_sqrthz > 0.0 or len(models) != 1:
-            return False
+    def learns_density(self) -> tuple[bool, bool]:
+        """Whether the densities of the white acceleration and of the clock's walk are learned on
+        the way: of one model, of acceleration if it has one and no IMU."""
+        models, continuous = self.motion_models, self.process_noise == "continuous"
+        if len(models) != 1 or not continuous or self.is_linear:
+            return False, False
         has_one = models[0].is_driven_by_white_acceleration and models[0].accel_density is None
-        return has_one and self.process_noise == "continuous" and not self.is_linear
+        accel = has_one and self.accel_density_mps2_sqrthz == 0.0
+        return accel, self.clock_walk_density == 0.0
 
     @property
     def use_imu(self) -> bool:

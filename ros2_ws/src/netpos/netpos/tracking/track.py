@@ -48,9 +48,9 @@ from netpos.tracking.report import (
     track_status,
     waiting_output,
 )
-from netpos.tracking.rsus.nlos_rate import NlosRate
 from netpos.tracking.rsus.rsu import Rsu
 from netpos.tracking.rsus.shared_errors import SharedErrors
+from netpos.tracking.rsus.shares import Shares
 
 
 class Track:
@@ -74,7 +74,7 @@ class Track:
         """Measurements refused at the door, by reason."""
         self._errors: tuple[RsuErrors, ...] = ()
         estimator = _estimator_of(vue_id, config, rsus, shared)
-        self._state = TrackSnapshot(estimator, NlosRate.of(config))
+        self._state = TrackSnapshot(estimator, Shares.unknown(config))
 
     def _take(self, config: TrackerConfig) -> None:
         self._config = config
@@ -131,7 +131,7 @@ class Track:
 
     def _forget(self) -> None:
         old = self._state
-        self._state = TrackSnapshot(old.estimator.fresh(), NlosRate.of(self._config))
+        self._state = TrackSnapshot(old.estimator.fresh(), Shares.unknown(self._config))
         self._state.accepted, self._state.rejected = old.accepted, old.rejected
         self._state.segment = old.segment + 1
         self._state.pose_wait.posed = old.pose_wait.posed
@@ -298,9 +298,9 @@ class Track:
         state = self._state
         unheard_s = (stamp_ns - state.last_accepted_ns) * 1e-9
         past = Past(unheard_s, state.rejected_in_row)
-        state.nlos_rate.expect(epoch_rows)
+        state.shares.expect(epoch_rows)
         result = state.estimator.update(stamp_ns, epoch_rows, past)
-        state.nlos_rate.learn(epoch_rows)
+        state.shares.learn(epoch_rows, result.accepted)
         self._count(result)
         if not result.sound:
             self._forget()

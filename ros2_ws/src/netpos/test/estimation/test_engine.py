@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from engine_cases import opened, start
 from netpos.estimation import engine
-from netpos.estimation.engine import EpochInput, Epochs, FilterOptions, Run
+from netpos.estimation.engine import EpochInput, Epochs, FilterOptions, Run, empty_run
 from netpos.estimation.forms import ekf
 from netpos.estimation.measurement import (
     GROUP,
@@ -177,7 +177,7 @@ def drive(epochs: int = 60) -> tuple[Array, Array, Array]:
 def run(config: TrackerConfig, mean: Array, cov: Array, inputs: Any) -> tuple[int, Run]:
     stamps, starts, rows = inputs
     N, n = len(stamps), len(mean)
-    out = Run(*(np.full(shape, np.nan) for shape in ((N, n), (N, n, n), N, N, N, N, N, N)))
+    out = empty_run(N, n)
     before, dynamics = rows.copy(), dynamics_of(config, NO_BIAS)
     epochs = Epochs(stamps, starts, rows)
     done = run_epochs(epochs, mean, cov, dynamics, options_of(config), out)
@@ -187,7 +187,8 @@ def run(config: TrackerConfig, mean: Array, cov: Array, inputs: Any) -> tuple[in
 
 @pytest.mark.parametrize("change", [{}, {"filter": "ekf"}])
 def test_a_run_is_its_steps(change: dict[str, Any]) -> None:
-    held = {"manoeuvre_speed_sd_mps": 0.0, "accel_density_mps2_sqrthz": 0.5}
+    held = {"accel_density_mps2_sqrthz": 0.5, "clock_walk_density": 5e-7}
+    held["manoeuvre_speed_sd_mps"] = 0.0
     config = TrackerConfig(**change, **held)
     motion, options = motions_of(config)[0], options_of(config)
     mean, cov = start()

@@ -247,4 +247,4 @@ def test_linear_rows_refuse_a_covariance_that_is_none() -> None:
 
 def test_speed_row() -> None:
     (row,) = speed_row(3.0, 0.04, 2)
-    assert row.tolist() == [Kind.SPEED, 3.0, 0.04, 0.04, -1, -1, 2, *([0.0] * 12), -1, *([0] * 7)]
+    assert row.tolist() == [Kind.SPEED, 3.0, 0.04, 0.04, -1, -1, 2, *([0.0] * 12), -1, *([0] * 8)]

@@ -7,10 +7,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
-from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
+from netpos.messages.values import (
+    AngleConvention,
+    Array,
+    Field,
+    RsuInfo,
+    RsuMeasurement,
+    TrackState,
+)
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.tracker import Tracker
 
@@ -237,12 +245,22 @@ def _message(case: Case, values: Array, i: int, var: float) -> RsuMeasurement:
     return replace(bare, fields=Field.RANGE, range_m=metres, range_var=var)
 
 
-def run(case: Case, seed: int, *, told: bool, learn: bool) -> tuple[Array, Array, Array]:
-    """True places (n, 2), estimated ones (n, 2) and their covariances (n, 2, 2); an epoch without
-    an estimate is not a number."""
+class Tracked(NamedTuple):
+    """A run: true places (n, 2), estimated ones (n, 2), their covariances (n, 2, 2), not a number
+    without an estimate, and the protection level (n,), not a number but in the state TRACKING."""
+
+    places: Array
+    means: Array
+    covs: Array
+    levels: Array
+
+
+def run(case: Case, seed: int, *, told: bool, learn: bool) -> Tracked:
+    """Simulate and track one run."""
     places, seen = measured(case, seed)
     tracker, variance = tracker_of(case, places, told=told, learn=learn)
     means, covs = np.full_like(places, math.nan), np.full((len(places), 2, 2), math.nan)
+    levels = np.full(len(places), math.nan)
     for k, values in enumerate(seen):
         stamp_ns = round(1e9 * (1.0 + k / case.rate_hz))
         for item in messages(case, stamp_ns, k, values, variance):
@@ -251,4 +269,6 @@ def run(case: Case, seed: int, *, told: bool, learn: bool) -> tuple[Array, Array
             if output.odometry is not None:
                 means[k] = output.odometry.position[:2]
                 covs[k] = output.odometry.pose_cov[:2, :2]
-    return places, means, covs
+                if output.status is not None and output.status.state is TrackState.TRACKING:
+                    levels[k] = output.status.protection_level_m
+    return Tracked(places, means, covs, levels)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from filterpy_estimate import FilterpyEstimate
-from netpos.estimation.engine import Epochs, Run
+from netpos.estimation.engine import Epochs, empty_run
 from netpos.estimation.mixture.epoch import run_epochs
 from netpos.estimation.mixture.gaussians import Mixture, moments
 from netpos.estimation.motion import NO_BIAS
@@ -102,6 +102,7 @@ def test_filterpy_says_the_same(
             motion_model=model,
             manoeuvre_speed_sd_mps=0.0,
             accel_density_mps2_sqrthz=0.5,
+            clock_walk_density=5e-7,
             isolate_rsus=False,  # the first fix is one component
             clock_offset_sd_s=3e-8,
             clock_drift_sd=1e-8,
@@ -276,7 +277,7 @@ def test_interacting_models_in_one_kernel_are_the_same(name: str) -> None:
     times = np.array([0.0, 0.1, 0.2, 0.3, 1.9, 2.0])
     stamps = T0 + np.round(times * 1e9).astype(np.int64)
     rows = [fix(1.0 + 3.0 * t + 500.0 * (t == 0.2), 2.0 + 4.0 * t) for t in times]
-    run = Run(np.empty((6, 7)), np.empty((6, 7, 7)), *np.empty((6, 6)))
+    run = empty_run(6, 7)
     epochs = Epochs(stamps, np.arange(0, 14, 2), np.vstack(rows))
     done = run_epochs(
         epochs,

@@ -68,7 +68,7 @@ CONFIGS: dict[str, dict[str, Any]] = {
         "clock_offset_sd_s": 0.0,
         "clock_drift_sd": 0.0,
         "clock_white_density": 0.0,
-        "clock_walk_density": 0.0,
+        "clock_walk_density": 1e-30,
         "require_initial_pose": True,
     },
 }

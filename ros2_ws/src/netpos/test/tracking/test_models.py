@@ -73,7 +73,7 @@ def test_options_hold_what_the_parameters_say() -> None:
         models=1,
         first_slow_error=2**31 - 1,
         sector_slip=1e-6,
-        learns_density=True,
+        learns_density=(True, True),
         of_form=options.of_form,
         gate_nis=options.gate_nis,
     )

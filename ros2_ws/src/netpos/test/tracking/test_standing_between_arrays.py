@@ -108,8 +108,8 @@ def test_minute_of_the_same_values_tells_nothing() -> None:
         variance=0.1, bias=2.5, rsus=4, measures=Measures.COSINES, time_s=math.inf, moving=False
     )
     runs = [run(room, seed, told=True, learn=False) for seed in range(700, 708)]
-    errors = np.array([np.linalg.norm(means - places, axis=1) for places, means, _ in runs])
-    sd = np.array([np.sqrt(np.trace(covs, axis1=1, axis2=2)) for *_, covs in runs])
+    errors = np.array([np.linalg.norm(r.means - r.places, axis=1) for r in runs])
+    sd = np.array([np.sqrt(np.trace(r.covs, axis1=1, axis2=2)) for r in runs])
     early, late = slice(100, 200), slice(700, 900)  # 10 Hz
     assert np.sqrt((errors[:, late] ** 2).mean()) < 1.2 * np.sqrt((errors[:, early] ** 2).mean())
     assert sd[:, late].mean() > 0.8 * sd[:, early].mean()

@@ -339,7 +339,7 @@ CONFIGS = st.fixed_dictionaries(
         "manoeuvre_speed_sd_mps": st.sampled_from([0.0, 5.0]),
         "clock_offset_sd_s": st.sampled_from([0.0, 1e-4]),
         "clock_drift_sd": st.sampled_from([0.0, 3e-5]),
-        "clock_walk_density": st.sampled_from([0.0, 2.5e-7]),
+        "clock_walk_density": st.sampled_from([0.0, 1e-30, 2.5e-7]),
     }
 )
 

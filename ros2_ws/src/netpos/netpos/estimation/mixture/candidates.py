@@ -16,7 +16,7 @@ from netpos.estimation.engine import (
     is_sound,
     update_with_gate,
 )
-from netpos.estimation.measurement import GATE_VARIANCE, GROUP
+from netpos.estimation.measurement import GATE_VARIANCE, GROUP, OUTLIER_SHARE
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.sensors.row import group_end
 from netpos.estimation.update import fusion
@@ -100,7 +100,8 @@ def outlier_log(rows: Array, predicted: PredictedRows, start: int, stop: int) ->
     """Log density of the rows ``start`` to ``stop`` of one measurement that is wrong by nobody
     knows how much: beyond the standard deviation of what is ``predicted`` each octave is as
     likely."""
-    total = math.log(OUTLIERS)
+    share = rows[start, OUTLIER_SHARE]
+    total = math.log(share if share > 0.0 else OUTLIERS)
     for i in range(start, stop):
         known = predicted.prior_var[i] + predicted.second_order_var[i]
         off = max(abs(predicted.innovation[i]), math.sqrt(rows[i, GATE_VARIANCE] + known))

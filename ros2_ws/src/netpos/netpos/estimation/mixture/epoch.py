@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netpos.estimation.accel_density import density_of, learn, unknown_density
-from netpos.estimation.accel_density import move as move_density
 from netpos.estimation.compile import kernel
+from netpos.estimation.densities import PARAMETERS, learn, unknown_densities, write_densities
+from netpos.estimation.densities import move as move_densities
 from netpos.estimation.engine import (
     EpochInput,
     Epochs,
@@ -69,7 +69,7 @@ from netpos.estimation.mixture.turns import (
     may_turn,
     unnoticed_s,
 )
-from netpos.estimation.motion import Parameter, add_velocity_step
+from netpos.estimation.motion import add_velocity_step
 from netpos.estimation.update.conditioning import Robust, by_fit, by_path
 from netpos.estimation.update.fusion import predicted_in, workspace
 from netpos.estimation.update.gate import fail_together
@@ -197,7 +197,7 @@ def _at_once(
     count, groups = prior.log_weights.size, int(rows[rows.shape[0] - 1, GROUP]) + 1
     sectors = 2 * most_turns(rows[at]) + 1 if at >= 0 else 0
     m, n = rows.shape[0], prior.means.shape[1]
-    size = (2 * (1 + TURNS_MAX) + m // 2) * count + (sectors + 1) * (count + 1)
+    size = (2 * (1 + TURNS_MAX) + m // 2 + 1) * count + (sectors + 1) * (count + 1)
     found, work = candidates(size, n, groups), workspace(n, m)
     end = np.int64(count)
     for k in range(count):
@@ -438,7 +438,7 @@ def run_epochs(
     memory = memory_of(mean.size, max(np.diff(row_start).max(), 1))
     x, S = mean.copy(), cov_or_sqrt_of(cov, options)
     components, rejected_in_row = a_component_each(x, cov, dynamics), 0
-    learned, motion = unknown_density(x.size), dynamics.motions[0]
+    learned, motion = unknown_densities(x.size, options.learns_density), dynamics.motions[0]
     last_ns = heard_ns = stamps_ns[0]
     open_s = 0.0
     for k in range(stamps_ns.size):
@@ -447,13 +447,12 @@ def run_epochs(
         dt, unheard_s = (now_ns - last_ns) * 1e-9, (now_ns - heard_ns) * 1e-9
         epoch = EpochInput(dt, unheard_s, rejected_in_row, rows)
         open_s, last_ns = open_s + dt, now_ns
-        if options.learns_density:
-            motion[Parameter.ACCEL] = density_of(learned)
-            move_density(learned, x, dt, motion, dynamics.bias)
-        run.accel_density[k] = motion[Parameter.ACCEL]
+        write_densities(learned, motion)
+        move_densities(learned, x, dt, motion, dynamics.bias)
+        run.densities[k] = motion[PARAMETERS[0]], motion[PARAMETERS[1]]
         found = advance(x, S, components, epoch, open_s, dynamics, options, memory)
         components = found.components
-        if options.learns_density and rows.shape[0] > 0:
+        if rows.shape[0] > 0:
             step = memory.step
             learn(learned, step.prior_mean, step.prior_cov, x, step.met_cov, found.turned)
         open_s = found.open_s

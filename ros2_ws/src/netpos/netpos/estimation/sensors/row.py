@@ -13,7 +13,8 @@ array a compiled kernel can take:
     blocked; 0: the option's), HEIGHT (state index of the device's height over the nominal one; 0:
     the height is known), REFERENCE (state index of the bias that is subtracted, that of the RSU a
     difference counts from; 0: none), SAME_BEND (how many more values of its RSU have the
-    same bend, which is what linearising leaves out, while the device stays)
+    same bend, which is what linearising leaves out, while the device stays), OUTLIER_SHARE (how
+    many of the values of its RSU are outliers; 0: as many as of others)
 
 A sensor may keep other figures in ORIGIN and AXES; its module says which.
 """
@@ -25,8 +26,8 @@ from netpos.messages.values import Array
 
 KIND, VALUE, VARIANCE, GATE_VARIANCE, BIAS, COMMON, GROUP, ORIGIN = range(8)
 AXES = 10
-HEADING, LEVER, BLOCKED, HEIGHT, REFERENCE, SAME_BEND = 19, 20, 23, 24, 25, 26
-ROW_WIDTH = 27
+HEADING, LEVER, BLOCKED, HEIGHT, REFERENCE, SAME_BEND, OUTLIER_SHARE = 19, 20, 23, 24, 25, 26, 27
+ROW_WIDTH = 28
 
 
 @inlined

@@ -55,8 +55,6 @@ DEAF = TrackerConfig(
     motion_model="constant_acceleration",
     jerk_density=0.0,
     gate_probability=1.0,
-    clock_white_density=0.0,
-    clock_walk_density=0.0,
 )
 """dvornikov2017:eq.6 with Q = 0: the gain goes to 0."""
 FLOORED = replace(DEAF, **_FLOOR)  # type: ignore[arg-type]

@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from netpos.estimation.engine import Epochs, Run
+from netpos.estimation.engine import Epochs, empty_run
 from netpos.estimation.intersection import METHODS, fuse_pair
 from netpos.estimation.measurement import GATE_VARIANCE, GROUP, ROW_WIDTH, VALUE, VARIANCE
 from netpos.estimation.mixture.epoch import run_epochs
@@ -133,7 +133,7 @@ class Pass:
         n = self._epochs.size
         mean = np.zeros(8)
         mean[TRACK_STATES] = start
-        run = Run(np.empty((n, 8)), np.empty((n, 8, 8)), *np.empty((6, n)))
+        run = empty_run(n, 8)
         epochs = Epochs(self._epochs, self._row_start, position_rows(fixes, self._sd))
         dynamics = dynamics_of(self._setting.tracker, NO_BIAS)
         run_epochs(epochs, mean, self._start_cov, dynamics, self._options, run)

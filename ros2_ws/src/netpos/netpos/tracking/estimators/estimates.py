@@ -9,13 +9,17 @@ from typing import NamedTuple
 import numpy as np
 
 from netpos.estimation import engine
-from netpos.estimation.accel_density import (
-    AccelDensity,
+from netpos.estimation.densities import (
+    HELD,
+    LEARNED,
+    Densities,
+    Density,
     density_of,
     learn,
     move,
     resized,
-    unknown_density,
+    unknown_densities,
+    write_densities,
 )
 from netpos.estimation.engine import EpochInput
 from netpos.estimation.forms.table import form_of
@@ -98,12 +102,12 @@ class Estimate:
         if self._options.models > 1:
             self._components = mixtures.a_component_each(mean, cov, self._dynamics)
         self._learned = self._unknown()
-        self._accel_is_set, self._learns = False, True
+        self._accel_is_set = False
         self._rows = 0
         self._make_room(4)
 
-    def _unknown(self) -> AccelDensity | None:
-        return unknown_density(self.mean.size) if self._options.learns_density else None
+    def _unknown(self) -> Densities:
+        return Densities(*unknown_densities(self.mean.size, self._options.learns_density))
 
     def set_imu_increment(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
         """Set what the IMU integrated since ``stamp_ns``, and how good its yaw rate was."""
@@ -115,7 +119,8 @@ class Estimate:
     def accel_density(self) -> float:
         """Density of the white acceleration [m/s^2/sqrt(Hz)] from ``stamp_ns`` on where none is
         set: declared, or learned up to there."""
-        return self.declared_density if self._learned is None else float(density_of(self._learned))
+        is_learned = self._options.learns_density[Density.ACCEL]
+        return density_of(self._learned, Density.ACCEL) if is_learned else self.declared_density
 
     def set_process_noise(self, accel_density: float) -> None:
         """Set the density of the white acceleration [m/s^2/sqrt(Hz)] from ``stamp_ns`` up to the
@@ -135,18 +140,13 @@ class Estimate:
     def _move_learned(self, dt_s: float, bias: Array) -> None:
         """Take the density that is set, learned or declared, and move what is learned with the
         state."""
-        learned, self._learns = self._learned, not self._accel_is_set
-        self._accel_is_set = False
-        if self._learns:
-            self.motion[Parameter.ACCEL] = self.accel_density
-        if learned is not None and self._learns:
-            move(learned, self.mean, dt_s, self.motion, bias)
-        elif learned is not None:
-            self._learned = AccelDensity(learned.theta, *unknown_density(self.mean.size)[1:])
-
-    def _learn(self, turned: float) -> None:
-        if self._learned is not None and self._learns:
-            learn(self._learned, *self.prior, self.mean, self.cov, turned)
+        is_set, self._accel_is_set = self._accel_is_set, False
+        learns = self._options.learns_density[Density.ACCEL] and not is_set
+        self._learned.phase[Density.ACCEL] = LEARNED if learns else HELD
+        if not is_set:
+            self.motion[Parameter.ACCEL] = self.declared_density
+        write_densities(self._learned, self.motion)
+        move(self._learned, self.mean, dt_s, self.motion, bias)
 
     def _with(self, bias: Array) -> Dynamics:
         return Dynamics(self._dynamics.motions, self._dynamics.sojourn_s, bias)
@@ -231,8 +231,7 @@ class Estimate:
         else:
             mean, cov = augmented(self.mean, self.cov, sd)
             self.mean, self._cov_or_sqrt = mean, engine.to_cov_or_sqrt(cov, self._options)
-        if self._learned is not None:
-            self._learned = resized(self._learned, self.mean.size)
+        self._learned = resized(self._learned, self.mean.size)
         self._make_room(self._rows)
 
     def change_prior(self, index: int, before: float, after: float) -> None:
@@ -293,7 +292,7 @@ class Estimate:
             memory,
         )
         self.stamp_ns = stamp_ns
-        self._learn(outcome.turned)
+        learn(self._learned, *self.prior, self.mean, self.cov, outcome.turned)
         self._open_s = outcome.open_s
         several = outcome.components.log_weights.size > 1
         self._components = outcome.components if several else None
@@ -314,8 +313,7 @@ class Estimate:
         twin.mean, twin._cov_or_sqrt = self.mean.copy(), self._cov_or_sqrt.copy()
         twin._dynamics = self._dynamics._replace(motions=self._dynamics.motions.copy())
         twin.motion = twin._dynamics.motions[0]
-        if self._learned is not None:
-            twin._learned = resized(self._learned, self.mean.size)
+        twin._learned = resized(self._learned, self.mean.size)
         return twin
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from netpos.estimation.accel_density import START
 from netpos.estimation.chi_square import chi_square_bound
+from netpos.estimation.densities import START, Density
 from netpos.estimation.engine import GATE_SIZE, FilterOptions
 from netpos.estimation.forms.table import form_of, number_of
 from netpos.estimation.mixture.epoch import Dynamics
@@ -77,7 +77,7 @@ def dynamics_of(config: TrackerConfig, bias: Array) -> Dynamics:
 
 def _motion_of(config: TrackerConfig, model: MotionModel, extras: int, idle: float) -> Array:
     c = SPEED_OF_LIGHT_MPS
-    accel = config.accel_density_mps2_sqrthz or START
+    accel = config.accel_density_mps2_sqrthz or START[Density.ACCEL]
     if model.accel_density is not None:
         accel = getattr(config, model.accel_density)
     elif config.process_noise == "white_acceleration":
@@ -89,7 +89,7 @@ def _motion_of(config: TrackerConfig, model: MotionModel, extras: int, idle: flo
         accel=accel,
         velocity_step=config.velocity_step_sd_mps,
         offset_density=c * config.clock_white_density,
-        drift_density=c * config.clock_walk_density,
+        drift_density=c * config.clock_walk_density or START[Density.CLOCK],
         drift_step=c * config.drift_step_sd,
         idle=idle,
         gyro=config.gyro_noise_density,

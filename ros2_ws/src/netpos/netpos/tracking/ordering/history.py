@@ -11,7 +11,7 @@ from netpos.estimation.noise_scale import NoiseScale
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimators.estimator import Estimator, Recent
 from netpos.tracking.ordering.sequencer import Epoch, Item, channel_and_source
-from netpos.tracking.rsus.nlos_rate import NlosRate
+from netpos.tracking.rsus.shares import Shares
 
 _SNAPSHOTS = 2  # states kept per length of the history
 
@@ -50,7 +50,7 @@ class TrackSnapshot:
     """All of a track that changes with an epoch; unheard of until its first measurement."""
 
     estimator: Estimator
-    nlos_rate: NlosRate
+    shares: Shares
     segment: int = 0
     recent: Recent = ()
     """The newest epochs that fitted: an initial pose is weighed with them."""
@@ -71,7 +71,7 @@ class TrackSnapshot:
         """An independent copy, for a track to go back to."""
         twin = TrackSnapshot(*_values(self))
         twin.estimator = self.estimator.copy()
-        twin.nlos_rate = self.nlos_rate.copy()
+        twin.shares = self.shares.copy()
         twin.rsus_scale = self.rsus_scale.copy()
         twin.device_scale = self.device_scale.copy()
         twin.pose_wait = replace(self.pose_wait)

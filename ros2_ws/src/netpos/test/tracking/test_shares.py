@@ -1,4 +1,5 @@
-"""The share of blocked paths is learned per RSU, and late measurements change nothing about it."""
+"""Shares of blocked paths and of outliers are learned per RSU; late measurements change nothing
+about them."""
 
 from __future__ import annotations
 
@@ -7,21 +8,25 @@ from typing import Any
 
 import numpy as np
 import pytest
-from netpos.estimation.measurement import BLOCKED, KIND, Kind
+from netpos.estimation.measurement import BLOCKED, KIND, OUTLIER_SHARE, Kind
+from netpos.estimation.mixture.candidates import OUTLIERS
 from netpos.estimation.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Field, RsuInfo, RsuMeasurement
 from netpos.tracking import TrackerConfig
 from netpos.tracking.estimators.epoch_rows import EpochRows
-from netpos.tracking.rsus.nlos_rate import NlosRate
+from netpos.tracking.rsus.shares import Shares
 from scipy.constants import speed_of_light
 
 STANDING = np.array([40.0, 2.0, 0.0, 0.0, 0.0, 0.0])
 EXCESS_M = 15.0
+BLOCKED_PATHS = TrackerConfig(nlos_probability=0.2, nlos_memory=50.0)
+LEARNED = TrackerConfig(learn_errors=True)
 NLOS = {
     "nlos_probability": 0.2,
     "nlos_mean_excess_m": EXCESS_M,
     "isolate_rsus": False,
     "accel_density_mps2_sqrthz": 0.1,
+    "clock_walk_density": 5e-7,
 }
 
 
@@ -42,36 +47,55 @@ def _epoch_rows() -> EpochRows:
 def test_share_is_the_mean_of_the_beta_distribution() -> None:
     """Three measurements written out: alpha' = f alpha + (1 - f) alpha0 + p, and the same of
     beta."""
-    nlos_rate, epoch_rows = NlosRate(0.2, 50.0), _epoch_rows()
+    shares, epoch_rows = Shares.unknown(BLOCKED_PATHS), _epoch_rows()
     alpha, beta, f = 2.0, 8.0, 0.98
     for p in (0.9, 1.0, 0.1):
-        nlos_rate.expect(epoch_rows)
+        shares.expect(epoch_rows)
         late = epoch_rows.rows[:, KIND] == Kind.RANGE
         assert epoch_rows.rows[late, BLOCKED] == pytest.approx(alpha / (alpha + beta))
         assert epoch_rows.rows[~late, BLOCKED] == 0.0
+        assert (epoch_rows.rows[:, OUTLIER_SHARE] == 0.0).all()
         epoch_rows.rows[late, BLOCKED] = p
-        nlos_rate.learn(epoch_rows)
+        shares.learn(epoch_rows, [1.0])
         alpha = f * alpha + (1 - f) * 2.0 + p
         beta = f * beta + (1 - f) * 8.0 + 1 - p
-        assert nlos_rate.share("a") == pytest.approx(alpha / (alpha + beta))
-    assert nlos_rate.share("b") == 0.2
+        assert shares.blocked.of("a") == pytest.approx(alpha / (alpha + beta))
+    assert shares.blocked.of("b") == 0.2
 
 
-def test_a_copy_learns_for_itself() -> None:
-    nlos_rate, epoch_rows = NlosRate(0.2, 50.0), _epoch_rows()
-    twin = nlos_rate.copy()
-    epoch_rows.rows[:, BLOCKED] = 1.0
-    twin.learn(epoch_rows)
-    assert twin.share("a") > 0.2
-    assert nlos_rate.share("a") == 0.2
-
-
-def test_nothing_is_learned_where_the_option_is_off() -> None:
-    nlos_rate, epoch_rows = NlosRate.of(TrackerConfig()), _epoch_rows()
-    nlos_rate.expect(epoch_rows)
+def test_what_is_refused_is_an_outlier() -> None:
+    """A measurement of two values counts once: a share of 1 in 100, worth 100 measurements, of
+    which three were refused and one was not; all its rows then say so."""
+    shares, epoch_rows = Shares.unknown(LEARNED), _epoch_rows()
+    shares.expect(epoch_rows)
+    assert epoch_rows.rows[:, OUTLIER_SHARE] == pytest.approx(OUTLIERS)
+    alpha, beta, f = 1.0, 99.0, 1.0 - 1.0 / 300.0
+    for accepted in (0.0, 0.0, 1.0, 0.0):
+        shares.learn(epoch_rows, [accepted])
+        alpha = f * alpha + (1 - f) * 1.0 + 1.0 - accepted
+        beta = f * beta + (1 - f) * 99.0 + accepted
+    shares.expect(epoch_rows)
+    assert epoch_rows.rows[:, OUTLIER_SHARE] == pytest.approx(alpha / (alpha + beta))
     assert (epoch_rows.rows[:, BLOCKED] == 0.0).all()
-    nlos_rate.learn(epoch_rows)
-    assert nlos_rate.share("a") == 0.0
+    assert shares.outliers.of("b") == pytest.approx(OUTLIERS)
+
+
+@pytest.mark.parametrize("config", [BLOCKED_PATHS, LEARNED])
+def test_a_copy_learns_for_itself(config: TrackerConfig) -> None:
+    shares, epoch_rows = Shares.unknown(config), _epoch_rows()
+    before, twin = (shares.blocked.of("a"), shares.outliers.of("a")), shares.copy()
+    epoch_rows.rows[:, BLOCKED] = 1.0
+    twin.learn(epoch_rows, [0.0])
+    assert (twin.blocked.of("a"), twin.outliers.of("a")) > before
+    assert (shares.blocked.of("a"), shares.outliers.of("a")) == before
+
+
+def test_nothing_is_learned_where_the_options_are_off() -> None:
+    shares, epoch_rows = Shares.unknown(TrackerConfig()), _epoch_rows()
+    shares.expect(epoch_rows)
+    assert (epoch_rows.rows[:, [BLOCKED, OUTLIER_SHARE]] == 0.0).all()
+    shares.learn(epoch_rows, [0.0])
+    assert shares.blocked.of("a") == shares.outliers.of("a") == 0.0
 
 
 RSUS = {
@@ -103,15 +127,15 @@ def test_learning_beats_the_configured_share(world: Any, feed: Any) -> None:
             outputs = [o for items in epochs for o in feed(tracker, items)][50:]
             places = np.array([o.odometry.position[:2] for o in outputs])
             square[memory] += float(np.sum((places - STANDING[:2]) ** 2))
-        shares = {name: tracker._tracks["vue_1"]._state.nlos_rate.share(name) for name in RSUS}
+        shares = {name: tracker._tracks["vue_1"]._state.shares.blocked.of(name) for name in RSUS}
         assert shares.pop("b") > 0.6
         assert max(shares.values()) < 0.1
     assert square[100.0] < 0.85 * square[1.0]
 
 
 def test_late_measurements_end_in_the_same_estimate(world: Any, feed: Any) -> None:
-    epochs = _measurements(world, 31, 60)
-    in_order, late = world.tracker(**NLOS), world.tracker(**NLOS)
+    epochs, config = _measurements(world, 31, 60), {**NLOS, "learn_errors": True}
+    in_order, late = world.tracker(**config), world.tracker(**config)
     for k, items in enumerate(epochs):
         feed(in_order, items)
         held = items[1:] if k == 40 else items
@@ -120,4 +144,6 @@ def test_late_measurements_end_in_the_same_estimate(world: Any, feed: Any) -> No
             feed(late, epochs[40][:1])
     first, second = (t._tracks["vue_1"]._state for t in (in_order, late))
     np.testing.assert_array_equal(first.estimator.estimate.mean, second.estimator.estimate.mean)
-    assert [first.nlos_rate.share(n) for n in RSUS] == [second.nlos_rate.share(n) for n in RSUS]
+    for n in RSUS:
+        assert first.shares.blocked.of(n) == second.shares.blocked.of(n)
+        assert first.shares.outliers.of(n) == second.shares.outliers.of(n)

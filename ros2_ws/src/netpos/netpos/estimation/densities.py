@@ -1,0 +1,181 @@
+"""The densities of the process noise, learned on the way by maximum likelihood: of the white
+acceleration, and of the walk of the device's clock.
+
+The likelihood of each measurement is derived with respect to theta = ln(density): beside mean and
+covariance the derivatives of both are carried (recursive prediction error method; Ljung and
+Söderström 1983, section 3.7; Gupta and Mehra 1974 for the derivatives of a Kalman filter). Only
+the prediction and the result of an update are needed, so that every form of the filter and a
+mixture by its moments will do. With u = P^-1 (x+ - x), the information M = P^-1 (P - P+) P^-1
+and A = P+ P^-1 of an update, and derivatives dx, dP of the prediction::
+
+    score        -tr(M dP)/2 + u' dP u/2 + u' dx
+    information  tr(M dP M dP)/2 + dx' M dx
+    dx+ = A (dx + dP u),  dP+ = A dP A'
+
+theta is a Gauss-Markov process about its prior; the density that the filter takes is one standard
+deviation above its mean. Each density is learned as if the other were known.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from netpos.estimation.compile import kernel
+from netpos.estimation.factor import factor, solve_factored
+from netpos.estimation.motion import SPEED_OF_LIGHT_MPS, Parameter, transition
+from netpos.estimation.motion.process_noise import add_walk
+from netpos.estimation.state import X
+from netpos.messages.values import Array
+
+
+class Density(IntEnum):
+    """Which density, as an index."""
+
+    ACCEL = 0  # [m/s^2/sqrt(Hz)]
+    CLOCK = 1  # [m/s/sqrt(s)]
+
+
+PARAMETERS = (int(Parameter.ACCEL), int(Parameter.DRIFT_DENSITY))
+"""Where each is in ``motion``."""
+START = (0.5, 5e-7 * SPEED_OF_LIGHT_MPS)
+"""Each before anything is learned."""
+LEAST = (0.1, 1e-10 * SPEED_OF_LIGHT_MPS)
+MOST = (5.0, 5e-6 * SPEED_OF_LIGHT_MPS)
+"""Acceleration: 0.3 m/s in 10 s; the speed of a runner in a second. Clock: a good oscillator, of
+which a second makes 2 cm; one that a second makes 0.9 km of."""
+SD = (1.0, 2.0)
+"""Of theta before anything is learned: a factor of e, and of 7."""
+TIME_S = (60.0, 600.0)
+"""After which a device may move otherwise, and its clock may be warmer."""
+_FARTHEST_SD = 5.0  # what one measurement may say at most, in standard deviations of its score
+_TURNED = 0.5  # an epoch that a manoeuvre explains with this probability says nothing
+_TELLS = 0.999  # an epoch that leaves more of the variance of the clock says nothing of it
+
+
+HELD, AWAITED, LEARNED = range(3)
+"""Phases of a density: not learned; not yet, as nothing was heard that tells of it; learned."""
+
+
+class Densities(NamedTuple):
+    """What is known of each theta: ``phase`` (2,); ``theta`` (2, 2), mean and variance;
+    derivatives by it of the state's mean (2, n) and covariance (2, n, n). Changed in place."""
+
+    phase: NDArray[np.int64]
+    theta: Array
+    mean: Array
+    cov: Array
+
+
+@kernel
+def unknown_densities(n: int, learns: tuple[bool, bool]) -> Densities:
+    """Nothing is learned yet, of a state of ``n`` entries; ``learns``: which are to be."""
+    phase, theta, (accel, clock) = np.zeros(2, np.int64), np.empty((2, 2)), learns
+    for k in range(2):
+        theta[k, 0], theta[k, 1] = math.log(START[k]) - SD[k], SD[k] ** 2
+    if accel:
+        phase[Density.ACCEL] = LEARNED
+    if clock:
+        phase[Density.CLOCK] = AWAITED
+    return Densities(phase, theta, np.zeros((2, n)), np.zeros((2, n, n)))
+
+
+def resized(learned: Densities, n: int) -> Densities:
+    """A copy for a state of ``n`` entries, the new ones of which depend on no density."""
+    old, copy = learned.mean.shape[1], unknown_densities(n, (False, False))
+    copy.phase[:], copy.theta[:], copy.mean[:, :old], copy.cov[:, :old, :old] = learned
+    return Densities(*copy)
+
+
+@kernel
+def density_of(learned: Densities, k: int) -> float:
+    """The ``Density`` k that the filter takes."""
+    return math.exp(learned.theta[k, 0] + math.sqrt(learned.theta[k, 1]))
+
+
+@kernel
+def write_densities(learned: Densities, motion: Array) -> None:
+    """Let ``motion`` have the densities that are not held."""
+    for k in range(2):
+        if learned.phase[k] != HELD:
+            motion[PARAMETERS[k]] = density_of(learned, k)
+
+
+@kernel
+def move(learned: Densities, mean: Array, dt: float, motion: Array, bias: Array) -> None:
+    """Move what is learned with the state ``mean`` (n,) by ``dt`` seconds. ``motion`` may have a
+    smaller density than ``density_of``, by what steps say: it does not depend on theta."""
+    if dt <= 0.0 or learned.phase.max() < LEARNED:
+        return
+    F = np.empty_like(learned.cov[0])
+    transition(mean, dt, motion, bias, F)
+    for k in range(2):
+        dx, dP, theta = learned.mean[k], learned.cov[k], learned.theta[k]
+        if learned.phase[k] != LEARNED:
+            dx[:], dP[:] = 0.0, 0.0
+            continue
+        dx[:] = F @ dx
+        dP[:] = F @ dP @ F.T
+        density = density_of(learned, k)
+        if motion[PARAMETERS[k]] >= density:
+            twice = (math.sqrt(2.0) * density) ** 2  # dQ/dtheta = 2 Q
+            if k == Density.ACCEL:
+                add_walk(X.PX, X.VX, dt, twice, dP)
+                add_walk(X.PY, X.VY, dt, twice, dP)
+            else:
+                add_walk(X.CLOCK, X.DRIFT, dt, twice, dP)
+        at_first, kept = math.log(START[k]) - SD[k], math.exp(-dt / TIME_S[k])
+        theta[0] = at_first + kept * (theta[0] - at_first)
+        theta[1] = kept * kept * theta[1] + (1.0 - kept * kept) * SD[k] ** 2
+
+
+@kernel
+def learn(
+    learned: Densities,
+    prior_mean: Array,
+    prior_cov: Array,
+    mean: Array,
+    cov: Array,
+    turned: float,
+) -> None:
+    """Learn from an update of the prediction ``prior_mean`` (n,), ``prior_cov`` (n, n) to mean
+    (n,), cov (n, n); ``turned``: the probability that a manoeuvre explains it."""
+    if learned.phase.max() == LEARNED:
+        n = mean.size
+        B = np.empty((n, n + 1))
+        B[:, :n], B[:, n] = cov.T, mean - prior_mean
+        L = factor(prior_cov)
+        solve_factored(L, B)
+        A, u = B[:, :n].T.copy(), B[:, n].copy()
+        M = np.eye(n) - A
+        solve_factored(L, M)
+        for k in range(2):
+            if learned.phase[k] == LEARNED:
+                _learn_one(learned, k, A, M, u, turned)
+    if learned.phase[Density.CLOCK] == AWAITED:
+        told = cov[X.CLOCK, X.CLOCK] < _TELLS * prior_cov[X.CLOCK, X.CLOCK]
+        learned.phase[Density.CLOCK] = LEARNED if told else AWAITED
+
+
+@kernel
+def _learn_one(learned: Densities, k: int, A: Array, M: Array, u: Array, turned: float) -> None:
+    """Of an update with ``A`` and ``M`` (n, n), ``u`` (n,) the ``Density`` k."""
+    dx, dP, theta = learned.mean[k], learned.cov[k], learned.theta[k]
+    gained, pulled = M @ dP, dP @ u
+    score = u @ dx + 0.5 * (u @ pulled - np.trace(gained))
+    information = dx @ (M @ dx) + 0.5 * np.sum(gained * gained.T)
+    if turned > _TURNED or not (information >= 0.0 and math.isfinite(score)):
+        dx[:], dP[:] = 0.0, 0.0
+        return
+    farthest = _FARTHEST_SD * math.sqrt(information)
+    theta[1] = theta[1] / (1.0 + theta[1] * information)
+    found = theta[0] + theta[1] * min(max(score, -farthest), farthest)
+    sd = math.sqrt(theta[1])
+    theta[0] = min(max(found, math.log(LEAST[k]) - sd), math.log(MOST[k]) - sd)
+    dx[:] = A @ (dx + pulled)
+    moved = A @ dP @ A.T
+    dP[:] = (moved + moved.T) / 2.0
