@@ -352,6 +352,19 @@ def test_two_late_paths_at_once_are_outvoted(seed: int, read: Any) -> None:
     assert np.sqrt(np.mean(late**2)) < 1.5 * np.sqrt(np.mean(clean**2))
 
 
+@pytest.mark.parametrize("late", [(), ("a",), ("b",)])
+def test_a_late_reference_says_nothing_of_the_others_noise(late: Sequence[str]) -> None:
+    """Learned errors of differences to ``a``: no scatter above 1.5 times the one stated, however
+    often it, or another RSU, hears the device late."""
+    made, scatter = tracker(learn_errors=True), []
+    for k, arrival in enumerate(late_paths(4, late, 1.0 / 6.0)):
+        items = number_beacons(differences(START_NS + 500_000_000 * k, arrival))
+        for output in said(made, items):
+            scatter += [max(e.scatter) for e in output.errors if k >= 120]
+    assert len(scatter) > 100
+    assert max(scatter) < 1.5
+
+
 @pytest.mark.parametrize(("clock_walk_density", "refused"), [(5e-7, 5), (0.0, 4)])
 @pytest.mark.parametrize("seed", range(3))
 def test_times_no_two_of_which_agree_move_nothing(

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from netpos.common.pair_errors import of_each_receiver
 from netpos.estimation.measurement import (
     BIAS,
+    COMMON,
     GATE_VARIANCE,
     GROUP,
     REFERENCE,
@@ -37,7 +38,8 @@ from netpos.tracking.rsus.learning import WINDOW_S, LearnedErrors, Name
 from netpos.tracking.rsus.shift import CHANGE, DeviceState
 
 _RSU = "rsu/"
-_WHOSE = [BIAS, REFERENCE, GROUP]
+_WHOSE = [BIAS, REFERENCE, COMMON, GROUP]
+_OUTLIER_SD = 4.0  # of what values share, where it is one: one Gaussian error in 16,000
 REFERENCED = sum(int(r.field) for s, r in readings() if s.difference_of >= 0)
 """Fields that compare the RSU with a second one."""
 _RENEWED_S = 1e-6  # correlation time of what is new at every epoch
@@ -289,8 +291,9 @@ class BiasStates:
         self, rows: Array, accepted: Array, posterior: DeviceState
     ) -> tuple[list[Name], list[PriorChange]]:
         """Learn from what the ``posterior`` leaves of ``rows`` (m, ROW_WIDTH), of which groups
-        were ``accepted`` (groups,). Returns what was concluded of whom, and the bias states whose
-        sd changed."""
+        were ``accepted`` (groups,). Differences to an RSU that heard the device late are accepted
+        with what they share, and say nothing of their own errors. Returns what was concluded of
+        whom, and the bias states whose sd changed."""
         learned = self.learned
         if learned is None:
             return [], []
@@ -301,8 +304,9 @@ class BiasStates:
         of_biases: dict[tuple[int, ...], Name] = {b: name for name, b in self._biases.items()}
         named = [
             (i, of_biases[own, reference])
-            for i, (own, reference, group) in enumerate(rows[:, _WHOSE].astype(np.int64).tolist())
-            if (own, reference) in of_biases and accepted[group]
+            for i, whose in enumerate(rows[:, _WHOSE].astype(np.int64).tolist())
+            for own, reference, common, group in [whose]
+            if (own, reference) in of_biases and accepted[group] and self._is_usual(common, mean)
         ]
         if named:
             taken, names = [i for i, _ in named], [name for _, name in named]
@@ -312,6 +316,12 @@ class BiasStates:
         speed = 0.0 if still else math.hypot(*velocity)
         concluded = learned.conclude(posterior)
         return concluded, self._take_learned(learned, concluded, speed)
+
+    def _is_usual(self, common: int, mean: Array) -> bool:
+        """Whether the state ``common`` of ``mean`` (n,), which several values share (-1: none), is
+        as large as it usually is."""
+        k = common - self.first
+        return k < 0 or abs(mean[common]) < _OUTLIER_SD * self.sd[k]
 
     def _take_learned(
         self, learned: LearnedErrors, concluded: Collection[Name], speed_mps: float
