@@ -43,6 +43,7 @@ from netpos.estimation.measurement import (  # noqa: E402
     Kind,
 )
 from netpos.estimation.mixture.turns import TURNS_HZ  # noqa: E402
+from netpos.estimation.motion import Parameter  # noqa: E402
 from netpos.estimation.state import N_CORE, POSITION  # noqa: E402
 from netpos.evaluation.metrics import SKIP_EPOCHS  # noqa: E402
 from netpos.messages.values import Array, InitialPose  # noqa: E402
@@ -51,6 +52,7 @@ from netpos.reproduction.fokin2020.paper import FIG_6, METIS_ONE_RSU, METIS_STRO
 from netpos.reproduction.monte_carlo import DIVERGED_M  # noqa: E402
 from netpos.reproduction.rows import RowTemplates, observation_rows  # noqa: E402
 from netpos.tracking.config import TrackerConfig  # noqa: E402
+from netpos.tracking.estimators.models import motions_of  # noqa: E402
 from particle_filter import Start  # noqa: E402
 from particle_gaussians import GaussianParticles, StepMotion  # noqa: E402
 from particle_kernels import Kind as OracleKind  # noqa: E402
@@ -107,7 +109,7 @@ def motion_of(config: TrackerConfig) -> StepMotion:
         to_sides=TURN_SIZES,
         turn_speed_sd=TURN_SPEED_SD,
         turn_angle_sd=TURN_ANGLE_SD,
-        clock=(c * config.clock_white_density, c * config.clock_walk_density),
+        clock=(c * config.clock_white_density, motions_of(config)[0][Parameter.DRIFT_DENSITY]),
     )
 
 

@@ -46,19 +46,26 @@ START = (0.5, 5e-7 * SPEED_OF_LIGHT_MPS)
 """Each before anything is learned."""
 LEAST = (0.1, 1e-10 * SPEED_OF_LIGHT_MPS)
 MOST = (5.0, 5e-6 * SPEED_OF_LIGHT_MPS)
-"""Acceleration: 0.3 m/s in 10 s; the speed of a runner in a second. Clock: a good oscillator, of
-which a second makes 2 cm; one that a second makes 0.9 km of."""
+"""Acceleration: 0.3 m/s after 10 s; the speed of a runner after a second. Clock: an offset of 2 cm
+and of 0.9 km after a second."""
 SD = (1.0, 2.0)
 """Of theta before anything is learned: a factor of e, and of 7."""
 TIME_S = (60.0, 600.0)
 """After which a device may move otherwise, and its clock may be warmer."""
 _FARTHEST_SD = 5.0  # what one measurement may say at most, in standard deviations of its score
 _TURNED = 0.5  # an epoch that a manoeuvre explains with this probability says nothing
-_TELLS = 0.999  # an epoch that leaves more of the variance of the clock says nothing of it
+_KEPT = 0.999  # an epoch that leaves more of the variance of the clock does not inform of it
+_STEP_SD = 5.0  # a clock that moves farther by an update has stepped: the gate allows less
 
 
 HELD, AWAITED, LEARNED = range(3)
-"""Phases of a density: not learned; not yet, as nothing was heard that tells of it; learned."""
+"""Phases of a density: not learned; not yet, as no measurement has informed of it; learned."""
+
+
+def held(declared: float, which: Density) -> float:
+    """The density that is not learned: the one ``declared``, or, if that is 0, the one that
+    learning starts from."""
+    return declared or START[which]
 
 
 class Densities(NamedTuple):
@@ -109,6 +116,9 @@ def write_densities(learned: Densities, motion: Array) -> None:
 def move(learned: Densities, mean: Array, dt: float, motion: Array, bias: Array) -> None:
     """Move what is learned with the state ``mean`` (n,) by ``dt`` seconds. ``motion`` may have a
     smaller density than ``density_of``, by what steps say: it does not depend on theta."""
+    for k in range(2):
+        if learned.phase[k] != LEARNED:
+            learned.mean[k], learned.cov[k] = 0.0, 0.0
     if dt <= 0.0 or learned.phase.max() < LEARNED:
         return
     F = np.empty_like(learned.cov[0])
@@ -116,7 +126,6 @@ def move(learned: Densities, mean: Array, dt: float, motion: Array, bias: Array)
     for k in range(2):
         dx, dP, theta = learned.mean[k], learned.cov[k], learned.theta[k]
         if learned.phase[k] != LEARNED:
-            dx[:], dP[:] = 0.0, 0.0
             continue
         dx[:] = F @ dx
         dP[:] = F @ dP @ F.T
@@ -134,6 +143,14 @@ def move(learned: Densities, mean: Array, dt: float, motion: Array, bias: Array)
 
 
 @kernel
+def clock_has_stepped(prior_mean: Array, prior_cov: Array, mean: Array) -> bool:
+    """Whether an update of the prediction ``prior_mean`` (n,), ``prior_cov`` (n, n) to ``mean``
+    (n,) moves the clock farther than its prediction allows."""
+    moved = mean[X.CLOCK] - prior_mean[X.CLOCK]
+    return bool(moved * moved > _STEP_SD * _STEP_SD * prior_cov[X.CLOCK, X.CLOCK])
+
+
+@kernel
 def learn(
     learned: Densities,
     prior_mean: Array,
@@ -143,8 +160,11 @@ def learn(
     turned: float,
 ) -> None:
     """Learn from an update of the prediction ``prior_mean`` (n,), ``prior_cov`` (n, n) to mean
-    (n,), cov (n, n); ``turned``: the probability that a manoeuvre explains it."""
-    if learned.phase.max() == LEARNED:
+    (n,), cov (n, n); ``turned``: the probability that a manoeuvre explains it. An update that a
+    manoeuvre or a step of the clock explains says nothing: the derivatives begin anew."""
+    if turned > _TURNED or clock_has_stepped(prior_mean, prior_cov, mean):
+        learned.mean[:], learned.cov[:] = 0.0, 0.0
+    elif learned.phase.max() == LEARNED:
         n = mean.size
         B = np.empty((n, n + 1))
         B[:, :n], B[:, n] = cov.T, mean - prior_mean
@@ -155,20 +175,20 @@ def learn(
         solve_factored(L, M)
         for k in range(2):
             if learned.phase[k] == LEARNED:
-                _learn_one(learned, k, A, M, u, turned)
+                _learn_one(learned, k, A, M, u)
     if learned.phase[Density.CLOCK] == AWAITED:
-        told = cov[X.CLOCK, X.CLOCK] < _TELLS * prior_cov[X.CLOCK, X.CLOCK]
-        learned.phase[Density.CLOCK] = LEARNED if told else AWAITED
+        informs = cov[X.CLOCK, X.CLOCK] < _KEPT * prior_cov[X.CLOCK, X.CLOCK]
+        learned.phase[Density.CLOCK] = LEARNED if informs else AWAITED
 
 
 @kernel
-def _learn_one(learned: Densities, k: int, A: Array, M: Array, u: Array, turned: float) -> None:
+def _learn_one(learned: Densities, k: int, A: Array, M: Array, u: Array) -> None:
     """Of an update with ``A`` and ``M`` (n, n), ``u`` (n,) the ``Density`` k."""
     dx, dP, theta = learned.mean[k], learned.cov[k], learned.theta[k]
     gained, pulled = M @ dP, dP @ u
     score = u @ dx + 0.5 * (u @ pulled - np.trace(gained))
     information = dx @ (M @ dx) + 0.5 * np.sum(gained * gained.T)
-    if turned > _TURNED or not (information >= 0.0 and math.isfinite(score)):
+    if not (information >= 0.0 and math.isfinite(score)):
         dx[:], dP[:] = 0.0, 0.0
         return
     farthest = _FARTHEST_SD * math.sqrt(information)

@@ -38,7 +38,6 @@ class FilterOptions(NamedTuple):
     lost_after: int  # epochs rejected in a row
     initial_speed_sd: float  # [m/s] to which the velocity opens then
     manoeuvre_speed_sd: float  # [m/s] of a manoeuvre; 0: none
-    coast_after_s: float  # a longer silence may leave the device anywhere
     integrity_risk: float  # share of errors that may exceed the protection level
     robust: RobustOptions
     models: int  # motion models that interact; 1: none

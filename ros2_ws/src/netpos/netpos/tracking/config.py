@@ -130,7 +130,7 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
         0.0,
         1.0,
         "continuous: clock random-walk frequency noise [(s/s)/sqrt(s)]; 0: learned on the way,"
-        " from 5e-7 on; interacting, strapdown: 5e-7",
+        " starting at 5e-7; interacting, strapdown, kf or without manoeuvres: 5e-7",
     )
     clock_offset_sd_s: float = real(
         1e-4,
@@ -184,7 +184,10 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
     )
     nlos_mean_excess_m: float = real(20.0, 1e-3, 1e5, "mean excess of a blocked path")
     nlos_memory: float = real(
-        100.0, 1.0, 1e9, "measurements over which the share of each RSU is learned"
+        100.0,
+        1.0,
+        1e9,
+        "measurements over which each RSU's share of blocked paths is learned",
     )
     ambiguity: str = choice(
         "hypotheses",
@@ -221,7 +224,8 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
     )
     learn_errors: bool = described(
         False,
-        "learn scatter, bias and correlation of each RSU's errors; declared ones are a prior",
+        "learn scatter, bias and correlation of each RSU's errors, and its share of outliers;"
+        " declared ones are a prior",
     )
     isolate_rsus: bool = described(
         True,
@@ -373,13 +377,14 @@ class TrackerConfig(_OfTheTables):  # type: ignore[misc]
     @property
     def learns_density(self) -> tuple[bool, bool]:
         """Whether the densities of the white acceleration and of the clock's walk are learned on
-        the way: of one model, of acceleration if it has one and no IMU."""
+        the way: of one model, of acceleration if it has one and no IMU, of the clock if a refused
+        measurement may have other explanations, a step of the clock among them."""
         models, continuous = self.motion_models, self.process_noise == "continuous"
         if len(models) != 1 or not continuous or self.is_linear:
             return False, False
         has_one = models[0].is_driven_by_white_acceleration and models[0].accel_density is None
         accel = has_one and self.accel_density_mps2_sqrthz == 0.0
-        return accel, self.clock_walk_density == 0.0
+        return accel, self.clock_walk_density == 0.0 and self.manoeuvre_sd_mps > 0.0
 
     @property
     def use_imu(self) -> bool:

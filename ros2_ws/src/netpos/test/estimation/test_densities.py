@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from netpos.estimation.densities import (
     AWAITED,
+    HELD,
     LEARNED,
     LEAST,
     MOST,
@@ -231,7 +232,7 @@ def test_a_smaller_density_of_steps_says_nothing_of_it() -> None:
 
 
 def test_a_clock_is_learned_from_what_tells_of_it() -> None:
-    """Positions leave it as it is; from the second time of arrival on it is learned."""
+    """Positions leave it as it is; after the first time of arrival it is learned."""
     accel, clock = Density.ACCEL, Density.CLOCK
     learned = Densities(*unknown_densities(6, (True, True)))
     (mean, cov), motion = start(), motion_parameters()
@@ -247,6 +248,18 @@ def test_a_clock_is_learned_from_what_tells_of_it() -> None:
     posterior = updated(clock, mean, cov, np.zeros(1))[:2]
     learn(learned, mean, cov, *posterior, 0.0)
     assert learned.phase[clock] == LEARNED
+
+
+def test_derivatives_of_what_is_held_for_a_while_begin_anew() -> None:
+    """Also where nothing else is learned, and where no time passes."""
+    for dt in (DT, 0.0):
+        learned = unknown(Density.ACCEL)
+        followed(Density.ACCEL, white(Density.ACCEL, 0.5, 50, 4), learned)
+        assert learned.cov[Density.ACCEL].any()
+        learned.phase[Density.ACCEL] = HELD
+        move(learned, np.zeros(6), dt, motion_parameters(), NO_BIAS)
+        assert not learned.mean[Density.ACCEL].any()
+        assert not learned.cov[Density.ACCEL].any()
 
 
 def test_what_is_held_stays() -> None:

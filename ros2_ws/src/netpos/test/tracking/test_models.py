@@ -68,7 +68,6 @@ def test_options_hold_what_the_parameters_say() -> None:
         initial_speed_sd=6.5,
         manoeuvre_speed_sd=7.5,
         integrity_risk=1e-5,
-        coast_after_s=0.7,
         robust=RobustOptions(ROBUST.index("student_t"), 5.5, 0.1, 33.0),
         models=1,
         first_slow_error=2**31 - 1,

@@ -194,7 +194,7 @@ def test_manoeuvre_is_accepted_at_once_where_allowed(world: Any, feed: Any) -> N
     # an outlier no manoeuvre explains is rejected all the same, and then nothing is opened
     sds = []
     for sd in (0.0, 1.0):
-        tracker = settled(world, feed, manoeuvre_speed_sd_mps=sd)
+        tracker = settled(world, feed, manoeuvre_speed_sd_mps=sd, clock_walk_density=5e-7)
         items = world.measure(2.0, standing())
         items[1] = replace(items[1], azimuth_rad=items[1].azimuth_rad + 2.0)
         (output,) = feed(tracker, items)

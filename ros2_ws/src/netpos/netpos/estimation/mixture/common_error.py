@@ -1,6 +1,6 @@
-"""An error that several measurements of an epoch share: where the reference of time differences
-hears the device late, all of them are early, and where the clock of the device steps, all times of
-arrival are off. None of them is wrong by itself."""
+"""An error that several measurements share: where the reference of time differences hears the
+device late, all of them are early; where the clock of the device steps, all times of arrival are
+off. None of them is wrong by itself."""
 
 from __future__ import annotations
 
@@ -26,14 +26,26 @@ _OVER_GAUSSIAN_LOG = math.log(OUTLIERS) + TAIL_LOG + 0.5 * (1.0 + math.log(2.0 *
 
 @kernel
 def add_common_errors(
-    k: int, end: int, prior: Mixture, rows: Array, options: FilterOptions, found: Candidates
+    k: int,
+    refused_by: int,
+    end: int,
+    prior: Mixture,
+    rows: Array,
+    options: FilterOptions,
+    found: Candidates,
 ) -> int:
-    """For each state that several ``rows`` (m, ROW_WIDTH) share, and for the clock, which a single
-    one shares with those that follow, if the candidate ``k`` refuses one of them: add the
-    component ``k`` of ``prior`` with an error there as large as the rows are off, if it accepts
-    more, and two of those that share it, if there are two; the number of candidates then. Such
-    errors are as frequent as outliers."""
-    mean, cov, accepted = prior.means[k], prior.covs[k], found.accepted[k]
+    """Add the component ``k`` of ``prior`` with an error of what measurements share; the number of
+    candidates then.
+
+    What they share is a state of COMMON that several ``rows`` (m, ROW_WIDTH) have, and a clock the
+    walk of which is learned: a single time of arrival shares it with those that follow. It is
+    tried where the candidate ``refused_by`` refuses one of these rows. The variance of the state
+    is larger by the square of what they are off by in the middle; such errors are as frequent as
+    outliers. The candidate is kept if it accepts more than ``refused_by``, and two of the rows
+    that share the state, if there are two.
+    """
+    mean, cov, accepted = prior.means[k], prior.covs[k], found.accepted[refused_by]
+    _, learns_clock = options.learns_density
     work = workspace(mean.size, rows.shape[0])
     predicted = predicted_rows(mean, cov, rows, options.height_m)
     groups = rows[:, GROUP].astype(np.int64)
@@ -42,8 +54,8 @@ def add_common_errors(
     for state in states.astype(np.int64):
         shares = rows[:, COMMON] == state if state != _CLOCK else predicted.H[:, _CLOCK] != 0.0
         count = shares.sum()
-        enough = count > 1 or state == _CLOCK
-        if state <= 0 or not enough or not (shares & is_refused).any():
+        may_err = learns_clock if state == _CLOCK else state > 0 and count > 1
+        if not may_err or not (shares & is_refused).any():
             continue
         off = np.median(predicted.innovation[shares])
         if abs(off) > _LARGEST * math.sqrt(rows[:, VARIANCE][shares].min()):

@@ -178,7 +178,7 @@ def _add_candidates(
         end = add_turns(k, end, prior, within_s, rows, options, found, 0.0)
     elif found.accepted[k].sum() < found.accepted.shape[1]:
         end = add_explanations(k, k, end, prior, epoch, options, found, work)
-        end = add_common_errors(k, end, prior, rows, options, found)
+        end = add_common_errors(k, k, end, prior, rows, options, found)
     return int(end)
 
 

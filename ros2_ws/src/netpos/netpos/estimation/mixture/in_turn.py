@@ -18,6 +18,7 @@ from netpos.estimation.mixture.candidates import (
     first_of,
     mixture_of,
 )
+from netpos.estimation.mixture.common_error import add_common_errors
 from netpos.estimation.mixture.gaussians import Mixture, together
 from netpos.estimation.mixture.reduction import PART_MERGE_COST, reduced
 from netpos.estimation.mixture.splits.choice import (
@@ -34,7 +35,7 @@ from netpos.estimation.update.fusion import predicted_in, workspace
 from netpos.estimation.update.predicted import predict_rows
 from netpos.messages.values import Array
 
-_EXPLANATIONS = TURNS_MAX + 1  # of what a candidate refuses: turns, and an error
+_EXPLANATIONS = TURNS_MAX + 2  # of what a candidate refuses: turns, an error, a step of the clock
 
 
 @kernel
@@ -61,6 +62,7 @@ def _add_candidates(
         predicted = predicted_in(work, mean.size, rows.shape[0])
         predict_rows(mean, cov, rows, options.height_m, predicted)
         end = add_explanations(k, first, end, prior, epoch, options, found, work)
+        end = add_common_errors(k, first, end, prior, rows, options, found)
     return int(end)
 
 

@@ -200,8 +200,8 @@ def update_prior(
     alpha0: float,
     beta0: float,
 ) -> tuple[float, float]:
-    """Adaptive prior of one RSU: a beta distribution of the share of blocked paths, alpha / (alpha
-    + beta), after a measurement blocked with posterior ``probability``.
+    """Adaptive prior of one RSU: a beta distribution of the share of its measurements that are
+    blocked, or outliers, alpha / (alpha + beta), after one that is so with ``probability``.
 
     ``forgetting`` in (0, 1]: the memory is 1 / (1 - forgetting) measurements, and what is
     forgotten goes back to (``alpha0``, ``beta0``) (stabilised forgetting, Kulhavy and Zarrop

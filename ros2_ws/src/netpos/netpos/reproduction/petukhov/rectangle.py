@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from netpos.estimation.densities import START, Density
+from netpos.estimation.densities import Density, held
 from netpos.estimation.fixes.phase_fix import TWO_PI, init_hypothesis
 from netpos.estimation.measurement import GROUP, VALUE, predict_row
 from netpos.estimation.motion import NO_BIAS
@@ -140,7 +140,7 @@ class Setup:
         for k, stamp in enumerate(self.stamps_ns.tolist()):
             epoch_rows = rows[k] if self.heard[k] else _alone(rows[k, 2:])
             velocity = reported(stamp, epoch_rows[-2:])
-            free = self.config.accel_density_mps2_sqrthz or START[Density.ACCEL]
+            free = held(self.config.accel_density_mps2_sqrthz, Density.ACCEL)
             density = process_noise.density(stamp, free, [velocity])
             if estimate is None:
                 start.hear(velocity)

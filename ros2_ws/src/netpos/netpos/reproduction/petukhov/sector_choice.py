@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from netpos.estimation.densities import START, Density
+from netpos.estimation.densities import Density, held
 from netpos.estimation.measurement import GATE_VARIANCE, VALUE, VARIANCE
 from netpos.estimation.mixture.sectors import turns_of
 from netpos.estimation.motion import NO_BIAS
@@ -153,7 +153,7 @@ class Setup:
         process_noise = AdaptiveProcessNoise(self.config)
         for k in range(1, len(rows)):
             stamp_ns = NS + round(self.times_s[k] * NS)
-            free = self.config.accel_density_mps2_sqrthz or START[Density.ACCEL]
+            free = held(self.config.accel_density_mps2_sqrthz, Density.ACCEL)
             velocities = [reported(stamp_ns, rows[k, 2:])]
             estimate.set_process_noise(process_noise.density(stamp_ns, free, velocities))
             estimate.step(stamp_ns, INTERVAL_S, 0, rows[k], NO_BIAS)

@@ -14,6 +14,7 @@ from netpos.estimation.densities import (
     LEARNED,
     Densities,
     Density,
+    clock_has_stepped,
     density_of,
     learn,
     move,
@@ -131,8 +132,9 @@ class Estimate:
     def set_config(self, config: TrackerConfig) -> None:
         """Go on with other live parameters (``live_parameters``)."""
         learned, self._options = self._options.learns_density, options_of(config)
-        if learned != self._options.learns_density:
-            self._learned = self._unknown()
+        unknown, changed = self._unknown(), np.not_equal(learned, self._options.learns_density)
+        for known, fresh in zip(self._learned, unknown, strict=True):
+            known[changed] = fresh[changed]
         self._dynamics.motions[:, Parameter.ACCEL] = motions_of(config)[:, Parameter.ACCEL]
         self.declared_density = float(self.motion[Parameter.ACCEL])
         self._modes = () if self._components is None else None
@@ -292,7 +294,11 @@ class Estimate:
             memory,
         )
         self.stamp_ns = stamp_ns
-        learn(self._learned, *self.prior, self.mean, self.cov, outcome.turned)
+        prior_mean, prior_cov = self.prior
+        learn(self._learned, prior_mean, prior_cov, self.mean, self.cov, outcome.turned)
+        stepped = self._options.learns_density[Density.CLOCK] and clock_has_stepped(
+            prior_mean, prior_cov, self.mean
+        )
         self._open_s = outcome.open_s
         several = outcome.components.log_weights.size > 1
         self._components = outcome.components if several else None
@@ -304,6 +310,7 @@ class Estimate:
             memory.innovations[:m].copy(),
             outcome.undetected_m,
             sound=not math.isnan(outcome.undetected_m),
+            breaks=int(stepped),
         )
 
     def copy(self) -> Estimate:

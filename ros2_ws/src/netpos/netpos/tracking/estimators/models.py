@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from netpos.estimation.chi_square import chi_square_bound
-from netpos.estimation.densities import START, Density
+from netpos.estimation.densities import Density, held
 from netpos.estimation.engine import GATE_SIZE, FilterOptions
 from netpos.estimation.forms.table import form_of, number_of
 from netpos.estimation.mixture.epoch import Dynamics
@@ -39,7 +39,6 @@ def options_of(config: TrackerConfig) -> FilterOptions:
         lost_after=int(config.max_rejected_epochs),
         initial_speed_sd=float(config.initial_speed_sd_mps),
         manoeuvre_speed_sd=config.manoeuvre_sd_mps,
-        coast_after_s=float(config.coast_after_s),
         integrity_risk=float(config.integrity_risk),
         robust=robust_options_of(config),
         models=max(len(config.motion_models), 1),
@@ -77,7 +76,7 @@ def dynamics_of(config: TrackerConfig, bias: Array) -> Dynamics:
 
 def _motion_of(config: TrackerConfig, model: MotionModel, extras: int, idle: float) -> Array:
     c = SPEED_OF_LIGHT_MPS
-    accel = config.accel_density_mps2_sqrthz or START[Density.ACCEL]
+    accel = held(config.accel_density_mps2_sqrthz, Density.ACCEL)
     if model.accel_density is not None:
         accel = getattr(config, model.accel_density)
     elif config.process_noise == "white_acceleration":
@@ -89,7 +88,7 @@ def _motion_of(config: TrackerConfig, model: MotionModel, extras: int, idle: flo
         accel=accel,
         velocity_step=config.velocity_step_sd_mps,
         offset_density=c * config.clock_white_density,
-        drift_density=c * config.clock_walk_density or START[Density.CLOCK],
+        drift_density=held(c * config.clock_walk_density, Density.CLOCK),
         drift_step=c * config.drift_step_sd,
         idle=idle,
         gyro=config.gyro_noise_density,

@@ -218,9 +218,9 @@ class PlanarEstimator(Estimator):
         if self._secondary is not None:
             self._own = self._secondary.after(self._own, stamp_ns, estimate, rows, self.bias)
         self._keep_in_front(epoch_rows, result.accepted)
-        # a smoother does not reach across: what it keeps is one Gaussian
-        breaks = int(bool(estimate.modes) != was_ambiguous)
-        return result._replace(breaks=breaks)
+        # a smoother does not reach across: it keeps one Gaussian, and its clock does not step
+        breaks = result.breaks > 0 or bool(estimate.modes) != was_ambiguous
+        return result._replace(breaks=int(breaks))
 
     def _keep_in_front(self, epoch_rows: EpochRows, accepted: Sequence[float]) -> None:
         """Take away what is behind an array that hears the device."""

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from scipy.linalg import block_diag
 
-from netpos.estimation.densities import START, Density
+from netpos.estimation.densities import Density, held
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.estimation.spatial.error_state import Constraints, Sensors, SlowErrors
 from netpos.estimation.state import (
@@ -52,7 +52,7 @@ def sensors_of(config: TrackerConfig) -> Sensors:
         ),
         slow=SlowErrors(
             SPEED_OF_LIGHT_MPS * config.clock_white_density,
-            SPEED_OF_LIGHT_MPS * config.clock_walk_density or START[Density.CLOCK],
+            held(SPEED_OF_LIGHT_MPS * config.clock_walk_density, Density.CLOCK),
             np.zeros((2, 0)),
         ),
     )

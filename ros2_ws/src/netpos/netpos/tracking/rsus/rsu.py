@@ -301,12 +301,14 @@ class BiasStates:
         velocity = mean[VELOCITY].tolist()
         still = rests(velocity, cov.diagonal()[VELOCITY].tolist())
         learned.move(stamp_ns, mean[CHANGE], still)
+        whose = rows[:, _WHOSE].astype(np.int64).tolist()
         of_biases: dict[tuple[int, ...], Name] = {b: name for name, b in self._biases.items()}
         named = [
             (i, of_biases[own, reference])
-            for i, whose in enumerate(rows[:, _WHOSE].astype(np.int64).tolist())
-            for own, reference, common, group in [whose]
-            if (own, reference) in of_biases and accepted[group] and self._is_usual(common, mean)
+            for i, (own, reference, common, group) in enumerate(whose)
+            if (own, reference) in of_biases
+            and accepted[group]
+            and not self._is_outlier(common, mean)
         ]
         if named:
             taken, names = [i for i, _ in named], [name for _, name in named]
@@ -317,11 +319,13 @@ class BiasStates:
         concluded = learned.conclude(posterior)
         return concluded, self._take_learned(learned, concluded, speed)
 
-    def _is_usual(self, common: int, mean: Array) -> bool:
-        """Whether the state ``common`` of ``mean`` (n,), which several values share (-1: none), is
-        as large as it usually is."""
+    def _is_outlier(self, common: int, mean: Array) -> bool:
+        """Whether the noise ``common`` (-1: none) that values of one epoch share is an outlier in
+        ``mean`` (n,). A bias that lasts is none."""
         k = common - self.first
-        return k < 0 or abs(mean[common]) < _OUTLIER_SD * self.sd[k]
+        if k < 0 or self.tau_s[k] > _RENEWED_S:
+            return False
+        return bool(abs(mean[common]) > _OUTLIER_SD * self.sd[k])
 
     def _take_learned(
         self, learned: LearnedErrors, concluded: Collection[Name], speed_mps: float

@@ -20,7 +20,7 @@ _BLOCKED_STRENGTH = 10.0  # measurements the configured share counts for
 _OUTLIER_STRENGTH, _OUTLIER_MEMORY = 100.0, 300.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Share:
     """Beta distribution (alpha, beta) of a share of the measurements of each RSU: ``expected``
     where nothing was heard yet, which counts for ``strength`` measurements; ``memory``: of how
@@ -31,8 +31,13 @@ class Share:
     memory: float
     _of: dict[str, tuple[float, float]] = field(default_factory=dict)
 
-    def of(self, rsu_id: str) -> float:
-        """Its mean."""
+    @property
+    def is_learned(self) -> bool:
+        """Whether one is expected."""
+        return self.expected > 0.0
+
+    def mean(self, rsu_id: str) -> float:
+        """Its mean, of an RSU."""
         alpha, beta = self._of.get(rsu_id, self._prior)
         return alpha / (alpha + beta)
 
@@ -74,7 +79,7 @@ class Shares:
 
     @property
     def _are_learned(self) -> bool:
-        return self.blocked.expected > 0.0 or self.outliers.expected > 0.0
+        return self.blocked.is_learned or self.outliers.is_learned
 
     def expect(self, epoch_rows: EpochRows) -> None:
         """Write each RSU's shares into its rows, for the filter to start from."""
@@ -82,10 +87,10 @@ class Shares:
             return
         for i, _, rsu_id in _measured(epoch_rows):
             row = epoch_rows.rows[i]
-            if self.blocked.expected > 0.0 and int(row[KIND]) in _LATE:
-                row[BLOCKED] = self.blocked.of(rsu_id)
-            if self.outliers.expected > 0.0:
-                row[OUTLIER_SHARE] = self.outliers.of(rsu_id)
+            if self.blocked.is_learned and int(row[KIND]) in _LATE:
+                row[BLOCKED] = self.blocked.mean(rsu_id)
+            if self.outliers.is_learned:
+                row[OUTLIER_SHARE] = self.outliers.mean(rsu_id)
 
     def learn(self, epoch_rows: EpochRows, accepted: Sequence[float]) -> None:
         """Take over what the filter made of the rows, and which groups it ``accepted``."""
@@ -94,9 +99,9 @@ class Shares:
         heard = None
         for i, group, rsu_id in _measured(epoch_rows):
             row = epoch_rows.rows[i]
-            if self.blocked.expected > 0.0 and int(row[KIND]) in _LATE:
+            if self.blocked.is_learned and int(row[KIND]) in _LATE:
                 self.blocked.hear(rsu_id, float(row[BLOCKED]))
-            if self.outliers.expected > 0.0 and group != heard:
+            if self.outliers.is_learned and group != heard:
                 self.outliers.hear(rsu_id, 1.0 - accepted[group])
             heard = group
 

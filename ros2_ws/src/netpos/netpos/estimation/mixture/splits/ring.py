@@ -190,10 +190,8 @@ def begins(
     cov: Array,
     options: FilterOptions,
 ) -> bool:
-    """Whether the track has been silent for long, and the measurement in the rows ``start`` to
-    ``stop`` of ``epoch`` divides it."""
-    if epoch.dt_s <= options.coast_after_s:
-        return False
+    """Whether the measurement in the rows ``start`` to ``stop`` of ``epoch`` divides the track:
+    after a silence, or a turn that opened a direction that ranges hardly measure."""
     return bool(divides(epoch.rows[start:stop], mean, cov, options))
 
 
