@@ -13,10 +13,11 @@ LIVE = (
     "max_rsu_rate_hz",
     "accept_initialpose",
     "max_gap_s",
+    "coast_after_s",
     "isolate_rsus",
 )
 """Limits and rules that no estimate holds."""
-LIVE_OF_ONE_MODEL = ("gate_probability", "accel_density_mps2_sqrthz", "coast_after_s")
+LIVE_OF_ONE_MODEL = ("gate_probability", "accel_density_mps2_sqrthz")
 """Parameters of a compiled planar filter with one motion model: its next epoch takes them."""
 
 
