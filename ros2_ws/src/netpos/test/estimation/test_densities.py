@@ -54,7 +54,7 @@ def unknown(which: Density, n: int = 6) -> Densities:
     """Of which only one is learned, and from the first measurement on."""
     learned = unknown_densities(n, (which == Density.ACCEL, which == Density.CLOCK))
     learned.phase[which] = LEARNED
-    return Densities(*learned)
+    return learned
 
 
 def noise(density: float) -> Array:
@@ -234,7 +234,7 @@ def test_a_smaller_density_of_steps_says_nothing_of_it() -> None:
 def test_a_clock_is_learned_from_what_tells_of_it() -> None:
     """Positions leave it as it is; after the first time of arrival it is learned."""
     accel, clock = Density.ACCEL, Density.CLOCK
-    learned = Densities(*unknown_densities(6, (True, True)))
+    learned = unknown_densities(6, (True, True))
     (mean, cov), motion = start(), motion_parameters()
     for seen in white(accel, 0.5, 50, 1):
         write_densities(learned, motion)
@@ -264,7 +264,7 @@ def test_derivatives_of_what_is_held_for_a_while_begin_anew() -> None:
 
 def test_what_is_held_stays() -> None:
     """Neither is written nor learned."""
-    learned = Densities(*unknown_densities(6, (False, False)))
+    learned = unknown_densities(6, (False, False))
     motion = motion_parameters(accel=0.7, drift_density=3.0)
     before = motion.copy()
     write_densities(learned, motion)

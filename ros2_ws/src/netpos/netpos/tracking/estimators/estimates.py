@@ -8,20 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netpos.estimation import engine
-from netpos.estimation.densities import (
-    HELD,
-    LEARNED,
-    Densities,
-    Density,
-    clock_has_stepped,
-    density_of,
-    learn,
-    move,
-    resized,
-    unknown_densities,
-    write_densities,
-)
+from netpos.estimation import densities, engine
+from netpos.estimation.densities import Densities, Density
 from netpos.estimation.engine import EpochInput
 from netpos.estimation.forms.table import form_of
 from netpos.estimation.level.protection import mixture_radius
@@ -108,7 +96,9 @@ class Estimate:
         self._make_room(4)
 
     def _unknown(self) -> Densities:
-        return Densities(*unknown_densities(self.mean.size, self._options.learns_density))
+        learns = self._options.learns_density
+        unknown: Densities = densities.unknown_densities(self.mean.size, learns)
+        return unknown
 
     def set_imu_increment(self, yaw_rad: float, speed_mps: float, gyro_density: float) -> None:
         """Set what the IMU integrated since ``stamp_ns``, and how good its yaw rate was."""
@@ -120,8 +110,9 @@ class Estimate:
     def accel_density(self) -> float:
         """Density of the white acceleration [m/s^2/sqrt(Hz)] from ``stamp_ns`` on where none is
         set: declared, or learned up to there."""
-        is_learned = self._options.learns_density[Density.ACCEL]
-        return density_of(self._learned, Density.ACCEL) if is_learned else self.declared_density
+        if self._options.learns_density[Density.ACCEL]:
+            return float(densities.density_of(self._learned, Density.ACCEL))
+        return self.declared_density
 
     def set_process_noise(self, accel_density: float) -> None:
         """Set the density of the white acceleration [m/s^2/sqrt(Hz)] from ``stamp_ns`` up to the
@@ -144,11 +135,12 @@ class Estimate:
         state."""
         is_set, self._accel_is_set = self._accel_is_set, False
         learns = self._options.learns_density[Density.ACCEL] and not is_set
-        self._learned.phase[Density.ACCEL] = LEARNED if learns else HELD
+        phase = densities.LEARNED if learns else densities.HELD
+        self._learned.phase[Density.ACCEL] = phase
         if not is_set:
             self.motion[Parameter.ACCEL] = self.declared_density
-        write_densities(self._learned, self.motion)
-        move(self._learned, self.mean, dt_s, self.motion, bias)
+        densities.write_densities(self._learned, self.motion)
+        densities.move(self._learned, self.mean, dt_s, self.motion, bias)
 
     def _with(self, bias: Array) -> Dynamics:
         return Dynamics(self._dynamics.motions, self._dynamics.sojourn_s, bias)
@@ -233,7 +225,7 @@ class Estimate:
         else:
             mean, cov = augmented(self.mean, self.cov, sd)
             self.mean, self._cov_or_sqrt = mean, engine.to_cov_or_sqrt(cov, self._options)
-        self._learned = resized(self._learned, self.mean.size)
+        self._learned = densities.resized(self._learned, self.mean.size)
         self._make_room(self._rows)
 
     def change_prior(self, index: int, before: float, after: float) -> None:
@@ -295,10 +287,9 @@ class Estimate:
         )
         self.stamp_ns = stamp_ns
         prior_mean, prior_cov = self.prior
-        learn(self._learned, prior_mean, prior_cov, self.mean, self.cov, outcome.turned)
-        stepped = self._options.learns_density[Density.CLOCK] and clock_has_stepped(
-            prior_mean, prior_cov, self.mean
-        )
+        densities.learn(self._learned, prior_mean, prior_cov, self.mean, self.cov, outcome.turned)
+        learns_clock = self._options.learns_density[Density.CLOCK]
+        stepped = densities.clock_has_stepped(prior_mean, prior_cov, self.mean)
         self._open_s = outcome.open_s
         several = outcome.components.log_weights.size > 1
         self._components = outcome.components if several else None
@@ -310,7 +301,7 @@ class Estimate:
             memory.innovations[:m].copy(),
             outcome.undetected_m,
             sound=not math.isnan(outcome.undetected_m),
-            breaks=int(stepped),
+            breaks=int(learns_clock and stepped),
         )
 
     def copy(self) -> Estimate:
@@ -320,7 +311,7 @@ class Estimate:
         twin.mean, twin._cov_or_sqrt = self.mean.copy(), self._cov_or_sqrt.copy()
         twin._dynamics = self._dynamics._replace(motions=self._dynamics.motions.copy())
         twin.motion = twin._dynamics.motions[0]
-        twin._learned = resized(self._learned, self.mean.size)
+        twin._learned = densities.resized(self._learned, self.mean.size)
         return twin
 
 
