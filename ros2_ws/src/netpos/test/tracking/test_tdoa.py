@@ -51,31 +51,24 @@ def distance(name: str, place: Array = PLACE) -> float:
     return float(np.linalg.norm(place - SITES[name]))
 
 
-def tdoa(stamp_ns: int, name: str, reference: str, value_m: float, sd_m: float = SD_M) -> Any:
+def heard(
+    stamp_ns: int, name: str, quantity: Field, value_m: float, sd_m: float, **more: str
+) -> Any:
+    """A time of arrival or a time difference of a device ``v``, told in metres."""
+    what = str(quantity.name).lower()
+    values = {f"{what}_s": value_m / C, f"{what}_var": (sd_m / C) ** 2}
     return RsuMeasurement(
-        stamp_ns=stamp_ns,
-        rsu_id=name,
-        reference_rsu_id=reference,
-        vue_id="v",
-        fields=Field.TDOA,
-        tdoa_s=value_m / C,
-        tdoa_var=(sd_m / C) ** 2,
+        stamp_ns=stamp_ns, rsu_id=name, vue_id="v", fields=quantity, **values, **more
     )
+
+
+def tdoa(stamp_ns: int, name: str, reference: str, value_m: float, sd_m: float = SD_M) -> Any:
+    return heard(stamp_ns, name, Field.TDOA, value_m, sd_m, reference_rsu_id=reference)
 
 
 def times(stamp_ns: int, arrival: dict[str, float], sd_m: float = SD_M / math.sqrt(2.0)) -> Any:
     """Times of arrival, ``arrival`` in metres."""
-    return [
-        RsuMeasurement(
-            stamp_ns=stamp_ns,
-            rsu_id=name,
-            vue_id="v",
-            fields=Field.TOA,
-            toa_s=value_m / C,
-            toa_var=(sd_m / C) ** 2,
-        )
-        for name, value_m in arrival.items()
-    ]
+    return [heard(stamp_ns, name, Field.TOA, m, sd_m) for name, m in arrival.items()]
 
 
 def differences(stamp_ns: int, arrival: dict[str, float], sd_m: float = SD_M) -> Any:
