@@ -54,7 +54,7 @@ Json = dict[str, Any]
 
 def cases() -> Iterator[Case]:
     """One error at a time around the middle, for a device that moves and one that stands; times
-    and time differences that are late; then arrays; then a car."""
+    and time differences that are late, with clocks that walk, too; then arrays; then a car."""
     for moving in (True, False):
         middle = Case(moving=moving)
         yield middle
@@ -74,6 +74,9 @@ def cases() -> Iterator[Case]:
             yield replace(middle, blocked=0.1)
             yield replace(middle, blocked=0.2)
             yield replace(middle, blocked=0.2, rsus=8)
+    for walk in (1e-8, 1e-7, 5e-7):
+        for moving in (True, False):
+            yield Case(moving=moving, measures=Measures.TIMES, blocked=0.2, clock_walk=walk)
     yield Case(variance=4.0, bias=5.0, rsus=8)
     yield Case(variance=0.25, bias=5.0, rsus=4)
     yield Case(variance=4.0, bias=0.0, rsus=3, moving=False)
@@ -168,6 +171,8 @@ def described(case: Case) -> str:
         parts.append(f"bias {case.bias:g} sd for {lasts}")
     if case.blocked:
         parts.append(f"{case.blocked:.0%} late")
+    if case.clock_walk:
+        parts.append(f"clock walks by {case.clock_walk:g}")
     return ", ".join(parts)
 
 

@@ -46,7 +46,8 @@ class Measures(StrEnum):
 class Case:
     """True errors: variance over the one declared, bias [sd of the noise declared], correlation
     time [s] and length [m], share of blocked paths; RSUs; whether the device moves, and whether it
-    stops in between; what the RSUs measure, or whether they are close together on a car."""
+    stops in between; what the RSUs measure, or whether they are close together on a car; how far
+    the drift of the device's clock walks [(s/s)/sqrt(s)]."""
 
     variance: float = 1.0
     bias: float = 1.0
@@ -58,6 +59,7 @@ class Case:
     stops: bool = False
     measures: Measures = Measures.RANGES
     on_a_car: bool = False
+    clock_walk: float = 0.0
 
     @property
     def arrays(self) -> bool:
@@ -146,6 +148,10 @@ def measured(case: Case, seed: int) -> tuple[Array, Array]:
     seen = values + bias + rng.normal(0.0, noise_sd, values.shape) + late
     if case.measures is Measures.TIMES:
         seen += (rng.normal(0.0, CLOCK_M) + rng.normal(0.0, DRIFT_MPS) * times)[:, None, None]
+        if case.clock_walk > 0.0:
+            density = SPEED_OF_LIGHT_MPS * case.clock_walk / math.sqrt(case.rate_hz)
+            drift = density * rng.normal(size=len(times)).cumsum()
+            seen += (drift.cumsum() / case.rate_hz)[:, None, None]
     return places, np.clip(seen, -0.99, 0.99) if case.arrays else seen
 
 

@@ -118,7 +118,8 @@ def _measurements(world: Any, seed: int, epochs: int) -> list[list[RsuMeasuremen
 
 
 def test_learning_beats_the_configured_share(world: Any, feed: Any) -> None:
-    """A memory of one measurement is all but the configured share."""
+    """A memory of one measurement is all but the configured share. The clock may be anything: one
+    that is known shows late times by itself."""
     square = {1.0: 0.0, 100.0: 0.0}
     for seed in range(8):
         epochs = _measurements(world, seed, 300)
