@@ -163,8 +163,10 @@ class Graph:
         for process in self.processes:
             if process.running:
                 process.kill()
-        self._context.try_shutdown()
+        self._executor.shutdown(10.0)
         self._thread.join(10.0)
+        self.node.destroy_node()  # or the next graph of this domain would see it
+        self._context.try_shutdown()
 
     def run(
         self,

@@ -17,11 +17,11 @@ DOMAINS = range(1, 102)
 def claim_domain() -> Iterator[int]:
     """Yield a domain id that nobody else who asks here holds, in this or any other process.
 
-    Raises ``RuntimeError`` where all are in use.
+    It is the one not in use for longest: a node that was killed stays in the graph of its domain
+    for seconds. Raises ``RuntimeError`` where all are in use.
     """
-    for domain in random.sample(DOMAINS, len(DOMAINS)):
-        path = Path(tempfile.gettempdir()) / f"netpos-domain-{domain}.lock"
-        with path.open("w") as file:
+    for domain in sorted(random.sample(DOMAINS, len(DOMAINS)), key=_last_used_s):
+        with _lock(domain).open("w") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -29,3 +29,15 @@ def claim_domain() -> Iterator[int]:
             yield domain
             return
     raise RuntimeError(f"all ROS domains {DOMAINS.start} to {DOMAINS.stop - 1} are in use")
+
+
+def _lock(domain: int) -> Path:
+    return Path(tempfile.gettempdir()) / f"netpos-domain-{domain}.lock"
+
+
+def _last_used_s(domain: int) -> float:
+    """When it was claimed last, by the clock of the file system; 0 if never."""
+    try:
+        return _lock(domain).stat().st_mtime
+    except FileNotFoundError:
+        return 0.0
