@@ -11,6 +11,9 @@ or 2 sd for a minute, which they do not. The clock drifts by 10 ns/s (sd), and i
 paths is longer by 4 m in the mean; nobody says so. The tracker is told how freely the device
 moves, and nothing of the clock.
 
+All RSUs of a network measure at once. Then it is run again, each of them as often and one after
+the other, but for time differences, which are those of one beacon.
+
 Errors are those after 15 s; RMSE is the geometric mean over the networks. *Above the level* counts
 errors of all epochs that say TRACKING.
 """
@@ -53,12 +56,13 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One network: what it measures and whether paths are late; of its estimates when they were
-    (n,) [s], errors (n,) [m] and NEES (n,), which say TRACKING, and which of those are above the
-    level."""
+    """One network: what it measures, whether paths are late and its RSUs measure one by one; of
+    its estimates when they were (n,) [s], errors (n,) [m] and NEES (n,), which say TRACKING, and
+    which of those are above the level."""
 
     fields: Field
     late: float
+    one_by_one: bool
     times: Array
     errors: Array
     nees: Array
@@ -84,12 +88,13 @@ def way(moves: str, times: Array, rng: np.random.Generator) -> Array:
 @dataclass(frozen=True, slots=True)
 class Network:
     """Network ``k``: what it measures, where its RSUs are (count, 2) [m], how often they measure,
-    the share of late paths, the sd of the biases over that of the noise, how the device moves, the
-    walk of its clock, and the generators that drew all that."""
+    one by one or at once, the share of late paths, the sd of the biases over that of the noise,
+    how the device moves, the walk of its clock, and the generators that drew all that."""
 
     fields: Field
     sites: Array
     rate_hz: float
+    one_by_one: bool
     late: float
     bias_sd: float
     moves: str
@@ -98,7 +103,7 @@ class Network:
     clock_rng: np.random.Generator
 
     @classmethod
-    def drawn(cls, k: int) -> Network:
+    def drawn(cls, k: int, one_by_one: bool) -> Network:
         """With the generator at the start of its run."""
         rng, moves = np.random.default_rng(k), list(MOVES)[k // len(MEASURED) % len(MOVES)]
         count, (size, _) = int(rng.integers(3, 9)), MOVES[moves]
@@ -109,6 +114,7 @@ class Network:
             fields=MEASURED[k % len(MEASURED)],
             sites=np.column_stack([far * np.cos(angle), far * np.sin(angle)]),
             rate_hz=float(rng.choice([2.0, 5.0, 10.0])),
+            one_by_one=one_by_one,
             late=float(rng.choice([0.0, 0.0, LATE])),
             bias_sd=float(rng.choice([0.0, 1.0, 2.0])),
             moves=moves,
@@ -117,13 +123,17 @@ class Network:
             clock_rng=clock_rng,
         )
 
+    @property
+    def step_s(self) -> float:
+        """Time from epoch to epoch."""
+        return 1.0 / (self.rate_hz * (len(self.sites) if self.one_by_one else 1))
+
     def seen(self, places: Array) -> Iterator[tuple[Array, Array]]:
         """Arrivals [m] and azimuths [rad], (count,) each, of a device at ``places`` (n, 2)."""
         rng, count = self.rng, len(self.sites)
         bias = rng.normal(0.0, self.bias_sd, (count, 2))
         clock_s, drift = rng.uniform(-1e-7, 1e-7), rng.normal(0.0, DRIFT_SD)
-        step_s = 1.0 / self.rate_hz
-        keep = math.exp(-1.0 / (self.rate_hz * BIAS_TIME_S))
+        keep = math.exp(-self.step_s / BIAS_TIME_S)
         step_sd = self.bias_sd * math.sqrt(1.0 - keep**2)
         for place in places:
             bias = keep * bias + rng.normal(0.0, step_sd, (count, 2))
@@ -137,14 +147,15 @@ class Network:
             if self.fields & Field.TOA:
                 arrivals += C_MPS * clock_s
             yield arrivals, azimuths
-            clock_s += drift * step_s
-            drift += self.walk * math.sqrt(step_s) * self.clock_rng.normal()
+            clock_s += drift * self.step_s
+            drift += self.walk * math.sqrt(self.step_s) * self.clock_rng.normal()
 
     def messages(self, epoch: int, arrivals: Array, azimuths: Array) -> list[RsuMeasurement]:
         """What the RSUs send."""
-        differs = self.fields is Field.TDOA
+        differs, count = self.fields is Field.TDOA, len(self.sites)
+        heard = [epoch % count] if self.one_by_one else range(differs, count)
         found = []
-        for i in range(differs, len(self.sites)):
+        for i in heard:
             values: Json = {}
             if self.fields & Field.RANGE:
                 values |= {"range_m": float(arrivals[i]), "range_var": RANGE_SD_M**2}
@@ -168,11 +179,11 @@ class Network:
                 }
             found.append(
                 RsuMeasurement(
-                    stamp_ns=round(1e9 * (START_S + epoch / self.rate_hz)),
+                    stamp_ns=round(1e9 * (START_S + epoch * self.step_s)),
                     rsu_id=f"r{i}",
                     vue_id="vue_1",
                     sequence=epoch,
-                    expected=len(self.sites) - differs,
+                    expected=len(heard),
                     fields=self.fields,
                     **values,
                 )
@@ -180,10 +191,10 @@ class Network:
         return found
 
 
-def run(k: int) -> Run:
+def run(k: int, one_by_one: bool) -> Run:
     """Track the device of network ``k``."""
-    network = Network.drawn(k)
-    moves, times = network.moves, np.arange(0.0, DURATION_S, 1.0 / network.rate_hz)
+    network = Network.drawn(k, one_by_one)
+    moves, times = network.moves, np.arange(0.0, DURATION_S, network.step_s)
     tracker = Tracker(
         TrackerConfig(
             learn_errors=True,
@@ -210,7 +221,28 @@ def run(k: int) -> Run:
     levels = np.array([status.protection_level_m for *_, status in estimates])
     nees = np.einsum("ni,nij,nj->n", off, np.linalg.inv(covs), off)
     above = tracking & (errors > levels)
-    return Run(network.fields, network.late, stamps - START_S, errors, nees, tracking, above)
+    return Run(
+        network.fields,
+        network.late,
+        one_by_one,
+        stamps - START_S,
+        errors,
+        nees,
+        tracking,
+        above,
+    )
+
+
+def rows_of(runs: Sequence[Run]) -> Iterator[Json]:
+    """A row for each kind of measurement, direct or late, and one for all."""
+    when = ", one by one" if runs[0].one_by_one else ""
+    for fields in MEASURED:
+        for late in (0.0, LATE):
+            some = [r for r in runs if r.fields == fields and r.late == late and r.settles]
+            if some:
+                name = " and ".join(str(f.name).lower() for f in Field if f & fields)
+                yield row_of(f"{name}, {late:.0%} late{when}", some)
+    yield row_of(f"all{when}", [r for r in runs if r.settles])
 
 
 def row_of(name: str, runs: Sequence[Run]) -> Json:
@@ -236,16 +268,13 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
+    every = range(args.networks)
+    apart = [k for k in every if MEASURED[k % len(MEASURED)] is not Field.TDOA]
     with ProcessPoolExecutor(args.workers) as pool:
-        runs = list(pool.map(run, range(args.networks)))
-    rows = []
-    for fields in MEASURED:
-        for late in (0.0, LATE):
-            some = [r for r in runs if r.fields == fields and r.late == late and r.settles]
-            if some:
-                name = " and ".join(str(f.name).lower() for f in Field if f & fields)
-                rows.append(row_of(f"{name}, {late:.0%} late", some))
-    rows.append(row_of("all", [r for r in runs if r.settles]))
+        at_once = list(pool.map(run, every, [False] * len(every)))
+        one_by_one = list(pool.map(run, apart, [True] * len(apart)))
+    runs = at_once + one_by_one
+    rows = [*rows_of(at_once), *rows_of(one_by_one)]
     print("| measured | networks | RMSE [m] | largest [m] | NEES | TRACKING | above the level |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for row in rows:
@@ -253,7 +282,7 @@ def main() -> None:
             f"| {row['name']} | {row['networks']} | {row['rmse_m']:.3f} | {row['max_m']:.1f} |"
             f" {row['nees_mean']:.2f} | {row['tracking']} of {row['estimates']} | {row['above']} |"
         )
-    print(f"{sum(not r.settles for r in runs)} networks without a first fix")
+    print(f"{sum(not r.settles for r in runs)} runs without a first fix")
     if args.json is not None:
         document = {"networks": args.networks, "rows": rows}
         args.json.write_text(json.dumps(document, indent=1) + "\n")

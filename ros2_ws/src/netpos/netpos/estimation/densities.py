@@ -40,23 +40,23 @@ class Density(IntEnum):
     CLOCK = 1  # [m/s/sqrt(s)]
 
 
+# Of each density, in the order of ``Density``.
 PARAMETERS = (int(Parameter.ACCEL), int(Parameter.DRIFT_DENSITY))
-"""Where each is in ``motion``."""
+"""Its index in ``motion``."""
 START = (0.5, 5e-7 * SPEED_OF_LIGHT_MPS)
-"""Each before anything is learned."""
+"""What it is before anything is learned."""
 LEAST = (0.1, 1e-10 * SPEED_OF_LIGHT_MPS)
+"""A change of 0.3 m/s in 10 s, of 2 cm of the clock in a second."""
 MOST = (5.0, 5e-6 * SPEED_OF_LIGHT_MPS)
-"""Acceleration: 0.3 m/s after 10 s; the speed of a runner after a second. Clock: an offset of 2 cm
-and of 0.9 km after a second."""
+"""The speed of a runner in a second, 0.9 km of the clock in a second."""
 SD = (1.0, 2.0)
-"""Of theta before anything is learned: a factor of e, and of 7."""
+"""Standard deviation of theta before anything is learned: a factor of e, of 7."""
 TIME_S = (60.0, 600.0)
-"""After which a device may move otherwise, and its clock may be warmer."""
+"""Correlation time [s] of theta: a device moves otherwise, a clock gets warmer."""
 _FARTHEST_SD = 5.0  # what one measurement may say at most, in standard deviations of its score
 _TURNED = 0.5  # an epoch that a manoeuvre explains with this probability says nothing
 _KEPT = 0.999  # an epoch that leaves more of the variance of the clock does not inform of it
 _STEP_SD = 5.0  # a clock that moves farther by an update has stepped: the gate allows less
-
 
 HELD, AWAITED, LEARNED = range(3)
 """Phases of a density: not learned; not yet, as no measurement has informed of it; learned."""
@@ -124,9 +124,9 @@ def move(learned: Densities, mean: Array, dt: float, motion: Array, bias: Array)
     F = np.empty_like(learned.cov[0])
     transition(mean, dt, motion, bias, F)
     for k in range(2):
-        dx, dP, theta = learned.mean[k], learned.cov[k], learned.theta[k]
         if learned.phase[k] != LEARNED:
             continue
+        dx, dP, theta = learned.mean[k], learned.cov[k], learned.theta[k]
         dx[:] = F @ dx
         dP[:] = F @ dP @ F.T
         density = density_of(learned, k)

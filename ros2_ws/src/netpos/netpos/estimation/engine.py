@@ -50,10 +50,12 @@ class FilterOptions(NamedTuple):
 
 class EpochInput(NamedTuple):
     """What one epoch brings: seconds since the last one and since the last accepted measurement,
-    epochs rejected in a row before it, and rows (m, ROW_WIDTH), groups numbered 0, 1, ..."""
+    the last seconds of which no component says whether the device turned, epochs rejected in a row
+    before it, and rows (m, ROW_WIDTH), groups numbered 0, 1, ..."""
 
     dt_s: float
     unheard_s: float
+    open_s: float
     rejected_in_row: int
     rows: Array
 

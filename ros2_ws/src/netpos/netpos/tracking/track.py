@@ -300,7 +300,7 @@ class Track:
         past = Past(unheard_s, state.rejected_in_row)
         state.shares.expect(epoch_rows)
         result = state.estimator.update(stamp_ns, epoch_rows, past)
-        state.shares.learn(epoch_rows, result.accepted)
+        state.shares.learn(epoch_rows, result.outliers)
         self._count(result)
         if not result.sound:
             self._forget()

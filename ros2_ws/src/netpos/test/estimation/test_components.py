@@ -51,8 +51,8 @@ def prior(
 
 def after(parts: Mixture, *rows: Array) -> tuple[Mixture, int]:
     """The mixture after one epoch, and the number of rows taken."""
-    epoch = EpochInput(0.0, 0.0, 0, np.array(rows))
-    found = epochs.apply_epoch(parts, epoch, OPTIONS, 0.0, np.zeros(len(rows)))
+    epoch = EpochInput(0.0, 0.0, 0.0, 0, np.array(rows))
+    found = epochs.apply_epoch(parts, epoch, OPTIONS, np.zeros(len(rows)))
     return found.components, found.used
 
 
@@ -172,8 +172,8 @@ def test_one_narrow_component_is_the_extended_filter() -> None:
         ]
     )
     accepted = np.zeros(3)
-    epoch = EpochInput(0.0, 0.0, 0, rows)
-    found = epochs.apply_epoch(one_component(x, P), epoch, OPTIONS, 0.0, accepted)
+    epoch = EpochInput(0.0, 0.0, 0.0, 0, rows)
+    found = epochs.apply_epoch(one_component(x, P), epoch, OPTIONS, accepted)
     means, covs, logs = found.components
     assert (logs.tolist(), found.used, accepted.tolist()) == ([0.0], 3, [1.0, 1.0, 1.0])
     expected, expected_cov, work = x.copy(), P.copy(), ekf.workspace(6, 3)
@@ -408,12 +408,15 @@ def turned_priors(x: Array, P: Array, within_s: float) -> list[tuple[float, Arra
 
 
 @pytest.mark.parametrize("velocity", [(0.3, -0.2), (0.0, 4.0)])
-@pytest.mark.parametrize(("off_m", "unheard_s"), [(1.8, 0.4), (2.5, 0.4), (6.0, 3.0)])
+@pytest.mark.parametrize(
+    ("off_m", "unheard_s", "open_s"),
+    [(1.8, 0.4, 9.0), (2.5, 0.4, 9.0), (1.8, 0.4, 0.5), (6.0, 3.0, 0.1)],
+)
 def test_a_refused_fix_is_an_outlier_a_tail_or_a_turn(
-    off_m: float, unheard_s: float, velocity: tuple[float, float]
+    off_m: float, unheard_s: float, open_s: float, velocity: tuple[float, float]
 ) -> None:
     """Weights and moments of the explanations, by the Kalman filter's own formulas; a fast device
-    may have turned to the side where the fix is."""
+    may have turned to the side where the fix is, since a component says so or it was heard."""
     x, P = prior((1.0, 2.0), (0.2, 0.3), rho=0.5)
     x[2:4] = velocity
     P[2:4, 2:4] *= 0.25
@@ -421,11 +424,11 @@ def test_a_refused_fix_is_an_outlier_a_tail_or_a_turn(
     P[2:4, 0:2] *= 0.5
     z = x[:2] + off_m * np.array([1.0, 0.0])
     rows, accepted = linear_rows(z, R, H, 0), np.zeros(1)
-    epoch = EpochInput(0.1, unheard_s, 0, rows)
-    found = epochs.apply_epoch(one_component(x, P), epoch, TURNING, 0.0, accepted)
+    epoch = EpochInput(0.1, unheard_s, open_s, 0, rows)
+    found = epochs.apply_epoch(one_component(x, P), epoch, TURNING, accepted)
     S = H @ P @ H.T + R
     delay_s = np.sqrt(2.0 * TURNING.gate_nis[2] / np.trace(np.linalg.inv(S))) / 5.0
-    within_s = max(unheard_s, delay_s)
+    within_s = max(unheard_s, min(delay_s, open_s))
     whitened = np.linalg.slogdet(np.linalg.cholesky(R))[1]  # rows are decorrelated fixes
     root = np.linalg.cholesky(R)
     innovation = np.abs(np.linalg.solve(root, z - x[:2]))
@@ -457,8 +460,8 @@ def test_a_fix_within_the_gate_leaves_one_component_and_without_manoeuvres_so_do
     for options, off_m in ((TURNING, 0.5), (straight, 6.0)):
         rows = linear_rows(x[:2] + off_m * np.array([1.0, 0.0]), R, H, 0)
         rows = np.vstack([rows, linear_rows(x[:2], R, H, 1)])
-        epoch = EpochInput(0.1, 0.1, 0, rows)
-        found = epochs.apply_epoch(one_component(x, P), epoch, options, 9.0, np.zeros(2))
+        epoch = EpochInput(0.1, 0.1, 9.0, 0, rows)
+        found = epochs.apply_epoch(one_component(x, P), epoch, options, np.zeros(2))
         assert found.components.log_weights.size == 1
         assert found.turned == 0.0
 
@@ -467,8 +470,8 @@ def test_a_fix_within_the_gate_leaves_one_component_and_without_manoeuvres_so_do
 def test_one_rsu_lets_a_turn_begin_every_quarter_of_a_second(since_s: float, begins: bool) -> None:
     x, P = prior((1.0, 2.0), (0.2, 0.3))
     rows = linear_rows(x[:2], R, H, 0)
-    epoch = EpochInput(0.1, 0.1, 0, rows)
-    found = epochs.apply_epoch(one_component(x, P), epoch, TURNING, since_s, np.zeros(1))
+    epoch = EpochInput(0.1, 0.1, since_s, 0, rows)
+    found = epochs.apply_epoch(one_component(x, P), epoch, TURNING, np.zeros(1))
     assert found.begun is begins
     assert (found.components.log_weights.size > 1) is begins
     if begins:
@@ -518,7 +521,7 @@ def test_rows_are_reweighted_by_the_most_probable_component(name: str) -> None:
     rows = linear_rows(x[:2] + off, R, H, 0)
     variance = rows[:, VARIANCE].copy()
     dynamics = dynamics_of(config, NO_BIAS)
-    epoch = EpochInput(0.0, 0.1, 0, rows)
+    epoch = EpochInput(0.0, 0.1, 0.0, 0, rows)
     epochs.moved_to_epoch(two, epoch, dynamics, options_of(config))
     distance = np.sqrt(off @ np.linalg.solve(H @ P @ H.T + R, off) / 2.0)
     np.testing.assert_allclose(rows[:, VARIANCE] / variance, distance / 1.5, rtol=1e-9)
@@ -542,9 +545,9 @@ def test_an_epoch_says_the_same_to_a_component_and_to_its_two_halves(since_s: fl
     for parts in (one_component(x, P), halves):
         mean, cov = x.copy(), P.copy()
         measured = [row(Kind.AZIMUTH, 0.4, 0.05**2, 0), row(Kind.RANGE, 17.0, 0.3**2, 1)]
-        epoch = EpochInput(since_s, since_s, 0, np.array(measured))
+        epoch = EpochInput(since_s, since_s, 0.0, 0, np.array(measured))
         memory = epochs.memory_of(6, 2)
-        epochs.advance(mean, cov, parts, epoch, 0.0, dynamics, options, memory)
+        epochs.advance(mean, cov, parts, epoch, dynamics, options, memory)
         found.append((mean, cov, epoch.rows))
     for one, two in zip(*found, strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-3, atol=1e-3)
@@ -594,8 +597,8 @@ def test_blocked_paths_against_the_grid(
     for origin, late in zip(sites, late_m, strict=True):
         value = float(np.hypot(*(truth - origin))) + late
         rows.append(row(Kind.RANGE, value, 0.2**2, origin=np.array([*origin, 0.0])))
-        epoch = EpochInput(0.0, 0.0, 0, np.array(rows[-1:]))
-        parts = epochs.apply_epoch(parts, epoch, options, 0.0, np.zeros(1)).components
+        epoch = EpochInput(0.0, 0.0, 0.0, 0, np.array(rows[-1:]))
+        parts = epochs.apply_epoch(parts, epoch, options, np.zeros(1)).components
     found, found_cov = moments(parts)
     mean, cov = blocked_on_grid(x, P, rows, share, excess_m)
     off = found[:2] - mean

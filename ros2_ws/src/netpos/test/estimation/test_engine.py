@@ -103,7 +103,7 @@ def compiled_step(
     options: FilterOptions,
 ) -> tuple[Array, Array, float, int, Array]:
     x, S = mean.copy(), engine.to_cov_or_sqrt(cov, options)
-    scratch, epoch = engine.scratch(6, len(rows)), EpochInput(dt, unheard_s, rejected, rows)
+    scratch, epoch = engine.scratch(6, len(rows)), EpochInput(dt, unheard_s, dt, rejected, rows)
     engine.predict_epoch(x, S, epoch, motion, NO_BIAS, options, scratch)
     result = engine.update_epoch(x, S, epoch, motion, options, scratch)
     accepted = scratch.accepted[:3]

@@ -189,7 +189,7 @@ def test_rows_are_weighed_by_what_is_carried(name: str) -> None:
     (mean, cov), R, off = start(), np.diag([0.25, 0.16]), np.array([9.0, -7.0])
     rows = linear_rows(mean[POSITION] + off, R, H, 0)
     S, memory = engine.to_cov_or_sqrt(cov, options), engine.scratch(6, 2)
-    epoch, motion = EpochInput(0.0, 0.0, 0, rows), motions_of(TrackerConfig())[0]
+    epoch, motion = EpochInput(0.0, 0.0, 0.0, 0, rows), motions_of(TrackerConfig())[0]
     engine.predict_epoch(mean.copy(), S, epoch, motion, NO_BIAS, options, memory)
     engine.update_epoch(mean.copy(), S, epoch, motion, options, memory)
     factor = math.sqrt(off @ np.linalg.solve(cov[POSITION, POSITION] + R, off) / 2.0) / 1.5

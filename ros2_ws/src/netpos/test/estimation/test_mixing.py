@@ -53,8 +53,8 @@ def after_epoch(
     rejected_in_row: int = 0,
 ) -> Update:
     """The components, moved to the epoch already, after its rows."""
-    epoch = EpochInput(0.5, 0.5, rejected_in_row, rows)
-    result: Update = epochs.apply_epoch(before, epoch, options, 0.0, accepted)
+    epoch = EpochInput(0.5, 0.5, 0.0, rejected_in_row, rows)
+    result: Update = epochs.apply_epoch(before, epoch, options, accepted)
     return result
 
 

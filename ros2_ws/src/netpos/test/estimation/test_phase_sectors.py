@@ -155,8 +155,8 @@ class Epoch:
 
     def applied(self) -> Update:
         before = self.rows.copy()
-        prior, epoch = one_component(self.prior, self.cov), EpochInput(0.1, 0.1, 0, self.rows)
-        found: Update = apply_epoch(prior, epoch, self.options, 0.1, self.accepted)
+        prior, epoch = one_component(self.prior, self.cov), EpochInput(0.1, 0.1, 0.1, 0, self.rows)
+        found: Update = apply_epoch(prior, epoch, self.options, self.accepted)
         np.testing.assert_array_equal(self.rows, before)
         return found
 

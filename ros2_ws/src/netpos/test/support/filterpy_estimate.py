@@ -79,7 +79,7 @@ class FilterpyEstimate:
         if used:
             self.mean, self.cov = mean, cov
             engine.set_velocity_step_noise(self.motion, sd, unheard_s, 0.0, 0.0)
-        return UpdateResult(nis, used, accepted.tolist(), innovations)
+        return UpdateResult(nis, used, accepted.tolist(), (1.0 - accepted).tolist(), innovations)
 
     def copy(self) -> FilterpyEstimate:
         twin = copy.copy(self)

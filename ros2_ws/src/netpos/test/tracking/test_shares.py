@@ -56,24 +56,24 @@ def test_share_is_the_mean_of_the_beta_distribution() -> None:
         assert epoch_rows.rows[~late, BLOCKED] == 0.0
         assert (epoch_rows.rows[:, OUTLIER_SHARE] == 0.0).all()
         epoch_rows.rows[late, BLOCKED] = p
-        shares.learn(epoch_rows, [1.0])
+        shares.learn(epoch_rows, [0.0])
         alpha = f * alpha + (1 - f) * 2.0 + p
         beta = f * beta + (1 - f) * 8.0 + 1 - p
         assert shares.blocked.mean("a") == pytest.approx(alpha / (alpha + beta))
     assert shares.blocked.mean("b") == 0.2
 
 
-def test_what_is_refused_is_an_outlier() -> None:
+def test_what_may_be_an_outlier_counts_with_its_probability() -> None:
     """A measurement of two values counts once: a share of 1 in 100, worth 100 measurements, of
-    which three were refused and one was not; all its rows then say so."""
+    which two were outliers, one was none and one may be; all its rows then say so."""
     shares, epoch_rows = Shares.unknown(LEARNED), _epoch_rows()
     shares.expect(epoch_rows)
     assert epoch_rows.rows[:, OUTLIER_SHARE] == pytest.approx(OUTLIERS)
     alpha, beta, f = 1.0, 99.0, 1.0 - 1.0 / 300.0
-    for accepted in (0.0, 0.0, 1.0, 0.0):
-        shares.learn(epoch_rows, [accepted])
-        alpha = f * alpha + (1 - f) * 1.0 + 1.0 - accepted
-        beta = f * beta + (1 - f) * 99.0 + accepted
+    for outlier in (1.0, 1.0, 0.0, 0.3):
+        shares.learn(epoch_rows, [outlier])
+        alpha = f * alpha + (1 - f) * 1.0 + outlier
+        beta = f * beta + (1 - f) * 99.0 + 1.0 - outlier
     shares.expect(epoch_rows)
     assert epoch_rows.rows[:, OUTLIER_SHARE] == pytest.approx(alpha / (alpha + beta))
     assert (epoch_rows.rows[:, BLOCKED] == 0.0).all()
@@ -85,7 +85,7 @@ def test_a_copy_learns_for_itself(config: TrackerConfig) -> None:
     shares, epoch_rows = Shares.unknown(config), _epoch_rows()
     before, twin = (shares.blocked.mean("a"), shares.outliers.mean("a")), shares.copy()
     epoch_rows.rows[:, BLOCKED] = 1.0
-    twin.learn(epoch_rows, [0.0])
+    twin.learn(epoch_rows, [1.0])
     assert (twin.blocked.mean("a"), twin.outliers.mean("a")) > before
     assert (shares.blocked.mean("a"), shares.outliers.mean("a")) == before
 
@@ -94,7 +94,7 @@ def test_nothing_is_learned_where_the_options_are_off() -> None:
     shares, epoch_rows = Shares.unknown(TrackerConfig()), _epoch_rows()
     shares.expect(epoch_rows)
     assert (epoch_rows.rows[:, [BLOCKED, OUTLIER_SHARE]] == 0.0).all()
-    shares.learn(epoch_rows, [0.0])
+    shares.learn(epoch_rows, [1.0])
     assert shares.blocked.mean("a") == shares.outliers.mean("a") == 0.0
 
 

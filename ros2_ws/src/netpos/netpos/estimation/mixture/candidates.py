@@ -34,12 +34,14 @@ TAIL_LOG = -math.log(2.0 * (1.0 + math.log(_FARTHEST_OUTLIER)))
 
 class Update(NamedTuple):
     """What came of an epoch: the components; of the most probable one the NIS of the rows it
-    accepted and their number; the probability that the device turned in the ``within_s`` seconds
-    before the epoch; whether a component "it has turned" has begun."""
+    accepted and their number; the probability of each group that it is an outlier (groups,); the
+    probability that the device turned in the ``within_s`` seconds before the epoch; whether a
+    component "it has turned" has begun."""
 
     components: Mixture
     nis: float
     used: int
+    outliers: Array
     turned: float
     within_s: float
     begun: bool
@@ -172,7 +174,7 @@ def apply_predicted(
     found.nis[k], found.used[k], found.within_s[k] = nis, used, 0.0
     predicted = fusion.predicted_in(work, mean.size, rows.shape[0])
     likelihood = log_likelihood(prior_mean, prior_cov, rows, height_m, predicted, accepted)
-    sound = math.isfinite(likelihood) and is_sound(mean, cov)
+    sound = math.isfinite(likelihood) and nis >= 0.0 and is_sound(mean, cov)
     found.log_weights[k] = log_weight + likelihood if sound else -math.inf
 
 

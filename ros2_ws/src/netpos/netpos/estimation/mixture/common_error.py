@@ -15,13 +15,26 @@ from netpos.estimation.mixture.candidates import OUTLIERS, TAIL_LOG, Candidates,
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.state import X
 from netpos.estimation.update.fusion import workspace
-from netpos.estimation.update.predicted import predicted_rows
+from netpos.estimation.update.predicted import PredictedRows, predicted_rows
 from netpos.messages.values import Array
 
 _CLOCK = int(X.CLOCK)
 _LARGEST = 1e6  # standard deviations of a measurement: beyond it the update has no digits left
 # The log density of an outlier over that of a Gaussian as wide as the outlier is large.
 _OVER_GAUSSIAN_LOG = math.log(OUTLIERS) + TAIL_LOG + 0.5 * (1.0 + math.log(2.0 * math.pi))
+
+
+@kernel
+def _sharing(state: int, rows: Array, predicted: PredictedRows, options: FilterOptions) -> Array:
+    """Which ``rows`` (m, ROW_WIDTH) share an error of ``state``. A single time of arrival shares
+    that of the clock with those that follow; of COMMON it takes two."""
+    if state == X.CLOCK:
+        _, learns_clock = options.learns_density
+        timed: Array = (predicted.H[:, X.CLOCK] != 0.0) & learns_clock
+        return timed
+    shares = rows[:, COMMON] == state
+    several: Array = shares & (state > 0 and shares.sum() > 1)
+    return several
 
 
 @kernel
@@ -34,28 +47,22 @@ def add_common_errors(
     options: FilterOptions,
     found: Candidates,
 ) -> int:
-    """Add the component ``k`` of ``prior`` with an error of what measurements share; the number of
-    candidates then.
+    """Add the component ``k`` of ``prior`` with an error in a state that ``rows`` (m, ROW_WIDTH)
+    share, for each such state; the number of candidates then.
 
-    What they share is a state of COMMON that several ``rows`` (m, ROW_WIDTH) have, and a clock the
-    walk of which is learned: a single time of arrival shares it with those that follow. It is
-    tried where the candidate ``refused_by`` refuses one of these rows. The variance of the state
-    is larger by the square of what they are off by in the middle; such errors are as frequent as
-    outliers. The candidate is kept if it accepts more than ``refused_by``, and two of the rows
-    that share the state, if there are two.
+    The candidate ``refused_by`` refuses one of these rows. The variance of the state is larger by
+    the square of their median innovation; such errors are as frequent as outliers. A candidate is
+    kept if it accepts more than ``refused_by``, and two of these rows, if there are two.
     """
     mean, cov, accepted = prior.means[k], prior.covs[k], found.accepted[refused_by]
-    _, learns_clock = options.learns_density
     work = workspace(mean.size, rows.shape[0])
     predicted = predicted_rows(mean, cov, rows, options.height_m)
     groups = rows[:, GROUP].astype(np.int64)
     is_refused = accepted[groups] == 0.0
-    states = np.append(np.unique(rows[:, COMMON][is_refused]), _CLOCK)
+    states = np.append(np.unique(rows[:, COMMON][is_refused]), float(_CLOCK))
     for state in states.astype(np.int64):
-        shares = rows[:, COMMON] == state if state != _CLOCK else predicted.H[:, _CLOCK] != 0.0
-        count = shares.sum()
-        may_err = learns_clock if state == _CLOCK else state > 0 and count > 1
-        if not may_err or not (shares & is_refused).any():
+        shares = _sharing(state, rows, predicted, options)
+        if not (shares & is_refused).any():
             continue
         off = np.median(predicted.innovation[shares])
         if abs(off) > _LARGEST * math.sqrt(rows[:, VARIANCE][shares].min()):
@@ -64,6 +71,6 @@ def add_common_errors(
         found.covs[end, state, state] += off**2
         apply(end, prior.log_weights[k] + _OVER_GAUSSIAN_LOG, rows, options, found, work)
         agree = found.accepted[end][groups[shares]].sum()
-        if agree >= min(count, 2) and found.accepted[end].sum() > accepted.sum():
+        if agree >= min(shares.sum(), 2) and found.accepted[end].sum() > accepted.sum():
             end += 1
     return int(end)

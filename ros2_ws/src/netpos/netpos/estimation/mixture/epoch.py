@@ -188,7 +188,6 @@ def _at_once(
     epoch: EpochInput,
     at: int,
     options: FilterOptions,
-    open_s: float,
     accepted: Array,
 ) -> Update:
     """All measurements of the epoch, for every component of ``prior``, in every sector of an
@@ -204,11 +203,11 @@ def _at_once(
         end = _add_candidates(k, end, prior, epoch, at, options, found, work)
     best = int(np.argmax(found.log_weights[:count]))
     H = predicted_in(work, n, m).H  # velocities: of any component
-    turns = found.accepted[best, 0] == 1.0 and may_turn(H, groups, open_s, options)
+    turns = found.accepted[best, 0] == 1.0 and may_turn(H, groups, epoch.open_s, options)
     if turns:
         weighed = Mixture(prior.means, prior.covs, found.log_weights[:count])
         for k in leaders(weighed):
-            within_s = max(open_s, epoch.unheard_s)
+            within_s = max(epoch.open_s, epoch.unheard_s)
             end = add_turns(k, end, prior, within_s, rows, options, found, -1.0)
     if at >= 0:
         end = keep_sectors(prior, best, end, rows, at, options, found)
@@ -217,10 +216,11 @@ def _at_once(
     top = found.log_weights[best]
     if not math.isfinite(top):
         accepted[:groups] = 0.0
-        return Update(prior, 0.0, 0, 0.0, 0.0, turns)
+        return Update(prior, 0.0, 0, np.ones(groups), 0.0, 0.0, turns)
     accepted[:groups] = found.accepted[best]
     weights = np.exp(found.log_weights - top)
-    turned = weights[found.within_s > 0.0].sum() / weights.sum()
+    weights /= weights.sum()
+    turned, outliers = weights[found.within_s > 0.0].sum(), 1.0 - weights @ found.accepted
     parts, merge_cost = mixture_of(found), _MERGE_SHARE * options.integrity_risk
     if options.models > 1:
         components = mixing.one_of_each(parts)
@@ -229,7 +229,7 @@ def _at_once(
     else:
         components = reduced(parts, merge_cost)
     nis, used = found.nis[best], int(found.used[best])
-    return Update(components, nis, used, turned, found.within_s.max(), turns)
+    return Update(components, nis, used, outliers, turned, found.within_s.max(), turns)
 
 
 @kernel
@@ -237,18 +237,17 @@ def apply_epoch(
     components: Mixture,
     epoch: EpochInput,
     options: FilterOptions,
-    open_s: float,
     accepted: Array,
 ) -> Update:
     """The components, moved to the epoch already, after it; ``accepted`` (groups,) is filled with
-    0 or 1. ``open_s``: the last seconds of which no component says whether the device turned."""
+    0 or 1."""
     rows, at = epoch.rows, ambiguous_phase(epoch.rows, options)
     if options.models == 1 and at < 0 and any_divides(components, rows, options):
-        found: Update = in_turn(components, epoch, options, open_s, accepted)
+        found: Update = in_turn(components, epoch, options, accepted)
         return found
     if options.robust.nlos_probability > 0.0:
         reweight_by_best(components, rows, options.height_m, by_path(options.robust))
-    at_once: Update = _at_once(components, epoch, at, options, open_s, accepted)
+    at_once: Update = _at_once(components, epoch, at, options, accepted)
     return at_once
 
 
@@ -262,13 +261,15 @@ def note_turn(found: Update, motion: Array, options: FilterOptions) -> None:
 
 class Outcome(NamedTuple):
     """What came of an epoch of a track: its components; NIS of the rows accepted and their number;
-    how far [m] a manoeuvre that this epoch does not show may have taken the device (not a number
-    where the posterior is not sound); the probability that the device has turned; the last seconds
-    of which neither a component nor the epoch itself says whether it did."""
+    the probability of each group that it is an outlier (groups,); how far [m] a manoeuvre that
+    this epoch does not show may have taken the device (not a number where the posterior is not
+    sound); the probability that the device has turned; the last seconds of which neither a
+    component nor the epoch itself says whether it did."""
 
     components: Mixture
     nis: float
     used: int
+    outliers: Array
     undetected_m: float
     turned: float
     open_s: float
@@ -294,7 +295,6 @@ def _by_one(
     x: Array,
     S: Array,
     epoch: EpochInput,
-    open_s: float,
     dynamics: Dynamics,
     options: FilterOptions,
     memory: Scratch,
@@ -315,7 +315,7 @@ def _by_one(
     if options.manoeuvre_speed_sd > 0.0:
         refused = result.groups < groups
         contradict = fail_together(result.nis, result.used, options.gate_nis)
-        if refused or contradict or may_turn(predicted.H, groups, open_s, options):
+        if refused or contradict or may_turn(predicted.H, groups, epoch.open_s, options):
             if changes:
                 rows[:] = raw
             return False, 0.0, 0
@@ -370,7 +370,6 @@ def advance(
     S: Array,
     components: Mixture,
     epoch: EpochInput,
-    open_s: float,
     dynamics: Dynamics,
     options: FilterOptions,
     memory: Memory,
@@ -378,7 +377,6 @@ def advance(
     """One epoch of a track: of its one component ``x`` (n,), ``S`` (n, n), or of several
     ``components``, of which ``x`` and ``S`` are the moments; in place.
 
-    ``open_s``: the seconds up to this epoch of which no component says whether the device turned.
     ``memory.step`` keeps the prediction of the whole estimate, and 0 or 1 of each group in
     ``accepted``. ``dynamics.motions[0]`` keeps the velocity step that the epoch allowed for.
     """
@@ -390,11 +388,12 @@ def advance(
     if not several:
         if rows.shape[0] == 0:
             predict(x, S, epoch.dt_s, dynamics.motions[0], dynamics.bias, options)
-            return Outcome(components, 0.0, 0, 0.0, 0.0, open_s)
-        enough, nis, used = _by_one(x, S, epoch, open_s, dynamics, options, step)
+            return Outcome(components, 0.0, 0, np.zeros(0), 0.0, 0.0, epoch.open_s)
+        enough, nis, used = _by_one(x, S, epoch, dynamics, options, step)
         if enough:
-            undetected_m, open_s = _finish(x, S, components, epoch, open_s, options, memory)
-            return Outcome(components, nis, used, undetected_m, 0.0, open_s)
+            undetected_m, open_s = _finish(x, S, components, epoch, epoch.open_s, options, memory)
+            groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
+            return Outcome(components, nis, used, np.zeros(groups), undetected_m, 0.0, open_s)
         components = one_component(step.prior_mean, step.prior_cov)
         reweighted(components, rows, options)
     else:
@@ -403,20 +402,20 @@ def advance(
         mean, cov = moments(components)
         x[:] = mean
         write_cov_or_sqrt(options.filter, cov, S)
-        return Outcome(components, 0.0, 0, 0.0, 0.0, open_s)
+        return Outcome(components, 0.0, 0, np.zeros(0), 0.0, 0.0, epoch.open_s)
     step.prior_mean[:], step.prior_cov[:] = moments(components)
     write_cov_or_sqrt(options.filter, step.prior_cov, step.prior_cov_or_sqrt)
-    found = apply_epoch(components, epoch, options, open_s, step.accepted)
+    found = apply_epoch(components, epoch, options, step.accepted)
     predicted = predicted_in(step.work, x.size, rows.shape[0])
     predict_rows(step.prior_mean, step.prior_cov, rows, options.height_m, predicted)
     note_turn(found, dynamics.motions[0], options)
     mean, cov = moments(found.components)
     x[:] = mean
     write_cov_or_sqrt(options.filter, cov, S)
-    open_s = 0.0 if found.begun else open_s
+    open_s = 0.0 if found.begun else epoch.open_s
     undetected_m, open_s = _finish(x, S, found.components, epoch, open_s, options, memory)
     nis, used, turned = found.nis, found.used, found.turned
-    return Outcome(found.components, nis, used, undetected_m, turned, open_s)
+    return Outcome(found.components, nis, used, found.outliers, undetected_m, turned, open_s)
 
 
 @kernel
@@ -445,12 +444,12 @@ def run_epochs(
         now_ns = stamps_ns[k]
         rows = epochs.rows[row_start[k] : row_start[k + 1]].copy()
         dt, unheard_s = (now_ns - last_ns) * 1e-9, (now_ns - heard_ns) * 1e-9
-        epoch = EpochInput(dt, unheard_s, rejected_in_row, rows)
-        open_s, last_ns = open_s + dt, now_ns
+        epoch = EpochInput(dt, unheard_s, open_s + dt, rejected_in_row, rows)
+        last_ns = now_ns
         write_densities(learned, motion)
         move_densities(learned, x, dt, motion, dynamics.bias)
         run.densities[k] = motion[PARAMETERS[0]], motion[PARAMETERS[1]]
-        found = advance(x, S, components, epoch, open_s, dynamics, options, memory)
+        found = advance(x, S, components, epoch, dynamics, options, memory)
         components = found.components
         if rows.shape[0] > 0:
             step = memory.step

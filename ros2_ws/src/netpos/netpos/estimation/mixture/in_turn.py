@@ -35,7 +35,7 @@ from netpos.estimation.update.fusion import predicted_in, workspace
 from netpos.estimation.update.predicted import predict_rows
 from netpos.messages.values import Array
 
-_EXPLANATIONS = TURNS_MAX + 2  # of what a candidate refuses: turns, an error, a step of the clock
+_EXPLANATIONS = TURNS_MAX + 3  # of what is refused: turns, a tail, an error, a step of the clock
 
 
 @kernel
@@ -93,7 +93,6 @@ def in_turn(
     components: Mixture,
     epoch: EpochInput,
     options: FilterOptions,
-    open_s: float,
     accepted: Array,
 ) -> Update:
     """The epoch, measurement by measurement; each is ``accepted`` where most of the mixture does.
@@ -105,13 +104,17 @@ def in_turn(
     if may_be_blocked:
         reweight_by_best(components, epoch.rows, options.height_m, by_path(options.robust))
     best, groups = int(np.argmax(components.log_weights)), int(raw[raw.shape[0] - 1, GROUP]) + 1
+    outliers = np.zeros(groups)
     _, H = linearise(raw, components.means[best], options.height_m)
-    begins, within_s = may_turn(H, groups, open_s, options), max(open_s, epoch.unheard_s)
+    begins = may_turn(H, groups, epoch.open_s, options)
+    within_s = max(epoch.open_s, epoch.unheard_s)
     while start < raw.shape[0]:
         group, stop = int(raw[start, GROUP]), group_end(raw, start)
         alone = raw[start:stop].copy()
         alone[:, GROUP] = 0.0
-        single = EpochInput(epoch.dt_s, epoch.unheard_s, epoch.rejected_in_row, alone)
+        single = EpochInput(
+            epoch.dt_s, epoch.unheard_s, epoch.open_s, epoch.rejected_in_row, alone
+        )
         prior, count = components, components.log_weights.size
         if begins and stop == raw.shape[0]:
             best = int(np.argmax(components.log_weights))
@@ -122,7 +125,8 @@ def in_turn(
         if math.isfinite(top):
             weights = np.exp(found.log_weights - top)
             weights /= weights.sum()
-            accepted[group] = 1.0 if 2.0 * (weights * taken).sum() > 1.0 else 0.0
+            outliers[group] = 1.0 - (weights * taken).sum()
+            accepted[group] = 1.0 if outliers[group] < 0.5 else 0.0
             best = int(np.argmax(np.where(taken == accepted[group], weights, -1.0)))
             nis, used = nis + found.nis[best], used + int(found.used[best])
             has_turned = max(has_turned, weights[found.within_s > 0.0].sum())
@@ -132,4 +136,4 @@ def in_turn(
                 epoch.rows[start + late, BLOCKED] = (weights * found.blocked).sum()
             components = reduced(mixture_of(found), PART_MERGE_COST)
         start = stop
-    return Update(components, nis, used, has_turned, longest_s, begins)
+    return Update(components, nis, used, outliers, has_turned, longest_s, begins)

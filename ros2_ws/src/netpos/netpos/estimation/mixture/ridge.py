@@ -87,10 +87,16 @@ def _log_det(cov: Array) -> float:
     return float(2.0 * np.log(sd).sum() + np.linalg.slogdet(cov / np.outer(sd, sd))[1])
 
 
+def log_weight_of(fit: Fit) -> float:
+    """Log weight of a minimum as one Gaussian, by Laplace's approximation."""
+    cost, _, cov = fit
+    return -0.5 * cost + 0.5 * _log_det(2.0 * math.pi * cov)
+
+
 def _whole(fit: Fit) -> _Piece:
     """A minimum as one Gaussian."""
-    cost, mean, cov = fit
-    return _Piece(-0.5 * cost + 0.5 * _log_det(2.0 * math.pi * cov), mean, cov)
+    _, mean, cov = fit
+    return _Piece(log_weight_of(fit), mean, cov)
 
 
 def _is_known(state: Array, pieces: list[_Piece]) -> bool:

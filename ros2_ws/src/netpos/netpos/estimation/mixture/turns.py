@@ -15,6 +15,7 @@ from netpos.estimation.level.manoeuvre import (
     side_turns,
     turn_to_side,
 )
+from netpos.estimation.measurement import GROUP
 from netpos.estimation.mixture.candidates import Candidates, add_gated, apply
 from netpos.estimation.mixture.gaussians import Mixture, together
 from netpos.estimation.update.fusion import predicted_in, workspace
@@ -78,10 +79,15 @@ def add_turns(
 
 @kernel
 def unnoticed_s(cov: Array, epoch: EpochInput, options: FilterOptions, work: Array) -> float:
-    """``manoeuvre_s`` of a component with ``cov`` (n, n), whose prediction ``work`` holds."""
+    """``manoeuvre_s`` of a component with ``cov`` (n, n), whose prediction ``work`` holds. Where
+    epochs do not show a turn by themselves, one from before the open time is a component."""
     rows = epoch.rows
     predicted = predicted_in(work, cov.shape[0], rows.shape[0])
-    return float(manoeuvre_s(cov, rows, predicted, epoch.unheard_s, options))
+    within_s = manoeuvre_s(cov, rows, predicted, epoch.unheard_s, options)
+    groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
+    if leaves_turns_open(predicted.H, groups):
+        within_s = min(within_s, max(epoch.open_s, epoch.unheard_s))
+    return float(within_s)
 
 
 @kernel

@@ -47,6 +47,7 @@ class UpdateResult(NamedTuple):
 
     nis, dof : of the accepted rows together, and their number
     accepted : 1 or 0 for each group of rows
+    outliers : probability of each group that it is an outlier
     innovations : (m, 2) innovation of each row at the prediction, and its standard deviation
     undetected_m : how far [m] a manoeuvre that nothing has shown may have taken the device
     sound : whether the posterior can be that of a device
@@ -56,6 +57,7 @@ class UpdateResult(NamedTuple):
     nis: float
     dof: int
     accepted: Sequence[float]
+    outliers: Sequence[float]
     innovations: Array
     undetected_m: float = 0.0
     sound: bool = True
@@ -273,14 +275,13 @@ class Estimate:
             self._make_room(m)
         memory = self._memory
         dt_s = (stamp_ns - self.stamp_ns) * 1e-9
-        epoch = EpochInput(dt_s, unheard_s, rejected_in_row, rows)
+        epoch = EpochInput(dt_s, unheard_s, self._open_s + dt_s, rejected_in_row, rows)
         self._move_learned(dt_s, bias)
         outcome: Outcome = mixtures.advance(
             self.mean,
             self._cov_or_sqrt,
             self._components or self._one,
             epoch,
-            self._open_s + dt_s,
             self._with(bias),
             self._options,
             memory,
@@ -298,6 +299,7 @@ class Estimate:
             outcome.nis,
             outcome.used,
             memory.step.accepted[: int(rows.item(-1, GROUP)) + 1].tolist(),
+            outcome.outliers.tolist(),
             memory.innovations[:m].copy(),
             outcome.undetected_m,
             sound=not math.isnan(outcome.undetected_m),

@@ -342,7 +342,8 @@ class SpatialEstimator(Estimator):
         if dof == 0:
             doubt_standstill(estimate.memory)
         sound = bool(is_sound(nav[_IN_PLANE], cov[np.ix_(_IN_PLANE, _IN_PLANE)]))
-        return UpdateResult(nis, dof, accepted.tolist(), innovations, sound=sound)
+        outliers = (1.0 - accepted).tolist()
+        return UpdateResult(nis, dof, accepted.tolist(), outliers, innovations, sound=sound)
 
     # output
 

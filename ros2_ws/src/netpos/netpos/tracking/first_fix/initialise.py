@@ -39,7 +39,7 @@ from netpos.estimation.measurement import (
 )
 from netpos.estimation.mixture.gaussians import Mixture, mode_of
 from netpos.estimation.mixture.reduction import PART_MERGE_COST, reduced
-from netpos.estimation.mixture.ridge import Fit, components_of, inverse
+from netpos.estimation.mixture.ridge import Fit, components_of, inverse, log_weight_of
 from netpos.estimation.mixture.window import Window, normal_equations
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.estimation.rows import drop_biases
@@ -219,7 +219,9 @@ class Initialiser:
         if misfit > 1.0:
             lasting = N_CORE + int(slow.lasts.sum())
             solutions = [solution.relaxed(lasting) for solution in solutions]
-        lacks = self._lacks(rows, solutions[0].fits[0][2], misfit)
+        # the place that weighs most, not the one that fits best: beside an RSU anything fits
+        _, _, cov = max(solutions[0].fits, key=log_weight_of)
+        lacks = self._lacks(rows, cov, misfit)
         if lacks:
             self.missing = lacks
             return None
@@ -367,15 +369,17 @@ class Initialiser:
         return sorted(fits, key=lambda fit: fit[0])
 
     def _plausible(self, state: Array) -> bool:
-        """Not behind an array without a back, and not on top of an RSU that measures angles only,
-        where an angle fits anything."""
+        """Not behind an array without a back, and not on top of an RSU where an angle fits
+        anything: one that measures no distance, or the only one that measures times."""
         heard = {r.info.rsu_id: r for e in self._window for r in e[2]}
-        ranged = {
-            tuple(row[ORIGIN:AXES])
-            for e in self._window
-            for row in e[1]
-            if BY_KIND[int(row[KIND])].is_range
-        }
+        timed: set[tuple[float, ...]] = set()
+        ranged: set[tuple[float, ...]] = set()
+        for row in (row for e in self._window for row in e[1]):
+            sensor, origin = BY_KIND[int(row[KIND])], tuple(row[ORIGIN:AXES])
+            if sensor.is_range:
+                (timed if sensor.has_clock else ranged).add(origin)
+        if len(timed) > 1:  # what one RSU hears says nothing of the distance
+            ranged |= timed
         for rsu in heard.values():
             dx, dy = state[:2] - rsu.info.position[:2]
             up = state[N_CORE : N_CORE + self._own.sd.size].sum()

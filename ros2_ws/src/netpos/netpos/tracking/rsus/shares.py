@@ -92,8 +92,9 @@ class Shares:
             if self.outliers.is_learned:
                 row[OUTLIER_SHARE] = self.outliers.mean(rsu_id)
 
-    def learn(self, epoch_rows: EpochRows, accepted: Sequence[float]) -> None:
-        """Take over what the filter made of the rows, and which groups it ``accepted``."""
+    def learn(self, epoch_rows: EpochRows, outliers: Sequence[float]) -> None:
+        """Take over what the filter made of the rows, and with which probability each group is one
+        of the ``outliers``."""
         if not self._are_learned:
             return
         heard = None
@@ -102,7 +103,7 @@ class Shares:
             if self.blocked.is_learned and int(row[KIND]) in _LATE:
                 self.blocked.hear(rsu_id, float(row[BLOCKED]))
             if self.outliers.is_learned and group != heard:
-                self.outliers.hear(rsu_id, 1.0 - accepted[group])
+                self.outliers.hear(rsu_id, outliers[group])
             heard = group
 
 
