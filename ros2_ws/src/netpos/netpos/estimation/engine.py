@@ -13,8 +13,8 @@ from netpos.estimation.compile import kernel, leaf, spliced
 from netpos.estimation.forms import choice
 from netpos.estimation.forms.table import FORMS
 from netpos.estimation.level.manoeuvre import detection_delay_s
-from netpos.estimation.measurement import GROUP
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS, Parameter
+from netpos.estimation.sensors.row import group_count
 from netpos.estimation.state import X
 from netpos.estimation.update import conditioning, fusion, slow_errors
 from netpos.estimation.update.conditioning import Robust, RobustOptions
@@ -331,7 +331,7 @@ def update_epoch(
     ``motion`` (``set_velocity_step_noise``), for a smoother to know.
     """
     rows = epoch.rows
-    groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
+    groups = group_count(rows)
     if options.robust.kind != Robust.NONE or options.robust.nlos_probability > 0.0:
         predicted = fusion.predicted_in(scratch.work, mean.size, rows.shape[0])
         conditioning.reweight(scratch.met_cov, rows, predicted, options.robust)

@@ -36,7 +36,6 @@ from netpos.estimation.level.protection import (
     manoeuvre_level,
     mixture_radius,
 )
-from netpos.estimation.measurement import GROUP
 from netpos.estimation.mixture import mixing
 from netpos.estimation.mixture.candidates import (
     Candidates,
@@ -67,9 +66,11 @@ from netpos.estimation.mixture.turns import (
     leaves_turns_open,
     may_have_turned,
     may_turn,
+    open_time_s,
     unnoticed_s,
 )
 from netpos.estimation.motion import add_velocity_step
+from netpos.estimation.sensors.row import group_count
 from netpos.estimation.update.conditioning import Robust, by_fit, by_path
 from netpos.estimation.update.fusion import predicted_in, workspace
 from netpos.estimation.update.gate import fail_together
@@ -193,7 +194,7 @@ def _at_once(
     """All measurements of the epoch, for every component of ``prior``, in every sector of an
     ambiguous phase in the row ``at`` (-1: there is none)."""
     rows = epoch.rows
-    count, groups = prior.log_weights.size, int(rows[rows.shape[0] - 1, GROUP]) + 1
+    count, groups = prior.log_weights.size, group_count(rows)
     sectors = 2 * most_turns(rows[at]) + 1 if at >= 0 else 0
     m, n = rows.shape[0], prior.means.shape[1]
     size = (2 * (1 + TURNS_MAX) + m // 2 + 1) * count + (sectors + 1) * (count + 1)
@@ -207,7 +208,7 @@ def _at_once(
     if turns:
         weighed = Mixture(prior.means, prior.covs, found.log_weights[:count])
         for k in leaders(weighed):
-            within_s = max(epoch.open_s, epoch.unheard_s)
+            within_s = open_time_s(epoch)
             end = add_turns(k, end, prior, within_s, rows, options, found, -1.0)
     if at >= 0:
         end = keep_sectors(prior, best, end, rows, at, options, found)
@@ -304,7 +305,7 @@ def _by_one(
     refused or contradicts the rest, or nothing tells that the device has not turned; the rows are
     as they were then."""
     rows, motion, n = epoch.rows, dynamics.motions[0], x.size
-    groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
+    groups = group_count(rows)
     predict_epoch(x, S, epoch, motion, dynamics.bias, options, memory)
     predicted = predicted_in(memory.work, n, rows.shape[0])
     if options.models == 1 and any_begins(x, memory.met_cov, epoch, predicted, options):
@@ -348,7 +349,7 @@ def _finish(
     note_innovations(rows, predicted, memory.innovations)
     if speed <= 0.0:
         return 0.0, open_s
-    groups, accepted = int(rows[rows.shape[0] - 1, GROUP]) + 1, step.accepted
+    groups, accepted = group_count(rows), step.accepted
     gate = options.gate_nis[2]
     _, longest_s = detection_delay_s(rows, predicted, x.size, gate, speed)
     is_open = leaves_turns_open(predicted.H, groups)
@@ -392,7 +393,7 @@ def advance(
         enough, nis, used = _by_one(x, S, epoch, dynamics, options, step)
         if enough:
             undetected_m, open_s = _finish(x, S, components, epoch, epoch.open_s, options, memory)
-            groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
+            groups = group_count(rows)
             return Outcome(components, nis, used, np.zeros(groups), undetected_m, 0.0, open_s)
         components = one_component(step.prior_mean, step.prior_cov)
         reweighted(components, rows, options)
@@ -459,7 +460,7 @@ def run_epochs(
         run.undetected_m[k] = run.undetected_m[k - 1] if k > 0 else 0.0
         if rows.shape[0] > 0:
             run.undetected_m[k] = found.undetected_m
-            groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
+            groups = group_count(rows)
             taken = memory.step.accepted[:groups].sum()
             run.groups[k] = taken
             rejected_in_row = 0 if 2 * taken >= groups else rejected_in_row + 1

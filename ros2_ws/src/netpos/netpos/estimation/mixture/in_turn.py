@@ -28,8 +28,14 @@ from netpos.estimation.mixture.splits.choice import (
     split_of,
 )
 from netpos.estimation.mixture.splits.paths import late_row, reweight_by_best
-from netpos.estimation.mixture.turns import TURNS_MAX, add_explanations, may_turn, turned
-from netpos.estimation.sensors.row import group_end
+from netpos.estimation.mixture.turns import (
+    TURNS_MAX,
+    add_explanations,
+    may_turn,
+    open_time_s,
+    turned,
+)
+from netpos.estimation.sensors.row import group_count, group_end
 from netpos.estimation.update.conditioning import by_path
 from netpos.estimation.update.fusion import predicted_in, workspace
 from netpos.estimation.update.predicted import predict_rows
@@ -103,11 +109,11 @@ def in_turn(
     has_turned, longest_s, may_be_blocked = 0.0, 0.0, options.robust.nlos_probability > 0.0
     if may_be_blocked:
         reweight_by_best(components, epoch.rows, options.height_m, by_path(options.robust))
-    best, groups = int(np.argmax(components.log_weights)), int(raw[raw.shape[0] - 1, GROUP]) + 1
+    best, groups = int(np.argmax(components.log_weights)), group_count(raw)
     outliers = np.zeros(groups)
     _, H = linearise(raw, components.means[best], options.height_m)
     begins = may_turn(H, groups, epoch.open_s, options)
-    within_s = max(epoch.open_s, epoch.unheard_s)
+    within_s = open_time_s(epoch)
     while start < raw.shape[0]:
         group, stop = int(raw[start, GROUP]), group_end(raw, start)
         alone = raw[start:stop].copy()

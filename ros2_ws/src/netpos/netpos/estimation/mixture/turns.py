@@ -15,9 +15,9 @@ from netpos.estimation.level.manoeuvre import (
     side_turns,
     turn_to_side,
 )
-from netpos.estimation.measurement import GROUP
 from netpos.estimation.mixture.candidates import Candidates, add_gated, apply
 from netpos.estimation.mixture.gaussians import Mixture, together
+from netpos.estimation.sensors.row import group_count
 from netpos.estimation.update.fusion import predicted_in, workspace
 from netpos.messages.values import Array
 
@@ -25,6 +25,13 @@ TURN_PERIOD_S = 0.25  # a component "it has turned" begins so long after the las
 TURNS_HZ = 1.0 / 30.0  # how often a device turns
 TURNS_MAX = 3  # components of ``turned``
 _LEAST_SHARE = 1e-2  # of turns to a side that are looked at
+
+
+@leaf
+def open_time_s(epoch: EpochInput) -> float:
+    """Time [s] before an epoch of which no component says whether the device turned, or since it
+    was heard."""
+    return max(epoch.open_s, epoch.unheard_s)
 
 
 @kernel
@@ -79,14 +86,14 @@ def add_turns(
 
 @kernel
 def unnoticed_s(cov: Array, epoch: EpochInput, options: FilterOptions, work: Array) -> float:
-    """``manoeuvre_s`` of a component with ``cov`` (n, n), whose prediction ``work`` holds. Where
-    epochs do not show a turn by themselves, one from before the open time is a component."""
+    """``manoeuvre_s`` of a component with ``cov`` (n, n), whose prediction ``work`` holds. No
+    longer than the open time where the epoch does not show a turn by itself: of one from before
+    that time a component says so."""
     rows = epoch.rows
     predicted = predicted_in(work, cov.shape[0], rows.shape[0])
     within_s = manoeuvre_s(cov, rows, predicted, epoch.unheard_s, options)
-    groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
-    if leaves_turns_open(predicted.H, groups):
-        within_s = min(within_s, max(epoch.open_s, epoch.unheard_s))
+    if leaves_turns_open(predicted.H, group_count(rows)):
+        within_s = min(within_s, open_time_s(epoch))
     return float(within_s)
 
 

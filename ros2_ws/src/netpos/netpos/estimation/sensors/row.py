@@ -31,6 +31,12 @@ ROW_WIDTH = 28
 
 
 @inlined
+def group_count(rows: Array) -> int:
+    """Number of groups of ``rows`` (m, ROW_WIDTH), m > 0, numbered 0, 1, ... in their order."""
+    return int(rows[rows.shape[0] - 1, GROUP]) + 1
+
+
+@inlined
 def group_end(rows: Array, start: int) -> int:
     """Index after the last row of the group that begins at ``start``."""
     stop = start + 1

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.measurement import GROUP
-from netpos.estimation.sensors.row import group_end
+from netpos.estimation.sensors.row import group_count, group_end
 from netpos.estimation.update.fit import distance2
 from netpos.messages.values import Array
 
@@ -80,7 +80,7 @@ def leave_minority_out(
     """Of the accepted groups, take out one after the other, always that without which the rest
     agree best, until they do, but fewer than half of them; False, and nothing done, where that
     does not bring them within their limit."""
-    groups = int(rows[rows.shape[0] - 1, GROUP]) + 1
+    groups = group_count(rows)
     before = accepted[:groups].copy()
     for _ in range((int(before.sum()) - 1) // 2):
         odd, least, limit = -1, np.inf, 0.0

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from netpos.estimation.engine import Epochs
-from netpos.estimation.measurement import GROUP, ORIGIN, VALUE
+from netpos.estimation.measurement import ORIGIN, VALUE
+from netpos.estimation.sensors.row import group_count
 from netpos.estimation.spatial.error_state import (
     MEMORY,
     UNCONSTRAINED,
@@ -118,7 +119,7 @@ def on_the_way(epochs: Epochs, states: Array, cov: Array, imu: Imu, sensors: Sen
         rows, before_ns, used = epochs.rows[first : epochs.row_start[i + 1]].copy(), stamp_ns, 0
         if len(rows) > 0:
             rows[:, VALUE] -= linearise_in_space(rows, nav, P)[0]
-            _, used = correct(nav, P, rows, gate, np.zeros(int(rows[-1, GROUP]) + 1))
+            _, used = correct(nav, P, rows, gate, np.zeros(group_count(rows)))
         navs[i], covs[i] = nav, P
         dof.append(used)
     return Drive(navs, covs, np.zeros(len(states)), np.array(dof))

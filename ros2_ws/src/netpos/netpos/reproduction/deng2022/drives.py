@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from netpos.estimation.compile import kernel
 from netpos.estimation.engine import Epochs
 from netpos.estimation.fixes.position_fix import fix_position, start_of
-from netpos.estimation.measurement import GROUP, KIND, ORIGIN, ROW_WIDTH, VALUE, VARIANCE, Kind
+from netpos.estimation.measurement import KIND, ORIGIN, ROW_WIDTH, VALUE, VARIANCE, Kind
+from netpos.estimation.sensors.row import group_count
 from netpos.estimation.spatial.error_state import (
     MEMORY,
     Imu,
@@ -56,7 +57,7 @@ def drive(
         now = stamp
         rows = epochs.rows[epochs.row_start[i] : epochs.row_start[i + 1]]
         if rows.shape[0] > 0:
-            accepted = np.zeros(int(rows[-1, GROUP]) + 1)
+            accepted = np.zeros(group_count(rows))
             nis[i], dof[i] = correct(state, P, rows, gate_nis, accepted)
             if dof[i] == 0:
                 doubt_standstill(memory)
@@ -112,7 +113,7 @@ def smoothed_drive(
         recorder.advance(nav, cov, memory, now, stamp, imu, sensors)
         rows, now = epochs.rows[epochs.row_start[i] : epochs.row_start[i + 1]], stamp
         if len(rows):
-            _, used = correct(nav, cov, rows, gate_nis, np.zeros(int(rows[-1, GROUP]) + 1))
+            _, used = correct(nav, cov, rows, gate_nis, np.zeros(group_count(rows)))
             if used == 0:
                 doubt_standstill(memory)
         recorder.note(nav, cov, None, sensors.slow.biases[0])

@@ -13,7 +13,7 @@ from netpos.estimation.densities import Densities, Density
 from netpos.estimation.engine import EpochInput
 from netpos.estimation.forms.table import form_of
 from netpos.estimation.level.protection import mixture_radius
-from netpos.estimation.measurement import GROUP, ROW_WIDTH
+from netpos.estimation.measurement import ROW_WIDTH
 from netpos.estimation.mixture import epoch as mixtures
 from netpos.estimation.mixture.epoch import Dynamics, Memory, Outcome
 from netpos.estimation.mixture.gaussians import (
@@ -298,7 +298,7 @@ class Estimate:
         return UpdateResult(
             outcome.nis,
             outcome.used,
-            memory.step.accepted[: int(rows.item(-1, GROUP)) + 1].tolist(),
+            memory.step.accepted[: outcome.outliers.size].tolist(),
             outcome.outliers.tolist(),
             memory.innovations[:m].copy(),
             outcome.undetected_m,
