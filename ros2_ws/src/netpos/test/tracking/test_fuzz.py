@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import math
 import os
+import subprocess
 import sys
 from collections import Counter
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -324,6 +326,24 @@ def test_the_generator_reaches_all_parts() -> None:
 def test_whatever_is_measured_nothing_raises_and_outputs_are_sound() -> None:
     _, wrong = run(int(os.environ.get("NETPOS_FUZZ", "20000")))
     assert not wrong, f"{len(wrong)} faults, first: {wrong[:3]}"
+
+
+def test_kernels_stay_within_their_memory() -> None:
+    """In Python an index beyond an array raises, a compiled kernel writes there: in this batch all
+    explanations of what is refused were one more than there was room for."""
+    code = (
+        "from test_fuzz import BATCH, CONFIGS, fuzz; print(fuzz(12, CONFIGS['robust'], BATCH)[1])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code],
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": os.pathsep.join(sys.path)},
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert (done.stdout, done.returncode) == ("[]\n", 0), done.stderr
 
 
 @pytest.mark.parametrize("name", CONFIGS)

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from netpos.estimation.compile import kernel
+from netpos.estimation.compile import inlined, kernel
 from netpos.estimation.engine import FilterOptions
 from netpos.estimation.measurement import COMMON, GROUP, VARIANCE
 from netpos.estimation.mixture.candidates import OUTLIERS, TAIL_LOG, Candidates, apply
@@ -22,6 +22,13 @@ _CLOCK = int(X.CLOCK)
 _LARGEST = 1e6  # standard deviations of a measurement: beyond it the update has no digits left
 # The log density of an outlier over that of a Gaussian as wide as the outlier is large.
 _OVER_GAUSSIAN_LOG = math.log(OUTLIERS) + TAIL_LOG + 0.5 * (1.0 + math.log(2.0 * math.pi))
+
+
+@inlined
+def most_common_errors(rows: int) -> int:
+    """How many candidates ``add_common_errors`` makes of so many rows: two for each state, and the
+    clock."""
+    return rows // 2 + 1
 
 
 @kernel

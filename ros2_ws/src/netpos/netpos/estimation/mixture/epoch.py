@@ -46,7 +46,7 @@ from netpos.estimation.mixture.candidates import (
     first_of,
     mixture_of,
 )
-from netpos.estimation.mixture.common_error import add_common_errors
+from netpos.estimation.mixture.common_error import add_common_errors, most_common_errors
 from netpos.estimation.mixture.gaussians import Mixture, leaders, moments, one_component
 from netpos.estimation.mixture.in_turn import in_turn
 from netpos.estimation.mixture.reduction import reduced
@@ -60,6 +60,7 @@ from netpos.estimation.mixture.sectors import (
 from netpos.estimation.mixture.splits.choice import any_begins, any_divides
 from netpos.estimation.mixture.splits.paths import reweight_by_best
 from netpos.estimation.mixture.turns import (
+    EXPLANATIONS_MAX,
     TURNS_MAX,
     add_explanations,
     add_turns,
@@ -197,7 +198,8 @@ def _at_once(
     count, groups = prior.log_weights.size, group_count(rows)
     sectors = 2 * most_turns(rows[at]) + 1 if at >= 0 else 0
     m, n = rows.shape[0], prior.means.shape[1]
-    size = (2 * (1 + TURNS_MAX) + m // 2 + 1) * count + (sectors + 1) * (count + 1)
+    each = 1 + EXPLANATIONS_MAX + most_common_errors(m) + TURNS_MAX
+    size = each * count + (sectors + 1) * (count + 1)
     found, work = candidates(size, n, groups), workspace(n, m)
     end = np.int64(count)
     for k in range(count):

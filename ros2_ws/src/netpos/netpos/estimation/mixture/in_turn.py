@@ -18,7 +18,7 @@ from netpos.estimation.mixture.candidates import (
     first_of,
     mixture_of,
 )
-from netpos.estimation.mixture.common_error import add_common_errors
+from netpos.estimation.mixture.common_error import add_common_errors, most_common_errors
 from netpos.estimation.mixture.gaussians import Mixture, together
 from netpos.estimation.mixture.reduction import PART_MERGE_COST, reduced
 from netpos.estimation.mixture.splits.choice import (
@@ -29,7 +29,7 @@ from netpos.estimation.mixture.splits.choice import (
 )
 from netpos.estimation.mixture.splits.paths import late_row, reweight_by_best
 from netpos.estimation.mixture.turns import (
-    TURNS_MAX,
+    EXPLANATIONS_MAX,
     add_explanations,
     may_turn,
     open_time_s,
@@ -40,8 +40,6 @@ from netpos.estimation.update.conditioning import by_path
 from netpos.estimation.update.fusion import predicted_in, workspace
 from netpos.estimation.update.predicted import predict_rows
 from netpos.messages.values import Array
-
-_EXPLANATIONS = TURNS_MAX + 3  # of what is refused: turns, a tail, an error, a step of the clock
 
 
 @kernel
@@ -82,7 +80,7 @@ def _explained(
     splits, size = np.empty(parts, dtype=np.int64), 0
     for k in range(parts):
         splits[k] = split_of(rows, prior.means[k], prior.covs[k], options)
-        size += most_candidates(splits[k]) + _EXPLANATIONS
+        size += most_candidates(splits[k]) + EXPLANATIONS_MAX + most_common_errors(rows.shape[0])
     found = candidates(size, prior.means.shape[1], 1)
     end = np.int64(0)  # no literal: it would make another version of each kernel below
     for k in range(parts):

@@ -24,6 +24,7 @@ from netpos.messages.values import Array
 TURN_PERIOD_S = 0.25  # a component "it has turned" begins so long after the last, with one RSU
 TURNS_HZ = 1.0 / 30.0  # how often a device turns
 TURNS_MAX = 3  # components of ``turned``
+EXPLANATIONS_MAX = TURNS_MAX + 1  # candidates of ``add_explanations``
 _LEAST_SHARE = 1e-2  # of turns to a side that are looked at
 
 
