@@ -12,10 +12,11 @@ paths is longer by 4 m in the mean; nobody says so. The tracker is told how free
 moves, and nothing of the clock.
 
 All RSUs of a network measure at once. Then it is run again, each of them as often and one after
-the other, but for time differences, which are those of one beacon.
+the other, but for time differences, which are those of one beacon; and where angles and times are
+measured once more, heard by its first RSU alone.
 
-Errors are those after 15 s; RMSE is the geometric mean over the networks. *Above the level* counts
-errors of all epochs that say TRACKING.
+Errors are those after 15 s; RMSE is the geometric mean over the networks that have an estimate
+then, the others are *waiting*. *Above the level* counts errors of all epochs that say TRACKING.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -54,15 +56,29 @@ MOVES = {"stands": (20.0, 0.0), "walks": (20.0, 1.3), "drives": (150.0, 10.0)}
 Json = dict[str, Any]
 
 
+class Heard(StrEnum):
+    """How the RSUs of a network hear its device; in words for its rows."""
+
+    AT_ONCE = ""
+    ONE_BY_ONE = ", one by one"
+    BY_ONE_RSU = ", one RSU"
+
+    def has(self, fields: Field) -> bool:
+        """Whether networks that measure these are run so."""
+        if self is Heard.BY_ONE_RSU:
+            return fields == Field.AZIMUTH | Field.TOA
+        return self is Heard.AT_ONCE or fields != Field.TDOA
+
+
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One network: what it measures, whether paths are late and its RSUs measure one by one; of
-    its estimates when they were (n,) [s], errors (n,) [m] and NEES (n,), which say TRACKING, and
-    which of those are above the level."""
+    """One network: what it measures, whether paths are late, how its RSUs hear the device; of its
+    estimates when they were (n,) [s], errors (n,) [m] and NEES (n,), which say TRACKING, and which
+    of those are above the level."""
 
     fields: Field
     late: float
-    one_by_one: bool
+    heard: Heard
     times: Array
     errors: Array
     nees: Array
@@ -87,14 +103,14 @@ def way(moves: str, times: Array, rng: np.random.Generator) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """Network ``k``: what it measures, where its RSUs are (count, 2) [m], how often they measure,
-    one by one or at once, the share of late paths, the sd of the biases over that of the noise,
+    """Network ``k``: what it measures, where its RSUs are (count, 2) [m], how often and how
+    they measure, the share of late paths, the sd of the biases over that of the noise,
     how the device moves, the walk of its clock, and the generators that drew all that."""
 
     fields: Field
     sites: Array
     rate_hz: float
-    one_by_one: bool
+    heard: Heard
     late: float
     bias_sd: float
     moves: str
@@ -103,18 +119,19 @@ class Network:
     clock_rng: np.random.Generator
 
     @classmethod
-    def drawn(cls, k: int, one_by_one: bool) -> Network:
+    def drawn(cls, k: int, heard: Heard) -> Network:
         """With the generator at the start of its run."""
         rng, moves = np.random.default_rng(k), list(MOVES)[k // len(MEASURED) % len(MOVES)]
         count, (size, _) = int(rng.integers(3, 9)), MOVES[moves]
         angle = 2.0 * np.pi * (np.arange(count) + rng.uniform(-0.3, 0.3, count)) / count
         far = size * rng.uniform(0.7, 1.3, count)
+        kept = 1 if heard is Heard.BY_ONE_RSU else count
         clock_rng = np.random.default_rng([k, 1])
         return cls(
             fields=MEASURED[k % len(MEASURED)],
-            sites=np.column_stack([far * np.cos(angle), far * np.sin(angle)]),
+            sites=np.column_stack([far * np.cos(angle), far * np.sin(angle)])[:kept],
             rate_hz=float(rng.choice([2.0, 5.0, 10.0])),
-            one_by_one=one_by_one,
+            heard=heard,
             late=float(rng.choice([0.0, 0.0, LATE])),
             bias_sd=float(rng.choice([0.0, 1.0, 2.0])),
             moves=moves,
@@ -126,7 +143,8 @@ class Network:
     @property
     def step_s(self) -> float:
         """Time from epoch to epoch."""
-        return 1.0 / (self.rate_hz * (len(self.sites) if self.one_by_one else 1))
+        apart = len(self.sites) if self.heard is Heard.ONE_BY_ONE else 1
+        return 1.0 / (self.rate_hz * apart)
 
     def seen(self, places: Array) -> Iterator[tuple[Array, Array]]:
         """Arrivals [m] and azimuths [rad], (count,) each, of a device at ``places`` (n, 2)."""
@@ -153,7 +171,8 @@ class Network:
     def messages(self, epoch: int, arrivals: Array, azimuths: Array) -> list[RsuMeasurement]:
         """What the RSUs send."""
         differs, count = self.fields is Field.TDOA, len(self.sites)
-        heard = [epoch % count] if self.one_by_one else range(differs, count)
+        one = self.heard is Heard.ONE_BY_ONE
+        heard = [epoch % count] if one else range(differs, count)
         found = []
         for i in heard:
             values: Json = {}
@@ -191,9 +210,9 @@ class Network:
         return found
 
 
-def run(k: int, one_by_one: bool) -> Run:
+def run(k: int, heard: Heard) -> Run:
     """Track the device of network ``k``."""
-    network = Network.drawn(k, one_by_one)
+    network = Network.drawn(k, heard)
     moves, times = network.moves, np.arange(0.0, DURATION_S, network.step_s)
     tracker = Tracker(
         TrackerConfig(
@@ -224,7 +243,7 @@ def run(k: int, one_by_one: bool) -> Run:
     return Run(
         network.fields,
         network.late,
-        one_by_one,
+        heard,
         stamps - START_S,
         errors,
         nees,
@@ -235,26 +254,29 @@ def run(k: int, one_by_one: bool) -> Run:
 
 def rows_of(runs: Sequence[Run]) -> Iterator[Json]:
     """A row for each kind of measurement, direct or late, and one for all."""
-    when = ", one by one" if runs[0].one_by_one else ""
+    how = runs[0].heard
     for fields in MEASURED:
         for late in (0.0, LATE):
-            some = [r for r in runs if r.fields == fields and r.late == late and r.settles]
+            some = [r for r in runs if r.fields == fields and r.late == late]
             if some:
                 name = " and ".join(str(f.name).lower() for f in Field if f & fields)
-                yield row_of(f"{name}, {late:.0%} late{when}", some)
-    yield row_of(f"all{when}", [r for r in runs if r.settles])
+                yield row_of(f"{name}, {late:.0%} late{how}", some)
+    if how is not Heard.BY_ONE_RSU:
+        yield row_of(f"all{how}", runs)
 
 
 def row_of(name: str, runs: Sequence[Run]) -> Json:
-    """The figures of some networks together."""
-    settled = [r.errors[r.times >= SKIPPED_S] for r in runs]
+    """The figures of some networks together; those without an estimate that counts are waiting."""
+    settled = [r.errors[r.times >= SKIPPED_S] for r in runs if r.settles]
     rmse = [math.sqrt(float(np.square(errors).mean())) for errors in settled]
+    nees = [float(r.nees[r.tracking].mean()) for r in runs if r.settles and r.tracking.any()]
     return {
         "name": name,
         "networks": len(runs),
-        "rmse_m": math.exp(float(np.log(rmse).mean())),
-        "max_m": max(float(errors.max()) for errors in settled),
-        "nees_mean": float(np.mean([r.nees[r.tracking].mean() for r in runs if r.tracking.any()])),
+        "waiting": len(runs) - len(settled),
+        "rmse_m": math.exp(float(np.log(rmse).mean())) if rmse else None,
+        "max_m": max(float(errors.max()) for errors in settled) if rmse else None,
+        "nees_mean": float(np.mean(nees)) if nees else None,
         "tracking": sum(int(r.tracking.sum()) for r in runs),
         "estimates": sum(len(r.errors) for r in runs),
         "above": sum(int(r.above.sum()) for r in runs),
@@ -268,21 +290,20 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    every = range(args.networks)
-    apart = [k for k in every if MEASURED[k % len(MEASURED)] is not Field.TDOA]
+    rows: list[Json] = []
     with ProcessPoolExecutor(args.workers) as pool:
-        at_once = list(pool.map(run, every, [False] * len(every)))
-        one_by_one = list(pool.map(run, apart, [True] * len(apart)))
-    runs = at_once + one_by_one
-    rows = [*rows_of(at_once), *rows_of(one_by_one)]
-    print("| measured | networks | RMSE [m] | largest [m] | NEES | TRACKING | above the level |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+        for heard in Heard:
+            some = [k for k in range(args.networks) if heard.has(MEASURED[k % len(MEASURED)])]
+            rows += rows_of(list(pool.map(run, some, [heard] * len(some))))
+    print("| measured | networks | waiting | RMSE [m] | largest [m] | NEES | TRACKING | above |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for row in rows:
-        print(
-            f"| {row['name']} | {row['networks']} | {row['rmse_m']:.3f} | {row['max_m']:.1f} |"
-            f" {row['nees_mean']:.2f} | {row['tracking']} of {row['estimates']} | {row['above']} |"
+        figures = (
+            f"{row[key]:.3g}" if row[key] else "" for key in ("rmse_m", "max_m", "nees_mean")
         )
-    print(f"{sum(not r.settles for r in runs)} runs without a first fix")
+        counts = f"{row['networks']} | {row['waiting']}"
+        said = f"{row['tracking']} of {row['estimates']} | {row['above']}"
+        print(f"| {row['name']} | {counts} | {' | '.join(figures)} | {said} |")
     if args.json is not None:
         document = {"networks": args.networks, "rows": rows}
         args.json.write_text(json.dumps(document, indent=1) + "\n")

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-_ITERATIONS = 30
+_ITERATIONS = 100
 _DAMPING, _DAMPING_MIN, _DAMPING_MAX = 1e-3, 1e-12, 1e8
 _GAIN_MIN = 1e-6  # of the cost, beside 1
 
@@ -30,7 +30,9 @@ def minimise(
     state, damping = start, _DAMPING
     cost, b, A = equations(state)
     for _ in range(_ITERATIONS):
-        tried = state + solve(A + damping * np.diag(np.diag(A)), b)
+        damped = A.copy()
+        np.fill_diagonal(damped, (1.0 + damping) * A.diagonal())
+        tried = state + solve(damped, b)
         new_cost, new_b, new_A = equations(tried)
         if new_cost < cost:
             done = cost - new_cost < _GAIN_MIN * (1.0 + cost)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from netpos.common.least_squares import minimise
 from netpos.estimation.mixture.gaussians import Mixture
-from netpos.estimation.mixture.ridge import Equations, Fit, components_of, inverse
+from netpos.estimation.mixture.ridge import Equations, Fit, components_of, inverse, on_line, solve
 from netpos.messages.values import Array
 
 ANCHORS = np.array([[1.3, 2.2], [-1.3, 2.2], [1.3, -2.2], [-1.3, -2.2]])
@@ -42,7 +43,7 @@ def minima(equations: Equations, radius: float) -> list[Fit]:
     fits = []
     for angle in 0.1 + 2.0 * math.pi * np.arange(12) / 12:
         start = np.array([radius * math.cos(angle), radius * math.sin(angle), 0.0, 0.0])
-        cost, state, A = minimise(equations, start, lambda A, b: inverse(A) @ b)
+        cost, state, A = minimise(equations, start, solve)
         fits.append((cost, state, inverse(A)))
     return sorted(fits, key=lambda fit: fit[0])
 
@@ -64,6 +65,16 @@ def on_grid(anchors: Array, measured: Array) -> tuple[Array, Array, float]:
     return mean, cov, float(weight[xy[1] > 0.0].sum())
 
 
+def posterior_of(
+    equations: Equations,
+    fits: list[Fit],
+    is_possible: Callable[[Array], bool] = lambda _: True,
+) -> Mixture:
+    found = components_of(equations, fits, [], is_possible)
+    assert found is not None
+    return found
+
+
 def moments(mixture: Mixture) -> tuple[Array, Array, Array]:
     """Weights, mean and covariance of the position, by NumPy."""
     weights = np.exp(mixture.log_weights - mixture.log_weights.max())
@@ -79,7 +90,7 @@ def test_a_thin_arc_is_a_row_of_gaussians(seed: int) -> None:
     """The figures for one Gaussian at the minimum are 0.3 to 0.4 sd."""
     anchors, measured = ranges(seed)
     equations = equations_of(anchors, measured)
-    found = components_of(equations, minima(equations, measured.mean()), lambda _: True)
+    found = posterior_of(equations, minima(equations, measured.mean()))
     weights, mean, cov = moments(found)
     expected, expected_cov, _ = on_grid(anchors, measured)
     away = mean - expected
@@ -95,7 +106,7 @@ def test_two_places_have_the_weights_of_their_evidence() -> None:
     anchors = np.array([[-15.0, 4.0], [15.0, 4.0]])
     measured = np.hypot(*(np.array([3.0, -14.0]) - anchors).T)
     equations = equations_of(anchors, measured)
-    found = components_of(equations, minima(equations, 18.0), lambda _: True)
+    found = posterior_of(equations, minima(equations, 18.0))
     weights, _, _ = moments(found)
     _, _, above = on_grid(anchors, measured)
     assert 0.2 < above < 0.5
@@ -112,7 +123,7 @@ def test_a_straight_posterior_is_its_one_gaussian() -> None:
         off = centre - state
         return float(off @ A @ off), A @ off, A
 
-    found = components_of(equations, [(0.0, centre, np.linalg.inv(A))], lambda _: True)
+    found = posterior_of(equations, [(0.0, centre, np.linalg.inv(A))])
     np.testing.assert_allclose(found.means, [centre])
     np.testing.assert_allclose(found.covs, [np.linalg.inv(A)], rtol=1e-9)
     evidence = 0.5 * math.log(np.linalg.det(2.0 * math.pi * np.linalg.inv(A)))
@@ -124,5 +135,46 @@ def test_what_is_impossible_is_left_out() -> None:
     equations = equations_of(anchors, measured)
     fits = minima(equations, measured.mean())
     side = float(fits[0][1][0])
-    found = components_of(equations, fits, lambda state: bool(state[0] > side - 1e-6))
+    found = posterior_of(equations, fits, lambda state: bool(state[0] > side - 1e-6))
     assert (found.means[:, 0] > side - 1e-6).all()
+
+
+@pytest.mark.parametrize("sd_deg", [0.5, 2.0, 8.0])
+@pytest.mark.parametrize("start_m", [2.0, 15.0, 100.0])
+def test_a_ray_is_followed_from_anywhere_on_it(start_m: float, sd_deg: float) -> None:
+    """One angle, of a device about 150 m from the array: the distance is of a Rayleigh
+    distribution, and what is a metre from the array counts as much as what is 300 m away, for the
+    area it has."""
+    sd, reach = math.radians(sd_deg), 150.0
+
+    def equations(state: Array) -> tuple[float, Array, Array]:
+        x, y = state
+        h = np.array([-y, x]) / (x * x + y * y)
+        error = 0.4 - math.atan2(y, x)
+        cost = state @ state / reach**2 + error**2 / sd**2
+        return (
+            cost,
+            h * error / sd**2 - state / reach**2,
+            np.outer(h, h) / sd**2 + np.eye(2) / reach**2,
+        )
+
+    towards = np.array([math.cos(0.4), math.sin(0.4)])
+    fit = on_line(equations, start_m * towards, towards)
+    found = components_of(equations, [], [fit], lambda state: bool(np.hypot(*state) > 1.0))
+    assert found is not None
+    weights, mean, cov = moments(found)
+    along = np.array([towards, [-towards[1], towards[0]]])
+    kept = math.exp(-0.5 * sd**2)  # mean of the cosine of an angle
+    distance = reach * math.sqrt(math.pi / 2.0)
+    assert (np.hypot(*found.means.T) > 1.0).all()
+    np.testing.assert_allclose(along @ mean, [kept * distance, 0.0], atol=0.02 * distance)
+    square = reach**2 * np.array([1.0 + kept**4, 1.0 - kept**4]) - [(kept * distance) ** 2, 0.0]
+    np.testing.assert_allclose(np.sqrt(np.diag(along @ cov @ along.T)), np.sqrt(square), rtol=0.1)
+    near = np.hypot(*found.means.T) < 20.0
+    assert weights[near].sum() == pytest.approx(-math.expm1(-0.5 * (20.0 / reach) ** 2), abs=0.01)
+
+
+def test_nothing_that_is_possible_is_no_posterior() -> None:
+    anchors, measured = ranges(3)
+    equations = equations_of(anchors, measured)
+    assert components_of(equations, minima(equations, 10.0), [], lambda _: False) is None

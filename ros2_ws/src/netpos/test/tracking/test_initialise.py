@@ -170,11 +170,12 @@ def test_spherical_arrays_see_behind_themselves() -> None:
 
 def test_motion_within_the_window_is_part_of_the_fit() -> None:
     """A moving device, ranges of one anchor per epoch: position and velocity at the newest stamp,
-    against SciPy's solution of the same least-squares problem."""
+    against SciPy's solution of the same least-squares problem. In each half of the 1.5 s the
+    acceleration, a constant, moves the device as far as white acceleration would."""
     rng = np.random.default_rng(3)
     stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40), rsu(40, 40)]
-    config = TrackerConfig(initial_position_sd_max_m=1e-3, initial_window_s=2.0)
-    initialiser = Initialiser(config)
+    accel = {"accel_density_mps2_sqrthz": 0.7, "initial_window_s": 2.0}
+    initialiser = Initialiser(TrackerConfig(initial_position_sd_max_m=1e-3, **accel))
     velocity, end = np.array([6.0, -3.0]), np.array([22.0, 17.0])
     observed = []
     for k in range(16):
@@ -191,25 +192,36 @@ def test_motion_within_the_window_is_part_of_the_fit() -> None:
     centre = np.mean([o for _, o, _ in observed], axis=0)
 
     def residuals(x: Array) -> Array:
-        fit = [(np.hypot(*(x[:2] + x[2:] * age - o)) - value) / 0.3 for age, o, value in observed]
-        prior = [*((x[:2] - centre) / 150.0), *(x[2:] / 5.0)]
-        return np.array([*fit, *prior])
+        place, speed, late, early = x.reshape(4, 2)
+        fit = []
+        for age, origin, value in observed:
+            last = max(age, -0.75)
+            there = place + speed * last + late * last**2 / 2.0
+            if age < -0.75:
+                first = age + 0.75
+                there += (speed - 0.75 * late) * first + early * first**2 / 2.0
+            fit.append((np.hypot(*(there - origin)) - value) / 0.3)
+        turned = np.array([late, early]) * 0.75**2 / 2.0 / (0.7 * math.sqrt(0.75**3 / 3.0))
+        prior = [(place - centre) / 150.0, speed / 5.0, *turned]
+        return np.array([*fit, *np.ravel(prior)])
 
-    oracle = least_squares(residuals, [20.0, 20.0, 0.0, 0.0], xtol=1e-14, ftol=1e-14)
-    rows_of_last = Initialiser(TrackerConfig(initial_window_s=2.0))
+    start = [20.0, 20.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    oracle = least_squares(residuals, start, xtol=1e-14, ftol=1e-14)
+    rows_of_last = Initialiser(TrackerConfig(**accel))
     for stamp, rows, rsus in initialiser._window:
         rows_of_last.add(stamp, rows, rsus)
     solution = fix_of(rows_of_last)
     assert solution is not None
-    np.testing.assert_allclose(solution[0][:4], oracle.x, atol=1e-3)
+    np.testing.assert_allclose(solution[0][:4], oracle.x[:4], atol=1e-3)
     cov = np.linalg.inv(oracle.jac.T @ oracle.jac) * max(1.0, 2 * oracle.cost / len(observed))
-    np.testing.assert_allclose(solution[1][:4, :4], cov, rtol=2e-2, atol=1e-3)
+    np.testing.assert_allclose(solution[1][:4, :4], cov[:4, :4], rtol=2e-2, atol=1e-3)
 
 
 def test_clock_drift_within_the_window_is_part_of_the_fit() -> None:
     """Over 1 s of TOA the offset at the newest stamp and its rate (30 ppm) both show."""
     stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40)]
-    config = TrackerConfig(initial_position_sd_max_m=0.3, isolate_rsus=False)
+    steady = {"accel_density_mps2_sqrthz": 1e-3, "clock_walk_density": 1e-12}
+    config = TrackerConfig(initial_position_sd_max_m=0.3, isolate_rsus=False, **steady)
     initialiser = Initialiser(config)
     solution = None
     for k in range(11):
@@ -260,3 +272,60 @@ def test_a_fit_on_top_of_an_rsu_is_refused() -> None:
     solution = fix_of(initialiser)
     assert solution is not None
     np.testing.assert_allclose(solution[0][:2], [0.0, 0.5], atol=0.1)
+
+
+def test_one_rsu_and_an_unknown_clock_tell_no_distance_of_a_device_that_stands() -> None:
+    """Beside the RSU any angle fits, and a metre along the ray is worth nothing there: the most
+    probable state is a metre away, with an sd of centimetres."""
+    config = TrackerConfig(initial_speed_sd_mps=1.5)
+    for seed in range(5):
+        initialiser, station = Initialiser(config), rsu(0, 0)
+        rng = np.random.default_rng(seed)
+        for k in range(12):
+            rows = measure(station, at(9.0, 7.0, 5000.0), Field.AZIMUTH | Field.TOA, rng)
+            initialiser.add(T0 + k * 250_000_000, rows, (station,))
+            assert initialiser.solve() is None
+        assert float(initialiser.missing.split("sd of ")[1].split(" m")[0]) > 20.0
+
+
+def test_who_waits_for_long_is_tried_less_often() -> None:
+    """After a twentieth of the time it has waited; after a silence as often as at first."""
+    initialiser, a, b = Initialiser(TrackerConfig()), rsu(0, 0), rsu(40, 0)
+
+    def solved_after(first_s: float, count: int) -> float:
+        """Seconds from when ``b`` is heard, after ``count`` epochs of ``a`` alone."""
+        for k in range(count + 100):
+            stamp_ns = T0 + round(1e9 * (first_s + 0.1 * k))
+            rows = [measure(s, at(12, 25), Field.AZIMUTH) for s in (a, b)[: 1 + (k >= count)]]
+            initialiser.add(stamp_ns, np.vstack(rows), (a, b)[: len(rows)])
+            if initialiser.solve() is not None:
+                return 0.1 * (k - count)
+        return math.inf
+
+    assert 0.1 <= solved_after(0.0, 400) <= 2.1
+    assert solved_after(100.0, 1) <= 0.11
+
+
+def test_the_fix_of_a_device_that_accelerates_is_as_wide_as_its_errors() -> None:
+    """White acceleration of 2 m/s^2/sqrt(Hz) in the three seconds in which four RSUs measure one
+    after the other: NEES of position and velocity, 4 expected. It is 900 where the device is
+    thought to move straight, and 76 with one acceleration for all the time."""
+    config = TrackerConfig(accel_density_mps2_sqrthz=2.0, initial_window_s=3.0)
+    stations, dt, nees = [rsu(0, 0), rsu(40, 0), rsu(0, 40), rsu(40, 40)], 0.1, []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        initialiser, truth = Initialiser(config), at(18.0, 15.0)
+        truth[2:4] = rng.normal(0.0, 3.0, 2)
+        for k in range(31):
+            station = stations[k % 4]
+            rows = measure(station, truth, Field.RANGE, rng)
+            initialiser.add(T0 + k * 100_000_000, rows, (station,))
+            if k < 30:
+                kick = rng.normal(0.0, 2.0 * math.sqrt(dt), 2)
+                truth[:2] += truth[2:4] * dt + 0.5 * dt * kick
+                truth[2:4] += kick
+        solution = fix_of(initialiser)
+        assert solution is not None
+        error = solution[0][:4] - truth[:4]
+        nees.append(float(error @ np.linalg.solve(solution[1][:4, :4], error)))
+    assert 3.0 < np.mean(nees) < 6.0

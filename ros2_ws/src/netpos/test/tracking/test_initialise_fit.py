@@ -46,8 +46,14 @@ def mixed_rows() -> tuple[list[Rsu], Array, Array]:
 
 
 def problem_of(rows: Array, prior: Array, prior_var: Array) -> Problem:
-    """Rows of one instant."""
-    return Problem(Window(np.zeros(len(rows)), rows, 0.0), prior, prior_var)
+    """Rows of one instant, that tell nothing of accelerations."""
+    window = Window(np.zeros(len(rows)), rows, 0.0, len(prior), 1.0, 1)
+    return Problem(window, np.append(prior, np.zeros(3)), np.append(prior_var, np.ones(3)))
+
+
+def still(*values: float) -> Array:
+    """The state of a device at rest that does not accelerate either."""
+    return np.append(at(*values), np.zeros(3))
 
 
 def linearised(state: Array, window: Window) -> tuple[Array, Array]:
@@ -56,6 +62,13 @@ def linearised(state: Array, window: Window) -> tuple[Array, Array]:
     for age, row in zip(window.ages_s, window.rows, strict=True):
         F = np.eye(state.size)
         F[0, 2] = F[1, 3] = F[4, 5] = age
+        for k in range(window.parts):
+            end, start = (-window.part_s * part for part in (k, k + 1))
+            start, at = max(start, age), window.first + 3 * k
+            if start < end:  # back from the end: over the part, then evenly
+                F[[2, 3, 5], [at, at + 1, at + 2]] = start - end
+                over = 0.5 * (end - start) ** 2 + (start - end) * (age - start)
+                F[[0, 1, 4], [at, at + 1, at + 2]] = over
         innovation, H = linearise(row[None], F @ state, window.height_m)
         left.append(innovation[0])
         J.append((H @ F)[0])
@@ -76,31 +89,32 @@ def test_cost_gradient_and_curvature_of_the_fit(shares: bool) -> None:
     _, rows, ages = mixed_rows()
     prior = np.array([1.0, 2.0, 0.5, -0.5, 300.0, 20.0])
     prior_var, errors_var = np.array([900.0, 900.0, 25.0, 25.0, 1e4, 400.0]), np.zeros(0)
-    signs = np.zeros((len(rows), 2 * shares))
+    signs, named = np.zeros((len(rows), 2 * shares)), [6, 7][: 2 * shares]
     if shares:
         errors_var = np.array([0.5, 2.0])
-        for column, named, error in (
+        for column, of_it, error in (
             (BIAS, [0, 3, 4], 0),
             (COMMON, [6, 7], 1),
             (REFERENCE, [5], 0),
         ):
-            rows[named, column] = 6 + error
-            signs[named, error] = -1.0 if column == REFERENCE else 1.0
-    window = Window(ages, rows, 0.7)
-    several = np.append(prior, 0.0 * errors_var), np.append(prior_var, errors_var)
-    problem = Problem(window, *several)
+            rows[of_it, column] = 6 + error
+            signs[of_it, error] = -1.0 if column == REFERENCE else 1.0
+    window = Window(ages, rows, 0.7, 6 + errors_var.size, 0.8, 2)
+    behind = np.append(errors_var, [4.0, 1.0, 9.0, 2.0, 3.0, 5.0])
+    problem = Problem(window, np.append(prior, 0.0 * behind), np.append(prior_var, behind))
     rng = np.random.default_rng(2)
     for _ in range(5):
         state = np.array([-12.0, 0.5, 3.0, -2.0, 500.0, 40.0]) + rng.normal(size=6)
-        state = np.append(state, rng.normal(size=errors_var.size))
+        state = np.append(state, rng.normal(size=behind.size))
         cost, half_gradient, hessian = normal_equations(state, *problem)
         assert cost == pytest.approx(cost_of(state, problem), rel=1e-10)
         numeric = np.empty(state.size)
         for i, e in enumerate(np.eye(state.size) * 1e-5):
             numeric[i] = (cost_of(state + e, problem) - cost_of(state - e, problem)) / 2e-5
         np.testing.assert_allclose(half_gradient, -numeric / 2, rtol=1e-5, atol=1e-3)
-        J = linearised(state, window)[1][:, :6]
+        J, turns = np.split(np.delete(linearised(state, window)[1], named, axis=1), [6], axis=1)
         R = np.diag(rows[:, VARIANCE]) + signs @ np.diag(errors_var) @ signs.T
+        R += turns @ np.diag(behind[-6:]) @ turns.T
         expected = np.linalg.inv(np.diag(1 / prior_var) + J.T @ np.linalg.solve(R, J))
         np.testing.assert_allclose(np.linalg.inv(hessian)[:6, :6], expected, rtol=1e-7, atol=1e-9)
 
@@ -114,13 +128,13 @@ def test_the_solver_ends_in_a_minimum_from_anywhere(seed: int) -> None:
     rows = np.vstack([measure(s, at(25.0, 18.0), fields, rng) for s in stations])
     prior_var = np.array([150.0**2, 150.0**2, 25.0, 25.0, 1e4, 1e4])
     problem = problem_of(rows, np.array([13.0, 13.0, 0, 0, 0, 0]), prior_var)
-    start = np.array([*rng.uniform(-60, 60, 2), 0, 0, 0, 0])
+    start = still(*rng.uniform(-60, 60, 2))
     cost, state, cov = _solve(start, problem)
     assert cost <= cost_of(start, problem)
     _, half_gradient, hessian = normal_equations(state, *problem)
     # in units of the sd of the solution
     assert math.sqrt(half_gradient @ np.linalg.solve(hessian, half_gradient)) < 0.02
-    np.testing.assert_allclose(cov @ hessian, np.eye(6), atol=1e-8)
+    np.testing.assert_allclose(cov @ hessian, np.eye(9), atol=1e-8)
 
 
 @pytest.mark.parametrize("start", [(-59.4, 38.5), (43.2, 50.2), (22.7, 41.0), (-5.2, 57.1)])
@@ -130,10 +144,10 @@ def test_a_step_uphill_is_tried_again_shorter(start: tuple[float, float]) -> Non
     rows = np.vstack([measure(s, at(25.0, 18.0), Field.AZIMUTH) for s in stations])
     prior_var = np.array([150.0**2, 150.0**2, 25.0, 25.0, 1e4, 1e4])
     problem = problem_of(rows, np.array([13.0, 13.0, 0, 0, 0, 0]), prior_var)
-    cost, b, A = normal_equations(at(*start), *problem)
-    first = at(*start) + np.linalg.solve(A + 1e-3 * np.diag(np.diag(A)), b)
+    cost, b, A = normal_equations(still(*start), *problem)
+    first = still(*start) + np.linalg.solve(A + 1e-3 * np.diag(np.diag(A)), b)
     assert cost_of(first, problem) > cost
-    end, state, _ = _solve(at(*start), problem)
+    end, state, _ = _solve(still(*start), problem)
     assert end < 0.02
     np.testing.assert_allclose(state[:2], [25.0, 18.0], atol=1.0)
 
@@ -371,8 +385,9 @@ def test_the_one_of_four_that_contradicts_the_others_is_left_out(liar: int) -> N
 def test_averaging_never_beats_the_bias() -> None:
     """Ten epochs with a 1 m bias in each range: the mean keeps the variance of the bias."""
     stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40)]
-    config = TrackerConfig(initial_position_sd_max_m=0.2, initial_speed_sd_mps=1e-3)
-    wide = TrackerConfig(initial_speed_sd_mps=1e-3, isolate_rsus=False)
+    stands = {"initial_speed_sd_mps": 1e-3, "accel_density_mps2_sqrthz": 1e-3}
+    config = TrackerConfig(initial_position_sd_max_m=0.2, **stands)
+    wide = TrackerConfig(isolate_rsus=False, **stands)
     slow = SlowErrors(6, np.ones(3), np.ones(3, np.bool_))
     biased, free, open_ = Initialiser(config), Initialiser(config), Initialiser(wide)
     for k in range(10):

@@ -85,8 +85,9 @@ def moments(components: Mixture) -> tuple[Array, Array]:
 @leaf
 def _log_sum(terms: Array) -> float:
     """Log of the sum of values given by their logs."""
-    top = terms.max()
-    total = 0.0
+    top, total = -math.inf, 0.0
+    for term in terms:
+        top = max(top, term)
     for term in terms:
         if term > top - _NOTHING_LOG:
             total += math.exp(term - top)

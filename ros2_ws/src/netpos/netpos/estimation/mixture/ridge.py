@@ -4,20 +4,22 @@ Ranges of near anchors, or an angle and few ranges, leave a thin arc: long one w
 and bent. One Gaussian at its most probable point is too short, too thick or off. Here the arc is
 followed from that point both ways, and becomes a row of Gaussians, each so short that its
 second-order variance is a twentieth of the variance across (Tuggle and Zanetti 2018 split along
-the direction of greatest curvature, too). Each is the product of the posterior and of a Gaussian
-along the arc, by Laplace's approximation: the Gaussians along the arc add up to a constant, so
-that the products add up to the posterior.
+the direction of greatest curvature, too), and that the arc is hardly wider at one end than at the
+other: along a ray they become longer with the distance (Peach 1995 covers a range so). Each is the
+product of the posterior and of a Gaussian along the arc, by Laplace's approximation: the Gaussians
+along the arc add up to a constant, so that the products add up to the posterior.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from netpos.common.least_squares import minimise
+from netpos.estimation.factor import factor, solve_factored
 from netpos.estimation.mixture.gaussians import CURVATURE_SHARE, SPACING_SD, Mixture
 from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import Array
@@ -30,10 +32,13 @@ Equations = Callable[[Array], tuple[float, Array, Array]]
 # A cost one sd away that differs by so much from the one of a Gaussian (1) shifts the mean by 1.5
 # times as many sd, where it is higher on one side.
 _UNEVEN = 0.05
+_EVEN = 0.2  # of the width across: how much it may change one sd along a component
+_GROWS = 1.25  # by how much a component may be longer or shorter than the one before
 _TIGHT = 0.01  # sd, over a component's, that holds a point at its place along the arc
 _COST_MAX = 37.0  # twice the log of the least weight of a component
 _PIECES_MAX = 32  # one way from the most probable point
 _SAME2 = 9.0  # squared Mahalanobis distance within which a minimum belongs to a component
+_SIDES = (-1.0, 1.0)
 _PLACE = slice(POSITION.start, VELOCITY.stop)
 
 
@@ -52,20 +57,32 @@ class _Line(NamedTuple):
 
 
 def components_of(
-    equations: Equations, fits: Sequence[Fit], is_possible: Callable[[Array], bool]
-) -> Mixture:
-    """The posterior with the cost of ``equations``, of which ``fits`` are the minima, best first;
-    log weights are not normalised.
+    equations: Equations,
+    minima: Sequence[Fit],
+    held: Sequence[Fit],
+    is_possible: Callable[[Array], bool],
+) -> Mixture | None:
+    """The posterior with the cost of ``equations``; log weights are not normalised.
 
-    is_possible : whether the device may be in a state; components that are not are left out
+    minima, held : where the cost is least; states of its arcs (``on_line``), from which they are
+        followed as far as no minimum has led
+    is_possible : whether the device may be in a state; components that are not are left out, None
+        where that leaves nothing
     """
     pieces: list[_Piece] = []
-    for fit in fits:
-        if fit[0] <= fits[0][0] + _COST_MAX and not _is_known(fit[1], pieces):
-            limit = fits[0][0] + _COST_MAX
-            pieces += [p for p in _along(equations, fit, limit) if is_possible(p.mean)]
+    limit = min(cost for cost, _, _ in (*minima, *held)) + _COST_MAX
+    for starts in (minima, held):
+        for fit in sorted(starts, key=log_weight_of, reverse=True):
+            if fit[0] <= limit and not _is_known(fit[1], pieces):
+
+                def ends(state: Array, known: tuple[_Piece, ...] = tuple(pieces)) -> bool:
+                    return not is_possible(state) or _is_known(state, known)
+
+                along = _along(equations, fit, limit, ends)
+                pieces += along or ([_whole(fit)] if starts is minima else [])
+    pieces = [piece for piece in pieces if is_possible(piece.mean)]
     if not pieces:
-        pieces = [_whole(fits[0])]
+        return None
     return Mixture(
         np.array([p.mean for p in pieces]),
         np.array([p.cov for p in pieces]),
@@ -80,6 +97,22 @@ def inverse(A: Array) -> Array:
     # 1e-14 is rounding: it keeps inv from calling singular what is only ill-conditioned.
     inverted: Array = np.linalg.inv(A * scaling + 1e-14 * np.eye(len(A))) * scaling
     return inverted
+
+
+def solve(A: Array, b: Array) -> Array:
+    """x (n,) of A x = b for a positive definite ``A`` (n, n)."""
+    x = b[:, None].copy()
+    solve_factored(factor(A), x)
+    return x[:, 0]
+
+
+def on_line(equations: Equations, start: Array, direction: Array) -> Fit:
+    """The most probable state where the position (2,) is the one of ``start`` (n,) along
+    ``direction`` (2,), and the covariance (n, n) there without that."""
+    line = _Line(start[POSITION], direction, _TIGHT)
+    state = _minimum(equations, line, start)[1]
+    cost, _, A = equations(state)
+    return cost, state, inverse(A)
 
 
 def _log_det(cov: Array) -> float:
@@ -99,7 +132,7 @@ def _whole(fit: Fit) -> _Piece:
     return _Piece(log_weight_of(fit), mean, cov)
 
 
-def _is_known(state: Array, pieces: list[_Piece]) -> bool:
+def _is_known(state: Array, pieces: Sequence[_Piece]) -> bool:
     """Whether a minimum lies within a component there is."""
     for piece in pieces:
         away = state[_PLACE] - piece.mean[_PLACE]
@@ -120,7 +153,7 @@ def _minimum(equations: Equations, line: _Line, start: Array) -> Fit:
         A[POSITION, POSITION] += weight * np.outer(u, u)
         return cost + weight * off * off, b, A
 
-    cost, state, A = minimise(held, start, lambda A, b: inverse(A) @ b)
+    cost, state, A = minimise(held, start, solve)
     return cost, state, inverse(A)
 
 
@@ -133,52 +166,88 @@ def _axis(cov: Array) -> tuple[float, Array, Array, float]:
     return math.sqrt(values[1]), u, follows, math.sqrt(max(values[0], 0.0))
 
 
-def _along(equations: Equations, fit: Fit, cost_max: float) -> list[_Piece]:
-    """Components of the arc through a minimum; one where it is straight."""
+def _along(
+    equations: Equations, fit: Fit, cost_max: float, ends: Callable[[Array], bool]
+) -> list[_Piece]:
+    """Components of the arc through a state on it, as far as where it ``ends``; none where it is
+    straight and as wide all along."""
     sd, u, follows, across = _axis(fit[2])
-    bend, differs = 0.0, False
-    for side in (-sd, sd):
-        q = fit[1] + side * follows
-        cost, state, _ = _minimum(equations, _Line(q[POSITION], u, _TIGHT * sd), q)
+
+    def beside(off: float) -> Fit:
+        q = fit[1] + off * follows
+        return _minimum(equations, _Line(q[POSITION], u, _TIGHT * abs(off)), q)
+
+    wider = [
+        side * (_across(equations, beside(side * across)[1]) / across - 1.0) for side in _SIDES
+    ]
+    growth = min(wider, key=abs) / across  # the other may be that of another arc
+    step = min(sd, _EVEN / max(abs(growth), 1e-9))
+    bend, differs = 0.0, step < sd
+    for side in (-step, step):
+        cost, state, _ = beside(side)
         away = state[POSITION] - fit[1][POSITION]
-        bend += float(away[1] * u[0] - away[0] * u[1]) / sd**2
-        differs |= abs(cost - fit[0] - 1.0) > _UNEVEN
+        bend += float(away[1] * u[0] - away[0] * u[1]) / step**2
+        differs |= abs(cost - fit[0] - (step / sd) ** 2) > _UNEVEN
     is_bent = 0.5 * bend**2 * sd**4 > CURVATURE_SHARE * across**2
     if not is_bent and not differs:
-        return [_whole(fit)]
-    short = min(
-        math.sqrt(math.sqrt(2.0 * CURVATURE_SHARE) * across / max(abs(bend), 1e-9)), 0.5 * sd
-    )
-    pieces = [_piece(equations, _Line(fit[1][POSITION], u, short), fit[1])]
-    for side in (-1.0, 1.0):
-        pieces += _one_way(equations, fit, side * u, short, cost_max)
+        return []
+    short = min(_length(sd, across, abs(bend), growth), step)
+    pieces = [_piece(equations, _Line(fit[1][POSITION], u, short), fit[1], growth)]
+    if ends(pieces[0].mean):
+        return []
+    for side in _SIDES:
+        for piece in _one_way(equations, fit, side * u, short, cost_max):
+            if ends(piece.mean):
+                break
+            pieces.append(piece)
     return pieces
+
+
+def _across(equations: Equations, state: Array) -> float:
+    """The sd across at a ``state`` (n,) of the arc."""
+    return _axis(inverse(equations(state)[2]))[3]
+
+
+def _length(sd: float, across: float, bend: float, growth: float) -> float:
+    """Sd of a component of an arc of ``sd`` along and ``across``, that turns by ``bend`` [1/m] and
+    becomes wider by the share ``growth`` [1/m]."""
+    by_bend = math.sqrt(math.sqrt(2.0 * CURVATURE_SHARE) * across / max(bend, 1e-9))
+    return min(by_bend, 0.5 * sd, _EVEN / max(abs(growth), 1e-9))
 
 
 def _one_way(
     equations: Equations, fit: Fit, towards: Array, short: float, cost_max: float
-) -> list[_Piece]:
-    """Components of the sd ``short`` along the arc that leaves a minimum ``towards`` (2,)."""
-    pieces: list[_Piece] = []
-    state, cov = fit[1], fit[2]
+) -> Iterator[_Piece]:
+    """Components along the arc that leaves a minimum ``towards`` (2,), the first of about the sd
+    ``short``."""
+    _, state, cov = fit
+    _, u, follows, across = _axis(cov)
     for _ in range(_PIECES_MAX):
-        _, u, follows, _ = _axis(cov)
         side = 1.0 if float(u @ towards) > 0.0 else -1.0
         towards = side * u
         q = state + SPACING_SD * short * side * follows
-        line = _Line(q[POSITION], towards, _TIGHT * short)
-        cost, state, _ = _minimum(equations, line, q)
+        cost, new, _ = _minimum(equations, _Line(q[POSITION], towards, _TIGHT * short), q)
         if not math.isfinite(cost) or cost > cost_max:
             break
-        cov = inverse(equations(state)[2])
-        u = _axis(cov)[1]
-        pieces.append(_piece(equations, _Line(state[POSITION], u, short), state))
-    return pieces
+        sd, u, follows, wide = _axis(inverse(equations(new)[2]))
+        if wide == 0.0:  # lost to rounding: the device is on top of an RSU
+            break
+        moved = float(np.hypot(*(new - state)[POSITION]))
+        turned = abs(float(u[0] * towards[1] - u[1] * towards[0]))
+        growth = math.log(wide / across) / moved
+        length, before = _length(sd, wide, turned / moved, growth), short
+        short = min(max(length, short / _GROWS), short * _GROWS)
+        piece = _piece(equations, _Line(new[POSITION], towards, short), new, growth)
+        share = math.log(0.5 * (before + short) / short)  # of the constant that all add up to
+        yield piece._replace(log_weight=piece.log_weight + share)
+        state, across = new, wide
 
 
-def _piece(equations: Equations, line: _Line, start: Array) -> _Piece:
-    """The product of the posterior and of a Gaussian along the arc, times their spacing."""
-    whole = _whole(_minimum(equations, line, start))
-    return whole._replace(
-        log_weight=whole.log_weight + math.log(SPACING_SD / math.sqrt(2.0 * math.pi))
-    )
+def _piece(equations: Equations, line: _Line, start: Array, growth: float) -> _Piece:
+    """The product of the posterior and of a Gaussian along the arc, times their spacing. The arc
+    becomes wider along the line by the share ``growth`` [1/m]: there is more of it that way."""
+    log_weight, mean, cov = _whole(_minimum(equations, line, start))
+    pull = cov[:, POSITION] @ (growth * line.direction)
+    log_weight += math.log(SPACING_SD / math.sqrt(2.0 * math.pi))
+    log_weight += 0.5 * growth * float(line.direction @ pull[POSITION])
+    return _Piece(log_weight, mean + pull, cov)

@@ -4,8 +4,9 @@ deserves.
 A maximum a posteriori fit of [x, y, vx, vy, clock, drift], and of the slow errors in the
 measurements (the height too, where it is unknown), at the newest stamp to all measurements of a
 short window: Gauss-Newton from several starts, under a prior as wide as the coverage of the RSUs,
-the initial speed and the clock allow. It takes any mixture of angles, times, ranges and fixes, and
-it waits while the measurements leave the position open. The track goes on with the slow errors as
+the initial speed and the clock allow; in parts of the window device and clock accelerate as
+the process noise says. It takes any mixture of angles, times, ranges and fixes, and it waits while
+the measurements leave the position open. The track goes on with the slow errors as
 the fit found them: what they have in common with the position is not heard twice.
 """
 
@@ -20,6 +21,7 @@ import numpy as np
 
 from netpos.common.least_squares import minimise
 from netpos.estimation.chi_square import chi_square_bound
+from netpos.estimation.densities import MOST, Density, held
 from netpos.estimation.measurement import (
     AXES,
     BIAS,
@@ -37,9 +39,16 @@ from netpos.estimation.measurement import (
     Kind,
     wrap,
 )
-from netpos.estimation.mixture.gaussians import Mixture, mode_of
+from netpos.estimation.mixture.gaussians import Mixture, mode_of, moments
 from netpos.estimation.mixture.reduction import PART_MERGE_COST, reduced
-from netpos.estimation.mixture.ridge import Fit, components_of, inverse, log_weight_of
+from netpos.estimation.mixture.ridge import (
+    Fit,
+    components_of,
+    inverse,
+    log_weight_of,
+    on_line,
+    solve,
+)
 from netpos.estimation.mixture.window import Window, normal_equations
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.estimation.rows import drop_biases
@@ -56,6 +65,8 @@ from netpos.tracking.rsus.rsu import Rsu, SlowErrors
 
 _REFINED = 12
 _ATTEMPT_NS = 100_000_000
+_PART_S, _PARTS_MAX = 0.75, 8  # of the window, in which accelerations are constant
+_PATIENCE = 0.05  # the next attempt comes after so much of the time waited
 # Odds of another heading this much worse in cost (chi-square 0.99, 2 dof) rule it out; places that
 # cannot be told apart are waited for from the same share on, and carried along below it.
 _RIVAL_COST, _RIVAL_SHARE = 9.21, 0.01
@@ -80,29 +91,45 @@ class Problem(NamedTuple):
 
 
 class _Solution(NamedTuple):
-    """A problem and its minima, best first. log_odds: of what it takes for granted, and the log
-    density of the states that it has more than others, where these are 0."""
+    """A problem, its minima and, ``held``, the most probable states at some distances from an RSU.
+    nearer: log weight of the heaviest minimum that is nearer to an RSU than a device can be.
+    log_odds: of what it takes for granted, and the log density of the states that it has more than
+    others, where these are 0."""
 
     problem: Problem
-    fits: list[Fit]
+    minima: list[Fit]
+    held: list[Fit]
+    nearer: float
     log_odds: float = 0.0
+
+    @property
+    def best(self) -> Fit | None:
+        """The state that fits best; None where there is none."""
+        return min((*self.minima, *self.held), key=lambda fit: fit[0], default=None)
+
+    @property
+    def cost(self) -> float:
+        """That of the best; infinite where there is none."""
+        return self.best[0] if self.best is not None else math.inf
 
     @property
     def misfit(self) -> float:
         """Cost for each row where it is more than the 1 of true measurements, or 1."""
-        return max(1.0, self.fits[0][0] / len(self.problem.window.rows))
+        return max(1.0, self.cost / len(self.problem.window.rows))
 
-    def mixture(self, is_possible: Callable[[Array], bool]) -> Mixture:
-        """The posterior of all states."""
+    def mixture(self, is_possible: Callable[[Array], bool]) -> Mixture | None:
+        """The posterior of all states; None where more of it is impossible."""
 
         def equations(state: Array) -> tuple[float, Array, Array]:
             found: tuple[float, Array, Array] = normal_equations(state, *self.problem)
             return found
 
-        means, covs, log_weights = components_of(equations, self.fits, is_possible)
-        return Mixture(means, covs, log_weights + self.log_odds)
+        found = components_of(equations, self.minima, self.held, is_possible)
+        if found is None or np.logaddexp.reduce(found.log_weights) < self.nearer:
+            return None
+        return found._replace(log_weights=found.log_weights + self.log_odds)
 
-    def relaxed(self, lasting: int) -> _Solution:
+    def relaxed(self, lasting: int, solution_of: Callable[[Problem], _Solution]) -> _Solution:
         """With variances so much larger that nothing contradicts: of the measurements, and of the
         place, the velocity and the clock beforehand, each by its own misfit. Slow errors, which
         end with the first ``lasting`` states, are as certain as before; the states behind are
@@ -119,17 +146,17 @@ class _Solution(NamedTuple):
             prior_var[lasting:] *= factors[0]
             window = self.problem.window._replace(rows=rows)
             problem = self.problem._replace(window=window, prior_var=prior_var)
-            fits = [_solve(mean, problem) for _, mean, _ in solution.fits]
-            fits = sorted((fit for fit in fits if _is_sound(fit)), key=lambda fit: fit[0])
-            if not fits:
+            found = solution_of(problem)
+            if found.best is None:
                 break
-            solution = self._replace(problem=problem, fits=fits)
+            solution = found._replace(log_odds=self.log_odds)
         return solution
 
     def _misfits(self, lasting: int) -> Array:
         """Cost of the measurements for each row, and of place, velocity and clock for each of
         their states, where that is more than 1 (1 + N_CORE,)."""
-        cost, state, _ = self.fits[0]
+        assert self.best is not None
+        cost, state, _ = self.best
         known = (state - self.problem.prior) ** 2 / self.problem.prior_var
         of_rows = (cost - known[:lasting].sum()) / len(self.problem.window.rows)
         pairs = known[:N_CORE].reshape(-1, 2).mean(axis=1)
@@ -143,6 +170,15 @@ def joined(mixtures: Sequence[Mixture]) -> Mixture:
     return reduced_
 
 
+def _widest(mixture: Mixture) -> Array:
+    """Covariance (2, 2) of the position in the mode that weighs most."""
+    modes = mode_of(mixture)
+    weights = np.exp(mixture.log_weights - mixture.log_weights.max())
+    first = modes == np.argmax(np.bincount(modes, weights))
+    _, cov = moments(Mixture(*(part[first] for part in mixture)))
+    return np.asarray(cov[:2, :2])
+
+
 def has_modes(mixture: Mixture, share: float) -> bool:
     """Whether more than one mode carries more than ``share``."""
     sums = np.bincount(mode_of(mixture), np.exp(mixture.log_weights))
@@ -151,9 +187,7 @@ def has_modes(mixture: Mixture, share: float) -> bool:
 
 def _solve(state: Array, problem: Problem) -> Fit:
     """Levenberg-Marquardt from one start: cost, state, covariance of the fit."""
-    cost, state, A = minimise(
-        lambda x: normal_equations(x, *problem), state, lambda A, b: inverse(A) @ b
-    )
+    cost, state, A = minimise(lambda x: normal_equations(x, *problem), state, solve)
     return cost, state, inverse(A)
 
 
@@ -165,6 +199,7 @@ class Initialiser:
         self._window: deque[tuple[int, Array, tuple[Rsu, ...]]] = deque()
         self._own = slow_states(config).slow_errors
         self._next_attempt_ns = 0
+        self._since_ns = 0
         self.missing = ""
         """What a first fix lacks, for people; empty before the first attempt."""
 
@@ -173,6 +208,7 @@ class Initialiser:
         twin = Initialiser(self._config)
         twin._window = self._window.copy()
         twin._next_attempt_ns = self._next_attempt_ns
+        twin._since_ns = self._since_ns
         twin.missing = self.missing
         return twin
 
@@ -185,6 +221,8 @@ class Initialiser:
         oldest = stamp_ns - int(self._config.initial_window_s * 1e9)
         while self._window[0][0] < oldest:
             self._window.popleft()
+        if len(self._window) == 1:
+            self._since_ns = stamp_ns
 
     def solve(self, slow: SlowErrors | None = None) -> Mixture | None:
         """State (n,) of a track at the newest stamp, with the ``slow`` errors that rows name
@@ -201,14 +239,15 @@ class Initialiser:
         newest = self._window[-1][0]
         if newest < self._next_attempt_ns:
             return None
-        self._next_attempt_ns = newest + _ATTEMPT_NS
+        waited_ns = newest - self._since_ns
+        self._next_attempt_ns = newest + max(_ATTEMPT_NS, round(_PATIENCE * waited_ns))
         slow = slow or self._own
         rows, ages, errors_sd = self._stacked(slow)
-        agreed = self._solution(rows, ages, errors_sd)
-        if not agreed.fits:
-            self.missing = f"no place in front of the RSUs fits {self._heard(rows)}"
+        agreed = self._solution(self._problem(rows, ages, errors_sd))
+        if agreed.best is None:
+            self.missing = self._nowhere(rows)
             return None
-        solutions, agrees = [agreed], self._consistent(agreed.fits[0], len(rows))
+        solutions, agrees = [agreed], self._consistent(agreed.cost, len(rows))
         if not agrees:
             solutions = (
                 self._without_one(rows, ages, errors_sd)
@@ -218,16 +257,25 @@ class Initialiser:
         misfit = solutions[0].misfit
         if misfit > 1.0:
             lasting = N_CORE + int(slow.lasts.sum())
-            solutions = [solution.relaxed(lasting) for solution in solutions]
-        # the place that weighs most, not the one that fits best: beside an RSU anything fits
-        _, _, cov = max(solutions[0].fits, key=log_weight_of)
-        lacks = self._lacks(rows, cov, misfit)
+            solutions = [solution.relaxed(lasting, self._solution) for solution in solutions]
+        heaviest = max(solutions[0].minima or solutions[0].held, key=log_weight_of)
+        lacks = self._lacks(rows, heaviest[2][:2, :2], misfit)
+        if lacks:
+            self.missing = lacks
+            return None
+        posterior = solutions[0].mixture(self._plausible)
+        if posterior is None:
+            self.missing = self._nowhere(rows)
+            return None
+        lacks = self._lacks(rows, _widest(posterior), misfit)
         if lacks:
             self.missing = lacks
             return None
         if agrees and self._config.isolate_rsus:
             solutions += self._one_errs(rows, solutions[0].problem)
-        mixture = joined([self._of_track(s.mixture(self._plausible), slow) for s in solutions])
+        others = [solution.mixture(self._plausible) for solution in solutions[1:]]
+        found = [self._of_track(one, slow) for one in (posterior, *others) if one is not None]
+        mixture = joined(found)
         waited_s = (newest - self._window[0][0]) * 1e-9
         waits = waited_s < 0.8 * self._config.initial_window_s or not carries_modes(self._config)
         if waits and has_modes(mixture, _RIVAL_SHARE):
@@ -246,8 +294,9 @@ class Initialiser:
         return Mixture(means, covs, mixture.log_weights)
 
     def _lacks(self, rows: Array, cov: Array, misfit: float) -> str:
-        """What a fit of the covariance ``cov`` lacks, for people; empty where it lacks nothing."""
-        sd_m = math.sqrt(float(np.linalg.eigvalsh(cov[:2, :2])[-1]))
+        """What a fit with the covariance ``cov`` (2, 2) of its position lacks, for people; empty
+        where it lacks nothing."""
+        sd_m = math.sqrt(float(np.linalg.eigvalsh(cov)[-1]))
         limit_m = self._config.initial_position_sd_max_m
         if sd_m > limit_m and misfit < _CONTRADICTS:
             return (
@@ -270,8 +319,8 @@ class Initialiser:
             return 0.0
         rows, ages, errors_sd = self._stacked(slow)
         problem = self._problem(rows, ages, errors_sd)
-        fits = self._fits(rows, problem)
-        if not fits:
+        least = self._solution(problem).cost
+        if math.isinf(least):
             return 0.0
         var = var.copy()
         var[:2] += age_s**2 * var[2:4]
@@ -280,7 +329,7 @@ class Initialiser:
         start = start.copy()
         start[4] = _clock_at(start, rows, self._config.device_height_m)
         cost = _solve(start, problem._replace(prior=mean, prior_var=var))[0]
-        return max(0.0, cost - fits[0][0])
+        return max(0.0, cost - least)
 
     def _stacked(self, slow: SlowErrors) -> tuple[Array, Array, Array]:
         """The rows of the window, their ages [s], <= 0, against the newest, and the sd of the slow
@@ -292,19 +341,18 @@ class Initialiser:
         )
         return rows, ages, _name_states_of_fit(rows, ages, slow)
 
+    def _nowhere(self, rows: Array) -> str:
+        return f"no place in front of the RSUs fits {self._heard(rows)}"
+
     def _heard(self, rows: Array) -> str:
         """What was measured, by whom."""
         kinds = sorted({BY_KIND[int(kind)].name for kind in rows[:, KIND]})
         rsus = sorted({rsu.info.rsu_id for entry in self._window for rsu in entry[2]})
         return f"{', '.join(kinds)} of {', '.join(rsus) or 'no RSU'}"
 
-    def _consistent(self, fit: Fit, rows: int) -> bool:
-        """Whether the cost of a fit is one that true measurements have."""
-        return bool(fit[0] <= chi_square_bound(rows, 1.0 - self._config.gate_probability))
-
-    def _solution(self, rows: Array, ages: Array, errors_sd: Array) -> _Solution:
-        problem = self._problem(rows, ages, errors_sd)
-        return _Solution(problem, self._fits(rows, problem))
+    def _consistent(self, cost: float, rows: int) -> bool:
+        """Whether the ``cost`` of a fit is one that true measurements have."""
+        return bool(cost <= chi_square_bound(rows, 1.0 - self._config.gate_probability))
 
     def _without_one(self, rows: Array, ages: Array, errors_sd: Array) -> list[_Solution]:
         """Solutions with a consistent fit without one of the RSUs, best first; none of fewer than
@@ -316,28 +364,31 @@ class Initialiser:
         solutions = []
         for origin in origins:
             keep = ~placed | (rows[:, ORIGIN:AXES] != origin).any(axis=1)
-            others = self._solution(rows[keep], ages[keep], errors_sd)
-            fits = [fit for fit in others.fits if self._consistent(fit, int(keep.sum()))]
-            if fits:
-                solutions.append(others._replace(fits=fits))
-        return sorted(solutions, key=lambda solution: solution.fits[0][0])
+            others = self._solution(self._problem(rows[keep], ages[keep], errors_sd))
+            if self._consistent(others.cost, int(keep.sum())):
+                solutions.append(others)
+        return sorted(solutions, key=lambda solution: solution.cost)
 
     def _any_clock(self, rows: Array, ages: Array, errors_sd: Array) -> list[_Solution]:
-        """The solution with a consistent fit whatever the clock offset is, if there is one."""
+        """The solution with a consistent fit whatever the clock offset is, and however the clock
+        walks, if there is one."""
         if not any(BY_KIND[int(kind)].has_clock for kind in np.unique(rows[:, KIND])):
             return []
         problem = self._problem(rows, ages, errors_sd)
         problem.prior_var[4] = (SPEED_OF_LIGHT_MPS * _ANY_CLOCK_S) ** 2
-        fits = [fit for fit in self._fits(rows, problem) if self._consistent(fit, len(rows))]
-        return [_Solution(problem, fits)] if fits else []
+        walks = MOST[Density.CLOCK]
+        accelerations = slice(problem.window.first + 2, None, 3)
+        problem.prior_var[accelerations] = _acceleration_sd(walks, problem.window.part_s) ** 2
+        found = self._solution(problem)
+        return [found] if self._consistent(found.cost, len(rows)) else []
 
     def _one_errs(self, rows: Array, problem: Problem) -> list[_Solution]:
         """Solutions in which one of the RSUs errs grossly, of at least three."""
         found = []
         for case in wrong_rsu.cases(*problem):
             changed = Problem(case.window, case.prior, case.prior_var)
-            found.append(_Solution(changed, self._fits(rows, changed), case.log_odds))
-        return [solution for solution in found if solution.fits]
+            found.append(self._solution(changed)._replace(log_odds=case.log_odds))
+        return [solution for solution in found if solution.best is not None]
 
     def _problem(self, rows: Array, ages: Array, errors_sd: Array) -> Problem:
         cfg = self._config
@@ -351,27 +402,54 @@ class Initialiser:
         prior = np.array([*centre, 0.0, 0.0, 0.0, c * cfg.clock_drift_mean])
         sd = np.array([reach, reach, *([cfg.initial_speed_sd_mps] * 2)])
         clock_sd = c * np.array([cfg.clock_offset_sd_s, max(cfg.clock_drift_sd, 1e-15)])
-        errors_sd = np.maximum(errors_sd, _LEAST_SD)
+        span_s = max(-float(ages.min()), 1e-9 * _ATTEMPT_NS)
+        parts = min(math.ceil(span_s / _PART_S), _PARTS_MAX)
+        accel = held(cfg.accel_density_mps2_sqrthz, Density.ACCEL)
+        walk = c * cfg.clock_walk_density  # who does not know it takes it for 0 (_any_clock)
+        turns_sd = parts * [_acceleration_sd(q, span_s / parts) for q in (accel, accel, walk)]
+        errors_sd = np.maximum([*errors_sd, *turns_sd], _LEAST_SD)
         prior_var = np.concatenate([sd, np.maximum(clock_sd, 1e-6), errors_sd]) ** 2
         prior = np.append(prior, np.zeros(errors_sd.size))
-        return Problem(Window(ages, rows, cfg.device_height_m), prior, prior_var)
+        first = prior.size - len(turns_sd)
+        window = Window(ages, rows, cfg.device_height_m, first, span_s / parts, parts)
+        return Problem(window, prior, prior_var)
 
-    def _fits(self, rows: Array, problem: Problem) -> list[Fit]:
-        """Solutions from the most promising starts, best first."""
+    def _solution(self, problem: Problem) -> _Solution:
+        """What is found from the most promising starts."""
+        rows = problem.window.rows
         scored: list[tuple[float, int, Array]] = []
         for xy in _starts(rows, problem.prior[:2], math.sqrt(problem.prior_var[0])):
             state = problem.prior.copy()
             state[:2] = xy
             state[4] = _clock_at(state, rows, self._config.device_height_m)
             scored.append((normal_equations(state, *problem)[0], len(scored), state))
-        fits = [_solve(state, problem) for _, _, state in sorted(scored)[:_REFINED]]
-        fits = [fit for fit in fits if _is_sound(fit) and self._plausible(fit[1])]
-        return sorted(fits, key=lambda fit: fit[0])
+        starts = [state for _, _, state in sorted(scored)[:_REFINED]]
+        free = [fit for fit in (_solve(start, problem) for start in starts) if _is_sound(fit)]
+        nearer = [log_weight_of(fit) for fit in free if self._beside(fit[1]) is not None]
+        # on top of an RSU anything fits: the distances of the starts are as good
+        held = [self._held(start, problem) for start in starts] if nearer else []
+        minima = [fit for fit in free if self._plausible(fit[1])]
+        held = [fit for fit in held if _is_sound(fit) and self._plausible(fit[1])]
+        return _Solution(problem, minima, held, max(nearer, default=-math.inf))
+
+    def _held(self, start: Array, problem: Problem) -> Fit:
+        """The most probable state that is as far from the nearest RSU as ``start``."""
+        origins = np.array([r.info.position[:2] for e in self._window for r in e[2]])
+        away = start[:2] - origins[np.argmin(np.hypot(*(start[:2] - origins).T))]
+        far = float(np.hypot(*away))
+        if far < _NEAREST_M:
+            return math.inf, start, np.eye(start.size)
+        return on_line(lambda x: normal_equations(x, *problem), start, away / far)
 
     def _plausible(self, state: Array) -> bool:
-        """Not behind an array without a back, and not on top of an RSU where an angle fits
-        anything: one that measures no distance, or the only one that measures times."""
-        heard = {r.info.rsu_id: r for e in self._window for r in e[2]}
+        """Not behind an array without a back, and not on top of an RSU."""
+        heard = (rsu for entry in self._window for rsu in entry[2])
+        in_front = all(rsu.in_front(*(state[:2] - rsu.info.position[:2])) for rsu in heard)
+        return in_front and self._beside(state) is None
+
+    def _beside(self, state: Array) -> Array | None:
+        """Where (2,) the RSU is on top of which ``state`` is, and an angle fits anything: one that
+        measures no distance, or the only one that measures times."""
         timed: set[tuple[float, ...]] = set()
         ranged: set[tuple[float, ...]] = set()
         for row in (row for e in self._window for row in e[1]):
@@ -380,14 +458,11 @@ class Initialiser:
                 (timed if sensor.has_clock else ranged).add(origin)
         if len(timed) > 1:  # what one RSU hears says nothing of the distance
             ranged |= timed
-        for rsu in heard.values():
-            dx, dy = state[:2] - rsu.info.position[:2]
-            up = state[N_CORE : N_CORE + self._own.sd.size].sum()
-            dz = self._config.device_height_m + up - rsu.info.position[2]
-            near = dx * dx + dy * dy + dz * dz < _NEAREST_M**2
-            if not rsu.in_front(dx, dy) or (near and tuple(rsu.info.position) not in ranged):
-                return False
-        return True
+        up = self._config.device_height_m + state[N_CORE : N_CORE + self._own.sd.size].sum()
+        for place in {tuple(r.info.position) for e in self._window for r in e[2]} - ranged:
+            if math.dist(place, (state[0], state[1], up)) < _NEAREST_M:
+                return np.array(place[:2])
+        return None
 
 
 def with_heading(
@@ -427,6 +502,12 @@ def _is_sound(fit: Fit) -> bool:
     """Whether the fit is finite and its position covariance survived rounding."""
     cost, _, cov = fit
     return bool(math.isfinite(cost) and np.linalg.eigvalsh(cov[:2, :2])[0] > 0.0)
+
+
+def _acceleration_sd(density: float, part_s: float) -> float:
+    """Sd of a constant acceleration [m/s^2] that moves as far in ``part_s`` seconds as white
+    acceleration of the ``density`` q does: q^2 T^3 / 3 = (a T^2 / 2)^2."""
+    return 2.0 * density / math.sqrt(3.0 * part_s)
 
 
 def _name_states_of_fit(rows: Array, ages_s: Array, slow: SlowErrors) -> Array:
