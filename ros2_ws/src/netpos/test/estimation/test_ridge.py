@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 from netpos.common.least_squares import minimise
 from netpos.estimation.mixture.gaussians import Mixture
-from netpos.estimation.mixture.ridge import Equations, Fit, components_of, inverse, on_line, solve
+from netpos.estimation.mixture.ridge import (
+    Equations,
+    Fit,
+    cholesky_solve,
+    components_of,
+    inverse,
+    on_line,
+)
 from netpos.messages.values import Array
 
 ANCHORS = np.array([[1.3, 2.2], [-1.3, 2.2], [1.3, -2.2], [-1.3, -2.2]])
@@ -43,7 +50,7 @@ def minima(equations: Equations, radius: float) -> list[Fit]:
     fits = []
     for angle in 0.1 + 2.0 * math.pi * np.arange(12) / 12:
         start = np.array([radius * math.cos(angle), radius * math.sin(angle), 0.0, 0.0])
-        cost, state, A = minimise(equations, start, solve)
+        cost, state, A = minimise(equations, start, cholesky_solve)
         fits.append((cost, state, inverse(A)))
     return sorted(fits, key=lambda fit: fit[0])
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -32,8 +33,8 @@ Equations = Callable[[Array], tuple[float, Array, Array]]
 # A cost one sd away that differs by so much from the one of a Gaussian (1) shifts the mean by 1.5
 # times as many sd, where it is higher on one side.
 _UNEVEN = 0.05
-_EVEN = 0.2  # of the width across: how much it may change one sd along a component
-_GROWS = 1.25  # by how much a component may be longer or shorter than the one before
+_WIDENING = 0.2  # of the width across: how much it may change one sd along a component
+_LENGTH_RATIO = 1.25  # by how much a component may be longer or shorter than the one before
 _TIGHT = 0.01  # sd, over a component's, that holds a point at its place along the arc
 _COST_MAX = 37.0  # twice the log of the least weight of a component
 _PIECES_MAX = 32  # one way from the most probable point
@@ -59,27 +60,26 @@ class _Line(NamedTuple):
 def components_of(
     equations: Equations,
     minima: Sequence[Fit],
-    held: Sequence[Fit],
+    constrained: Sequence[Fit],
     is_possible: Callable[[Array], bool],
 ) -> Mixture | None:
     """The posterior with the cost of ``equations``; log weights are not normalised.
 
-    minima, held : where the cost is least; states of its arcs (``on_line``), from which they are
-        followed as far as no minimum has led
+    minima, constrained : where the cost is least, and where it is at a given distance, which
+        ``on_line`` finds; arcs are followed from the latter as far as none has led from the former
     is_possible : whether the device may be in a state; components that are not are left out, None
         where that leaves nothing
     """
     pieces: list[_Piece] = []
-    limit = min(cost for cost, _, _ in (*minima, *held)) + _COST_MAX
-    for starts in (minima, held):
-        for fit in sorted(starts, key=log_weight_of, reverse=True):
-            if fit[0] <= limit and not _is_known(fit[1], pieces):
-
-                def ends(state: Array, known: tuple[_Piece, ...] = tuple(pieces)) -> bool:
-                    return not is_possible(state) or _is_known(state, known)
-
-                along = _along(equations, fit, limit, ends)
-                pieces += along or ([_whole(fit)] if starts is minima else [])
+    limit = min(cost for cost, _, _ in (*minima, *constrained)) + _COST_MAX
+    for fits in (minima, constrained):
+        for fit in sorted(fits, key=log_weight_of, reverse=True):
+            if fit[0] > limit or _is_known(fit[1], pieces):
+                continue
+            along = _along(equations, fit, limit, partial(_is_end, is_possible, tuple(pieces)))
+            if along is None:  # one Gaussian describes it, about its minimum
+                along = [_whole(fit)] if fits is minima else []
+            pieces += along
     pieces = [piece for piece in pieces if is_possible(piece.mean)]
     if not pieces:
         return None
@@ -99,7 +99,7 @@ def inverse(A: Array) -> Array:
     return inverted
 
 
-def solve(A: Array, b: Array) -> Array:
+def cholesky_solve(A: Array, b: Array) -> Array:
     """x (n,) of A x = b for a positive definite ``A`` (n, n)."""
     x = b[:, None].copy()
     solve_factored(factor(A), x)
@@ -141,11 +141,16 @@ def _is_known(state: Array, pieces: Sequence[_Piece]) -> bool:
     return False
 
 
+def _is_end(is_possible: Callable[[Array], bool], known: Sequence[_Piece], state: Array) -> bool:
+    """Whether an arc ends at a state."""
+    return not is_possible(state) or _is_known(state, known)
+
+
 def _minimum(equations: Equations, line: _Line, start: Array) -> Fit:
     """The minimum, from ``start``, of the cost and that of a Gaussian along a line."""
     u, weight = line.direction, 1.0 / line.sd**2
 
-    def held(state: Array) -> tuple[float, Array, Array]:
+    def constrained(state: Array) -> tuple[float, Array, Array]:
         cost, b, A = equations(state)
         off = float(u @ (line.centre - state[POSITION]))
         b, A = b.copy(), A.copy()
@@ -153,7 +158,7 @@ def _minimum(equations: Equations, line: _Line, start: Array) -> Fit:
         A[POSITION, POSITION] += weight * np.outer(u, u)
         return cost + weight * off * off, b, A
 
-    cost, state, A = minimise(held, start, solve)
+    cost, state, A = minimise(constrained, start, cholesky_solve)
     return cost, state, inverse(A)
 
 
@@ -168,8 +173,8 @@ def _axis(cov: Array) -> tuple[float, Array, Array, float]:
 
 def _along(
     equations: Equations, fit: Fit, cost_max: float, ends: Callable[[Array], bool]
-) -> list[_Piece]:
-    """Components of the arc through a state on it, as far as where it ``ends``; none where it is
+) -> list[_Piece] | None:
+    """Components of the arc through a state on it, as far as where it ``ends``; None where it is
     straight and as wide all along."""
     sd, u, follows, across = _axis(fit[2])
 
@@ -180,8 +185,8 @@ def _along(
     wider = [
         side * (_across(equations, beside(side * across)[1]) / across - 1.0) for side in _SIDES
     ]
-    growth = min(wider, key=abs) / across  # the other may be that of another arc
-    step = min(sd, _EVEN / max(abs(growth), 1e-9))
+    widening = min(wider, key=abs) / across  # the other may be that of another arc
+    step = min(sd, _WIDENING / max(abs(widening), 1e-9))
     bend, differs = 0.0, step < sd
     for side in (-step, step):
         cost, state, _ = beside(side)
@@ -190,9 +195,9 @@ def _along(
         differs |= abs(cost - fit[0] - (step / sd) ** 2) > _UNEVEN
     is_bent = 0.5 * bend**2 * sd**4 > CURVATURE_SHARE * across**2
     if not is_bent and not differs:
-        return []
-    short = min(_length(sd, across, abs(bend), growth), step)
-    pieces = [_piece(equations, _Line(fit[1][POSITION], u, short), fit[1], growth)]
+        return None
+    short = min(_length(sd, across, abs(bend), widening), step)
+    pieces = [_piece(equations, _Line(fit[1][POSITION], u, short), fit[1], widening)]
     if ends(pieces[0].mean):
         return []
     for side in _SIDES:
@@ -208,11 +213,11 @@ def _across(equations: Equations, state: Array) -> float:
     return _axis(inverse(equations(state)[2]))[3]
 
 
-def _length(sd: float, across: float, bend: float, growth: float) -> float:
+def _length(sd: float, across: float, bend: float, widening: float) -> float:
     """Sd of a component of an arc of ``sd`` along and ``across``, that turns by ``bend`` [1/m] and
-    becomes wider by the share ``growth`` [1/m]."""
+    becomes wider by the share ``widening`` [1/m]."""
     by_bend = math.sqrt(math.sqrt(2.0 * CURVATURE_SHARE) * across / max(bend, 1e-9))
-    return min(by_bend, 0.5 * sd, _EVEN / max(abs(growth), 1e-9))
+    return min(by_bend, 0.5 * sd, _WIDENING / max(abs(widening), 1e-9))
 
 
 def _one_way(
@@ -234,20 +239,20 @@ def _one_way(
             break
         moved = float(np.hypot(*(new - state)[POSITION]))
         turned = abs(float(u[0] * towards[1] - u[1] * towards[0]))
-        growth = math.log(wide / across) / moved
-        length, before = _length(sd, wide, turned / moved, growth), short
-        short = min(max(length, short / _GROWS), short * _GROWS)
-        piece = _piece(equations, _Line(new[POSITION], towards, short), new, growth)
+        widening = math.log(wide / across) / moved
+        length, before = _length(sd, wide, turned / moved, widening), short
+        short = min(max(length, short / _LENGTH_RATIO), short * _LENGTH_RATIO)
+        piece = _piece(equations, _Line(new[POSITION], towards, short), new, widening)
         share = math.log(0.5 * (before + short) / short)  # of the constant that all add up to
         yield piece._replace(log_weight=piece.log_weight + share)
         state, across = new, wide
 
 
-def _piece(equations: Equations, line: _Line, start: Array, growth: float) -> _Piece:
+def _piece(equations: Equations, line: _Line, start: Array, widening: float) -> _Piece:
     """The product of the posterior and of a Gaussian along the arc, times their spacing. The arc
-    becomes wider along the line by the share ``growth`` [1/m]: there is more of it that way."""
+    becomes wider along the line by the share ``widening`` [1/m]: there is more of it that way."""
     log_weight, mean, cov = _whole(_minimum(equations, line, start))
-    pull = cov[:, POSITION] @ (growth * line.direction)
+    pull = cov[:, POSITION] @ (widening * line.direction)
     log_weight += math.log(SPACING_SD / math.sqrt(2.0 * math.pi))
-    log_weight += 0.5 * growth * float(line.direction @ pull[POSITION])
+    log_weight += 0.5 * widening * float(line.direction @ pull[POSITION])
     return _Piece(log_weight, mean + pull, cov)

@@ -21,7 +21,7 @@ import numpy as np
 
 from netpos.common.least_squares import minimise
 from netpos.estimation.chi_square import chi_square_bound
-from netpos.estimation.densities import MOST, Density, held
+from netpos.estimation.densities import Density, held
 from netpos.estimation.measurement import (
     AXES,
     BIAS,
@@ -43,11 +43,11 @@ from netpos.estimation.mixture.gaussians import Mixture, mode_of, moments
 from netpos.estimation.mixture.reduction import PART_MERGE_COST, reduced
 from netpos.estimation.mixture.ridge import (
     Fit,
+    cholesky_solve,
     components_of,
     inverse,
     log_weight_of,
     on_line,
-    solve,
 )
 from netpos.estimation.mixture.window import Window, normal_equations
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
@@ -65,8 +65,9 @@ from netpos.tracking.rsus.rsu import Rsu, SlowErrors
 
 _REFINED = 12
 _ATTEMPT_NS = 100_000_000
+_LEAST_SPAN_S = 0.1  # of a window
 _PART_S, _PARTS_MAX = 0.75, 8  # of the window, in which accelerations are constant
-_PATIENCE = 0.05  # the next attempt comes after so much of the time waited
+_RETRY_SHARE = 0.05  # the next attempt comes after so much of the time waited
 # Odds of another heading this much worse in cost (chi-square 0.99, 2 dof) rule it out; places that
 # cannot be told apart are waited for from the same share on, and carried along below it.
 _RIVAL_COST, _RIVAL_SHARE = 9.21, 0.01
@@ -89,28 +90,38 @@ class Problem(NamedTuple):
     prior: Array
     prior_var: Array
 
+    def equations(self, state: Array) -> tuple[float, Array, Array]:
+        """``normal_equations`` at ``state`` (n,)."""
+        found: tuple[float, Array, Array] = normal_equations(state, *self)
+        return found
+
 
 class _Solution(NamedTuple):
-    """A problem, its minima and, ``held``, the most probable states at some distances from an RSU.
-    nearer: log weight of the heaviest minimum that is nearer to an RSU than a device can be.
-    log_odds: of what it takes for granted, and the log density of the states that it has more than
-    others, where these are 0."""
+    """A problem, its minima and the ``constrained`` ones, at some distances from an RSU; there is
+    one of either. nearer: log weight of the heaviest minimum that is nearer to an RSU than a
+    device can be. log_odds: of what it takes for granted, and the log density of the states that
+    it has more than others, where these are 0."""
 
     problem: Problem
     minima: list[Fit]
-    held: list[Fit]
+    constrained: list[Fit]
     nearer: float
     log_odds: float = 0.0
 
     @property
-    def best(self) -> Fit | None:
-        """The state that fits best; None where there is none."""
-        return min((*self.minima, *self.held), key=lambda fit: fit[0], default=None)
+    def best(self) -> Fit:
+        """The one that fits best."""
+        return min((*self.minima, *self.constrained), key=lambda fit: fit[0])
+
+    @property
+    def heaviest(self) -> Fit:
+        """The minimum that weighs most."""
+        return max(self.minima or self.constrained, key=log_weight_of)
 
     @property
     def cost(self) -> float:
-        """That of the best; infinite where there is none."""
-        return self.best[0] if self.best is not None else math.inf
+        """That of the best."""
+        return self.best[0]
 
     @property
     def misfit(self) -> float:
@@ -119,17 +130,14 @@ class _Solution(NamedTuple):
 
     def mixture(self, is_possible: Callable[[Array], bool]) -> Mixture | None:
         """The posterior of all states; None where more of it is impossible."""
-
-        def equations(state: Array) -> tuple[float, Array, Array]:
-            found: tuple[float, Array, Array] = normal_equations(state, *self.problem)
-            return found
-
-        found = components_of(equations, self.minima, self.held, is_possible)
+        found = components_of(self.problem.equations, self.minima, self.constrained, is_possible)
         if found is None or np.logaddexp.reduce(found.log_weights) < self.nearer:
             return None
         return found._replace(log_weights=found.log_weights + self.log_odds)
 
-    def relaxed(self, lasting: int, solution_of: Callable[[Problem], _Solution]) -> _Solution:
+    def relaxed(
+        self, lasting: int, solution_of: Callable[[Problem], _Solution | None]
+    ) -> _Solution:
         """With variances so much larger that nothing contradicts: of the measurements, and of the
         place, the velocity and the clock beforehand, each by its own misfit. Slow errors, which
         end with the first ``lasting`` states, are as certain as before; the states behind are
@@ -147,7 +155,7 @@ class _Solution(NamedTuple):
             window = self.problem.window._replace(rows=rows)
             problem = self.problem._replace(window=window, prior_var=prior_var)
             found = solution_of(problem)
-            if found.best is None:
+            if found is None:
                 break
             solution = found._replace(log_odds=self.log_odds)
         return solution
@@ -155,7 +163,6 @@ class _Solution(NamedTuple):
     def _misfits(self, lasting: int) -> Array:
         """Cost of the measurements for each row, and of place, velocity and clock for each of
         their states, where that is more than 1 (1 + N_CORE,)."""
-        assert self.best is not None
         cost, state, _ = self.best
         known = (state - self.problem.prior) ** 2 / self.problem.prior_var
         of_rows = (cost - known[:lasting].sum()) / len(self.problem.window.rows)
@@ -170,7 +177,7 @@ def joined(mixtures: Sequence[Mixture]) -> Mixture:
     return reduced_
 
 
-def _widest(mixture: Mixture) -> Array:
+def _cov_of_mode(mixture: Mixture) -> Array:
     """Covariance (2, 2) of the position in the mode that weighs most."""
     modes = mode_of(mixture)
     weights = np.exp(mixture.log_weights - mixture.log_weights.max())
@@ -187,7 +194,7 @@ def has_modes(mixture: Mixture, share: float) -> bool:
 
 def _solve(state: Array, problem: Problem) -> Fit:
     """Levenberg-Marquardt from one start: cost, state, covariance of the fit."""
-    cost, state, A = minimise(lambda x: normal_equations(x, *problem), state, solve)
+    cost, state, A = minimise(problem.equations, state, cholesky_solve)
     return cost, state, inverse(A)
 
 
@@ -240,48 +247,52 @@ class Initialiser:
         if newest < self._next_attempt_ns:
             return None
         waited_ns = newest - self._since_ns
-        self._next_attempt_ns = newest + max(_ATTEMPT_NS, round(_PATIENCE * waited_ns))
-        slow = slow or self._own
-        rows, ages, errors_sd = self._stacked(slow)
-        agreed = self._solution(self._problem(rows, ages, errors_sd))
-        if agreed.best is None:
-            self.missing = self._nowhere(rows)
+        self._next_attempt_ns = newest + max(_ATTEMPT_NS, round(_RETRY_SHARE * waited_ns))
+        found = self._posterior(slow or self._own)
+        if isinstance(found, str):
+            self.missing = found
             return None
+        return found
+
+    def _posterior(self, slow: SlowErrors) -> Mixture | str:
+        """The fix, or what it lacks, for people."""
+        rows, ages, errors_sd = self._stacked(slow)
+        nowhere = f"no place in front of the RSUs fits {self._heard(rows)}"
+        agreed = self._solution(self._problem(rows, ages, errors_sd))
+        if agreed is None:
+            return nowhere
         solutions, agrees = [agreed], self._consistent(agreed.cost, len(rows))
         if not agrees:
-            solutions = (
-                self._without_one(rows, ages, errors_sd)
-                or self._any_clock(rows, ages, errors_sd)
-                or solutions
-            )
+            solutions = self._that_agree(rows, ages, errors_sd) or solutions
         misfit = solutions[0].misfit
         if misfit > 1.0:
             lasting = N_CORE + int(slow.lasts.sum())
             solutions = [solution.relaxed(lasting, self._solution) for solution in solutions]
-        heaviest = max(solutions[0].minima or solutions[0].held, key=log_weight_of)
-        lacks = self._lacks(rows, heaviest[2][:2, :2], misfit)
-        if lacks:
-            self.missing = lacks
-            return None
+        lacks = self._lacks(rows, solutions[0].heaviest[2][:2, :2], misfit)
+        if lacks:  # one minimum says so sooner than its mode
+            return lacks
         posterior = solutions[0].mixture(self._plausible)
         if posterior is None:
-            self.missing = self._nowhere(rows)
-            return None
-        lacks = self._lacks(rows, _widest(posterior), misfit)
+            return nowhere
+        lacks = self._lacks(rows, _cov_of_mode(posterior), misfit)
         if lacks:
-            self.missing = lacks
-            return None
+            return lacks
         if agrees and self._config.isolate_rsus:
             solutions += self._one_errs(rows, solutions[0].problem)
         others = [solution.mixture(self._plausible) for solution in solutions[1:]]
         found = [self._of_track(one, slow) for one in (posterior, *others) if one is not None]
         mixture = joined(found)
-        waited_s = (newest - self._window[0][0]) * 1e-9
+        waited_s = (self._window[-1][0] - self._window[0][0]) * 1e-9
         waits = waited_s < 0.8 * self._config.initial_window_s or not carries_modes(self._config)
         if waits and has_modes(mixture, _RIVAL_SHARE):
-            self.missing = f"more than one place fits {self._heard(rows)}; waiting for more"
-            return None
+            return f"more than one place fits {self._heard(rows)}; waiting for more"
         return mixture
+
+    def _that_agree(self, rows: Array, ages: Array, errors_sd: Array) -> list[_Solution]:
+        """Consistent solutions of measurements that contradict each other: without one of the
+        RSUs, or else with another clock; none where there are none."""
+        without = self._without_one(rows, ages, errors_sd)
+        return without or self._any_clock(rows, ages, errors_sd)
 
     def _of_track(self, mixture: Mixture, slow: SlowErrors) -> Mixture:
         """The states of a track, of the components of a fit."""
@@ -319,8 +330,8 @@ class Initialiser:
             return 0.0
         rows, ages, errors_sd = self._stacked(slow)
         problem = self._problem(rows, ages, errors_sd)
-        least = self._solution(problem).cost
-        if math.isinf(least):
+        found = self._solution(problem)
+        if found is None:
             return 0.0
         var = var.copy()
         var[:2] += age_s**2 * var[2:4]
@@ -329,7 +340,7 @@ class Initialiser:
         start = start.copy()
         start[4] = _clock_at(start, rows, self._config.device_height_m)
         cost = _solve(start, problem._replace(prior=mean, prior_var=var))[0]
-        return max(0.0, cost - least)
+        return max(0.0, cost - found.cost)
 
     def _stacked(self, slow: SlowErrors) -> tuple[Array, Array, Array]:
         """The rows of the window, their ages [s], <= 0, against the newest, and the sd of the slow
@@ -340,9 +351,6 @@ class Initialiser:
             [np.full(len(entry[1]), (entry[0] - newest) * 1e-9) for entry in self._window]
         )
         return rows, ages, _name_states_of_fit(rows, ages, slow)
-
-    def _nowhere(self, rows: Array) -> str:
-        return f"no place in front of the RSUs fits {self._heard(rows)}"
 
     def _heard(self, rows: Array) -> str:
         """What was measured, by whom."""
@@ -365,30 +373,27 @@ class Initialiser:
         for origin in origins:
             keep = ~placed | (rows[:, ORIGIN:AXES] != origin).any(axis=1)
             others = self._solution(self._problem(rows[keep], ages[keep], errors_sd))
-            if self._consistent(others.cost, int(keep.sum())):
+            if others is not None and self._consistent(others.cost, int(keep.sum())):
                 solutions.append(others)
         return sorted(solutions, key=lambda solution: solution.cost)
 
     def _any_clock(self, rows: Array, ages: Array, errors_sd: Array) -> list[_Solution]:
-        """The solution with a consistent fit whatever the clock offset is, and however the clock
-        walks, if there is one."""
+        """The solution with a consistent fit whatever the clock offset is, if there is one."""
         if not any(BY_KIND[int(kind)].has_clock for kind in np.unique(rows[:, KIND])):
             return []
         problem = self._problem(rows, ages, errors_sd)
         problem.prior_var[4] = (SPEED_OF_LIGHT_MPS * _ANY_CLOCK_S) ** 2
-        walks = MOST[Density.CLOCK]
-        accelerations = slice(problem.window.first + 2, None, 3)
-        problem.prior_var[accelerations] = _acceleration_sd(walks, problem.window.part_s) ** 2
         found = self._solution(problem)
-        return [found] if self._consistent(found.cost, len(rows)) else []
+        return [found] if found and self._consistent(found.cost, len(rows)) else []
 
     def _one_errs(self, rows: Array, problem: Problem) -> list[_Solution]:
         """Solutions in which one of the RSUs errs grossly, of at least three."""
         found = []
         for case in wrong_rsu.cases(*problem):
-            changed = Problem(case.window, case.prior, case.prior_var)
-            found.append(self._solution(changed)._replace(log_odds=case.log_odds))
-        return [solution for solution in found if solution.best is not None]
+            solution = self._solution(Problem(case.window, case.prior, case.prior_var))
+            if solution is not None:
+                found.append(solution._replace(log_odds=case.log_odds))
+        return found
 
     def _problem(self, rows: Array, ages: Array, errors_sd: Array) -> Problem:
         cfg = self._config
@@ -402,10 +407,10 @@ class Initialiser:
         prior = np.array([*centre, 0.0, 0.0, 0.0, c * cfg.clock_drift_mean])
         sd = np.array([reach, reach, *([cfg.initial_speed_sd_mps] * 2)])
         clock_sd = c * np.array([cfg.clock_offset_sd_s, max(cfg.clock_drift_sd, 1e-15)])
-        span_s = max(-float(ages.min()), 1e-9 * _ATTEMPT_NS)
+        span_s = max(-float(ages.min()), _LEAST_SPAN_S)
         parts = min(math.ceil(span_s / _PART_S), _PARTS_MAX)
         accel = held(cfg.accel_density_mps2_sqrthz, Density.ACCEL)
-        walk = c * cfg.clock_walk_density  # who does not know it takes it for 0 (_any_clock)
+        walk = c * cfg.clock_walk_density  # 0 where nobody knows it
         turns_sd = parts * [_acceleration_sd(q, span_s / parts) for q in (accel, accel, walk)]
         errors_sd = np.maximum([*errors_sd, *turns_sd], _LEAST_SD)
         prior_var = np.concatenate([sd, np.maximum(clock_sd, 1e-6), errors_sd]) ** 2
@@ -414,42 +419,48 @@ class Initialiser:
         window = Window(ages, rows, cfg.device_height_m, first, span_s / parts, parts)
         return Problem(window, prior, prior_var)
 
-    def _solution(self, problem: Problem) -> _Solution:
-        """What is found from the most promising starts."""
+    def _solution(self, problem: Problem) -> _Solution | None:
+        """What is found from the most promising starts; None where that is nothing."""
+        starts = self._starts(problem)
+        free = [fit for fit in (_solve(start, problem) for start in starts) if _is_sound(fit)]
+        nearer = [log_weight_of(fit) for fit in free if self._is_on_rsu(fit[1])]
+        # on top of an RSU anything fits: the distances of the starts are as good
+        fits = [self._constrained(start, problem) for start in starts] if nearer else []
+        minima = [fit for fit in free if self._plausible(fit[1])]
+        constrained = [fit for fit in fits if _is_sound(fit) and self._plausible(fit[1])]
+        if not minima and not constrained:
+            return None
+        return _Solution(problem, minima, constrained, max(nearer, default=-math.inf))
+
+    def _starts(self, problem: Problem) -> list[Array]:
+        """The starts (n,) that cost least."""
         rows = problem.window.rows
         scored: list[tuple[float, int, Array]] = []
         for xy in _starts(rows, problem.prior[:2], math.sqrt(problem.prior_var[0])):
             state = problem.prior.copy()
             state[:2] = xy
             state[4] = _clock_at(state, rows, self._config.device_height_m)
-            scored.append((normal_equations(state, *problem)[0], len(scored), state))
-        starts = [state for _, _, state in sorted(scored)[:_REFINED]]
-        free = [fit for fit in (_solve(start, problem) for start in starts) if _is_sound(fit)]
-        nearer = [log_weight_of(fit) for fit in free if self._beside(fit[1]) is not None]
-        # on top of an RSU anything fits: the distances of the starts are as good
-        held = [self._held(start, problem) for start in starts] if nearer else []
-        minima = [fit for fit in free if self._plausible(fit[1])]
-        held = [fit for fit in held if _is_sound(fit) and self._plausible(fit[1])]
-        return _Solution(problem, minima, held, max(nearer, default=-math.inf))
+            scored.append((problem.equations(state)[0], len(scored), state))
+        return [state for _, _, state in sorted(scored)[:_REFINED]]
 
-    def _held(self, start: Array, problem: Problem) -> Fit:
+    def _constrained(self, start: Array, problem: Problem) -> Fit:
         """The most probable state that is as far from the nearest RSU as ``start``."""
         origins = np.array([r.info.position[:2] for e in self._window for r in e[2]])
         away = start[:2] - origins[np.argmin(np.hypot(*(start[:2] - origins).T))]
         far = float(np.hypot(*away))
         if far < _NEAREST_M:
             return math.inf, start, np.eye(start.size)
-        return on_line(lambda x: normal_equations(x, *problem), start, away / far)
+        return on_line(problem.equations, start, away / far)
 
     def _plausible(self, state: Array) -> bool:
         """Not behind an array without a back, and not on top of an RSU."""
         heard = (rsu for entry in self._window for rsu in entry[2])
         in_front = all(rsu.in_front(*(state[:2] - rsu.info.position[:2])) for rsu in heard)
-        return in_front and self._beside(state) is None
+        return in_front and not self._is_on_rsu(state)
 
-    def _beside(self, state: Array) -> Array | None:
-        """Where (2,) the RSU is on top of which ``state`` is, and an angle fits anything: one that
-        measures no distance, or the only one that measures times."""
+    def _is_on_rsu(self, state: Array) -> bool:
+        """Whether ``state`` is nearer to an RSU than a device can be. Any angle fits there: this
+        is asked of RSUs that measure no distance, and of the only one that measures times."""
         timed: set[tuple[float, ...]] = set()
         ranged: set[tuple[float, ...]] = set()
         for row in (row for e in self._window for row in e[1]):
@@ -459,10 +470,8 @@ class Initialiser:
         if len(timed) > 1:  # what one RSU hears says nothing of the distance
             ranged |= timed
         up = self._config.device_height_m + state[N_CORE : N_CORE + self._own.sd.size].sum()
-        for place in {tuple(r.info.position) for e in self._window for r in e[2]} - ranged:
-            if math.dist(place, (state[0], state[1], up)) < _NEAREST_M:
-                return np.array(place[:2])
-        return None
+        places = {tuple(r.info.position) for e in self._window for r in e[2]} - ranged
+        return any(math.dist(place, (state[0], state[1], up)) < _NEAREST_M for place in places)
 
 
 def with_heading(
