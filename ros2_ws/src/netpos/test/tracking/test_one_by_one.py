@@ -50,15 +50,15 @@ def test_a_late_value_does_not_lead_the_track_away() -> None:
 def test_one_rsu_that_hears_a_device_pass_does_not_place_it_beside_itself(
     walk: float, world: Any, feed: Any
 ) -> None:
-    """Directions and times of a clock: beside the RSU anything fits. Devices pass 12 m from it at
-    4 m/s; the change of the times tells the distance, if the clock is known to drift evenly (0:
-    nobody knows). Where the most probable place was the fix, 10 of 16 were TRACKING above the
-    level at some time."""
+    """Directions and times of a clock that drifts evenly, which is declared or nobody knows (0):
+    beside the RSU anything fits. Devices pass 12 m from it at 4 m/s; the change of the times tells
+    the distance. Where the most probable place was the fix, 10 of 16 were TRACKING above the level
+    at some time."""
     world.rsus = {"a": RsuInfo(rsu_id="a", position=np.zeros(3))}
     world.angle_sd, world.range_sd = 0.005, 0.003
     config = {"accel_density_mps2_sqrthz": 0.1, "initial_speed_sd_mps": 3.0}
     ways_above, tracking = 0, 0
-    for seed in range(16 if walk > 0.0 else 6):
+    for seed in range(16):
         world.rng = np.random.default_rng(seed)
         tracker, above = world.tracker(clock_walk_density=walk, **config), 0
         for k in range(200):
@@ -70,5 +70,5 @@ def test_one_rsu_that_hears_a_device_pass_does_not_place_it_beside_itself(
                     tracking += 1
                     above += off_m > output.status.protection_level_m
         ways_above += above > 0
-    assert ways_above <= 1
-    assert walk == 0.0 or tracking > 16 * 50
+    assert ways_above == 0
+    assert tracking > 16 * 50
