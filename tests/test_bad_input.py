@@ -268,6 +268,7 @@ def attacked(bags: Bags) -> Iterator[tuple[list[Any], list[Any], Counter[str], s
                 out.publish(CODEC.measurement_to_msg(good[0]))
                 sent += Counter(duplicate=1, late=1)
         status.wait_for(51)
+        odometry.wait_for(len(messages(bags.good, ODOMETRY)))  # another topic, maybe later
         yield list(odometry.messages), list(status.messages), sent, tracker.output
         assert tracker.interrupt() == 0, tracker.describe()
 
