@@ -8,16 +8,16 @@ import re
 import numpy as np
 import pytest
 from first_fix import at, fix_of, measure, rsu, solve
-from netpos.estimation.measurement import KIND, VALUE, Kind
+from netpos.estimation.measurement import KIND, VALUE, VARIANCE, Kind
+from netpos.estimation.mixture.gaussians import Mixture, moments
 from netpos.estimation.rows import linear_rows, speed_row
 from netpos.messages.values import AngleConvention, Array, Field
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.first_fix.initialise import (
-    Initialiser,
-)
+from netpos.tracking.first_fix.initialise import Initialiser
 from scipy.constants import speed_of_light
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 from track_cases import KNOWN_CLOCK, T0
 
 
@@ -96,6 +96,56 @@ def test_another_clock_does_not_excuse_a_wrong_rsu() -> None:
     assert solution is not None
     np.testing.assert_allclose(solution[0][:2], [25.0, 20.0], atol=0.2)
     assert abs(solution[0][4]) < 1.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_one_direction_that_is_wrong_puts_no_device_beside_its_rsu(seed: int) -> None:
+    """Eight RSUs hear a device seven times. One direction of the 56 is 70 degrees off, and what is
+    stated of them is so uncertain that the sum of all residuals does not show it: beside the RSU
+    that measured it any direction fits."""
+    rng, config = np.random.default_rng(seed), TrackerConfig(initial_position_sd_max_m=20.0)
+    stations = [rsu(150.0 * math.cos(a), 150.0 * math.sin(a)) for a in np.arange(8) * math.pi / 4]
+    truth, initialiser = at(85.0, -75.0), Initialiser(config)
+    for k in range(7):
+        rows = np.vstack(
+            [
+                measure(s, truth, Field.AZIMUTH, rng, math.radians(2.0), group=i)
+                for i, s in enumerate(stations)
+            ]
+        )
+        rows[:, VARIANCE] = math.radians(5.0) ** 2
+        rows[7, VALUE] -= math.radians(70.0) * (k == 6)
+        initialiser.add(T0 + k * 100_000_000, rows, tuple(stations))
+    fix = fix_of(initialiser)
+    assert fix is not None
+    error, cov = fix[0][:2] - truth[:2], fix[1][:2, :2]
+    assert error @ np.linalg.solve(cov, error) < chi2.ppf(0.999, 2)
+    assert np.hypot(*error) < 10.0
+
+
+@pytest.mark.parametrize(("stamps_ms", "is_told"), [((0, 200), False), ((0, 100, 200), True)])
+def test_of_two_values_that_differ_nobody_can_tell_which_is_wrong(
+    stamps_ms: tuple[int, ...], is_told: bool
+) -> None:
+    """Two anchors hear a device that stands; the first range is 4 m too long. Of three the other
+    two say so, of two the place is between them, and less certain."""
+    config = TrackerConfig(
+        initial_window_s=0.2, initial_speed_sd_mps=0.01, accel_density_mps2_sqrthz=0.01
+    )
+    stations, initialiser = [rsu(0, 0), rsu(40, 0)], Initialiser(config)
+    for ms in stamps_ms:
+        rows = np.vstack(
+            [measure(s, at(12.0, 25.0), Field.RANGE, group=i) for i, s in enumerate(stations)]
+        )
+        rows[0, VALUE] += 4.0 * (ms == 0)
+        initialiser.add(T0 + ms * 1_000_000, rows, tuple(stations))
+    fix = initialiser.solve()
+    assert fix is not None
+    above = fix.means[:, 1] > 0.0
+    mean, cov = moments(Mixture(*(part[above] for part in fix)))
+    distance, sd = float(np.hypot(*mean[:2])), math.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1])
+    assert distance == pytest.approx(math.hypot(12.0, 25.0) + (0.0 if is_told else 2.0), abs=0.1)
+    assert (sd < 0.3) is is_told
 
 
 def test_three_ranges() -> None:

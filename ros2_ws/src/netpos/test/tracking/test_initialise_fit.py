@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 from error_cases import Case, messages, tracker_of, true_values, walk
 from first_fix import at, fix_of, measure, rsu, solve
-from netpos.estimation.measurement import BIAS, COMMON, REFERENCE, VARIANCE, linearise
+from netpos.estimation.measurement import (
+    BIAS,
+    COMMON,
+    GROUP,
+    ORIGIN,
+    REFERENCE,
+    VALUE,
+    VARIANCE,
+    linearise,
+)
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.mixture.ridge import inverse as inverse_of
 from netpos.estimation.mixture.window import Window, normal_equations
@@ -16,17 +25,12 @@ from netpos.estimation.rows import speed_row
 from netpos.messages.values import AngleConvention, Array, Field, RsuInfo, RsuMeasurement
 from netpos.tracking import Tracker
 from netpos.tracking.config import TrackerConfig
-from netpos.tracking.first_fix.initialise import (
-    Initialiser,
-    Problem,
-    _clock_at,
-    _is_sound,
-    _solve,
-    _starts,
-    has_modes,
-)
+from netpos.tracking.first_fix.fit import Problem, is_sound, minima, minimum
+from netpos.tracking.first_fix.initialise import Initialiser, has_modes
+from netpos.tracking.first_fix.starts import clock_at, starts_of
 from netpos.tracking.rsus.rsu import Rsu, SlowErrors
-from scipy.stats import chi2
+from scipy.optimize import least_squares
+from scipy.stats import chi2, norm
 from track_cases import KNOWN_CLOCK, T0
 
 
@@ -47,7 +51,8 @@ def mixed_rows() -> tuple[list[Rsu], Array, Array]:
 
 def problem_of(rows: Array, prior: Array, prior_var: Array) -> Problem:
     """Rows of one instant, that tell nothing of accelerations."""
-    window = Window(np.zeros(len(rows)), rows, 0.0, len(prior), 1.0, 1)
+    none = np.zeros(len(rows))
+    window = Window(none, rows, 0.0, len(prior), 1.0, 1, none, 1.0)
     return Problem(window, np.append(prior, np.zeros(3)), np.append(prior_var, np.ones(3)))
 
 
@@ -99,7 +104,7 @@ def test_cost_gradient_and_curvature_of_the_fit(shares: bool) -> None:
         ):
             rows[of_it, column] = 6 + error
             signs[of_it, error] = -1.0 if column == REFERENCE else 1.0
-    window = Window(ages, rows, 0.7, 6 + errors_var.size, 0.8, 2)
+    window = Window(ages, rows, 0.7, 6 + errors_var.size, 0.8, 2, np.zeros(len(rows)), 1.0)
     behind = np.append(errors_var, [4.0, 1.0, 9.0, 2.0, 3.0, 5.0])
     problem = Problem(window, np.append(prior, 0.0 * behind), np.append(prior_var, behind))
     rng = np.random.default_rng(2)
@@ -119,6 +124,69 @@ def test_cost_gradient_and_curvature_of_the_fit(shares: bool) -> None:
         np.testing.assert_allclose(np.linalg.inv(hessian)[:6, :6], expected, rtol=1e-7, atol=1e-9)
 
 
+def test_an_outlier_costs_hardly_more_the_farther_off_it_is() -> None:
+    """Twice the negative log of a Gaussian or, for a share of the measurements, of a tail in which
+    each octave up to 1000 sd is as likely; a measurement is an outlier as a whole."""
+    _, rows, _ = mixed_rows()
+    ages = -0.3 * rows[:, GROUP]
+    shares = np.where(rows[:, GROUP] == 1, 0.0, 0.02)
+    window = Window(ages, rows, 0.7, 6, 0.8, 2, shares, 2.0)
+    prior = np.append([1.0, 2.0, 0.5, -0.5, 300.0, 20.0], np.zeros(6))
+    prior_var = np.array([900.0, 900.0, 25.0, 25.0, 1e4, 400.0, 4.0, 1.0, 9.0, 2.0, 3.0, 5.0])
+    problem = Problem(window, prior, prior_var)
+    measurements = np.column_stack([rows[:, GROUP], ages])
+    _, which = np.unique(measurements, axis=0, return_inverse=True)
+
+    def cost_with_outliers(state: Array) -> float:
+        sizes = np.abs(linearised(state, window)[0]) / np.sqrt(2.0 * rows[:, VARIANCE])
+        cost = float(np.sum((state - prior) ** 2 / prior_var))
+        for k in range(which.max() + 1):
+            size, share = sizes[which.reshape(-1) == k], shares[which.reshape(-1) == k][0]
+            tail = 1.0 / (2.0 * (1.0 + math.log(1000.0)) * np.maximum(size, 1.0))
+            log_tail = np.log(share) + np.log(tail / norm.pdf(0.0)).sum() if share else -np.inf
+            cost -= 2.0 * float(np.logaddexp(-0.5 * np.sum(size**2), log_tail))
+        return cost
+
+    rng, costs = np.random.default_rng(3), []
+    for scale in (1.0, 1.0, 30.0, 30.0, 1000.0):
+        state = np.append([-12.0, 0.5, 3.0, -2.0, 500.0, 40.0], np.zeros(6))
+        state[:6] += scale * rng.normal(size=6)
+        cost, half_gradient, _ = normal_equations(state, *problem)
+        assert cost == pytest.approx(cost_with_outliers(state), rel=1e-9)
+        numeric = np.empty(state.size)
+        for i, e in enumerate(np.eye(state.size) * 1e-5):
+            numeric[i] = (cost_with_outliers(state + e) - cost_with_outliers(state - e)) / 2e-5
+        np.testing.assert_allclose(half_gradient, -numeric / 2, rtol=1e-4, atol=1e-3)
+        costs.append(cost)
+
+
+def test_the_solver_finds_what_most_say_from_anywhere() -> None:
+    """Six ranges at each of four RSUs, of which three are wrong by far; the start is anywhere."""
+    rng = np.random.default_rng(4)
+    stations = [rsu(0, 0), rsu(40, 0), rsu(0, 40), rsu(40, 40)]
+    each = [measure(s, at(25.0, 18.0), Field.RANGE, rng, group=i) for i, s in enumerate(stations)]
+    rows = np.vstack([np.vstack(each) + 0.0 for _ in range(6)])
+    rows[:, VALUE] += rng.normal(0.0, 0.3, len(rows))
+    rows[[2, 7, 16], VALUE] += [9.0, -7.0, 60.0]
+    ages = np.repeat(np.arange(-5, 1) * 0.1, 4)
+    prior_var = np.array([150.0**2, 150.0**2, 1e-4, 1e-4, 1e4, 1e4, 1e-6, 1e-6, 1e-6])
+    prior = np.append([20.0, 20.0], np.zeros(7))
+    shares = np.full(len(rows), 0.01)
+    problem = Problem(Window(ages, rows, 0.0, 6, 1.0, 1, shares, 1.0), prior, prior_var)
+    good = np.delete(rows, [2, 7, 16], axis=0)
+
+    def left(place: Array) -> Array:
+        away = np.hypot(*(place - good[:, ORIGIN : ORIGIN + 2]).T)
+        return np.asarray((good[:, VALUE] - away) / np.sqrt(good[:, VARIANCE]))
+
+    expected = least_squares(left, [25.0, 18.0]).x
+    for _ in range(30):
+        found = minima(still(*rng.uniform(-60, 100, 2)), problem)
+        _, state, cov = min(found, key=lambda fit: fit[0])
+        np.testing.assert_allclose(state[:2], expected, atol=0.05)
+        assert np.sqrt(np.diag(cov)[:2]).max() < 0.15
+
+
 @pytest.mark.parametrize("seed", range(10))
 def test_the_solver_ends_in_a_minimum_from_anywhere(seed: int) -> None:
     """Steps that do not go down are damped until they do: the gradient vanishes at the end."""
@@ -129,7 +197,7 @@ def test_the_solver_ends_in_a_minimum_from_anywhere(seed: int) -> None:
     prior_var = np.array([150.0**2, 150.0**2, 25.0, 25.0, 1e4, 1e4])
     problem = problem_of(rows, np.array([13.0, 13.0, 0, 0, 0, 0]), prior_var)
     start = still(*rng.uniform(-60, 60, 2))
-    cost, state, cov = _solve(start, problem)
+    cost, state, cov = minimum(start, problem)
     assert cost <= cost_of(start, problem)
     _, half_gradient, hessian = normal_equations(state, *problem)
     # in units of the sd of the solution
@@ -147,7 +215,7 @@ def test_a_step_uphill_is_tried_again_shorter(start: tuple[float, float]) -> Non
     cost, b, A = normal_equations(still(*start), *problem)
     first = still(*start) + np.linalg.solve(A + 1e-3 * np.diag(np.diag(A)), b)
     assert cost_of(first, problem) > cost
-    end, state, _ = _solve(still(*start), problem)
+    end, state, _ = minimum(still(*start), problem)
     assert end < 0.02
     np.testing.assert_allclose(state[:2], [25.0, 18.0], atol=1.0)
 
@@ -157,7 +225,7 @@ def test_starts_lie_where_the_measurements_point() -> None:
     turned = rsu(10, 20, 90)
     d = np.array([0.6, 0.8])
     azimuth = measure(turned, at(*(np.array([10, 20]) + 30 * d)), Field.AZIMUTH)
-    starts = _starts(np.vstack([azimuth, azimuth]), centre, 150.0)
+    starts = starts_of(np.vstack([azimuth, azimuth]), centre, 150.0)
     np.testing.assert_array_equal(starts[0], centre)
     along = np.array(starts[1:]) - [10, 20]
     assert len(along) == 5  # the second row of the same sensor adds none
@@ -166,31 +234,31 @@ def test_starts_lie_where_the_measurements_point() -> None:
     cone = rsu(10, 20, 90, angle_convention=AngleConvention.CONE)
     row = measure(cone, at(*(np.array([10, 20]) + 30 * d)), Field.AZIMUTH)
     np.testing.assert_allclose(
-        np.array(_starts(row, centre, 150.0)[1:]) - [10, 20], along, atol=1e-9
+        np.array(starts_of(row, centre, 150.0)[1:]) - [10, 20], along, atol=1e-9
     )
     row[0, 1] = 1.2  # noise beyond the end-fire direction
-    assert np.isfinite(np.array(_starts(row, centre, 150.0))).all()
+    assert np.isfinite(np.array(starts_of(row, centre, 150.0))).all()
 
-    circle = np.array(_starts(measure(turned, at(10, 27), Field.RANGE), centre, 150.0)[1:]) - [
+    circle = np.array(starts_of(measure(turned, at(10, 27), Field.RANGE), centre, 150.0)[1:]) - [
         10,
         20,
     ]
     np.testing.assert_allclose(np.linalg.norm(circle, axis=1), 7.0)
     angles = np.sort(np.arctan2(circle[:, 1], circle[:, 0]))
     np.testing.assert_allclose(np.diff(angles), 2 * math.pi / 12, atol=1e-9)
-    toa = np.array(_starts(measure(turned, at(10, 27), Field.TOA), centre, 150.0)[1:]) - [10, 20]
+    toa = np.array(starts_of(measure(turned, at(10, 27), Field.TOA), centre, 150.0)[1:]) - [10, 20]
     np.testing.assert_allclose(np.linalg.norm(toa, axis=1), 30.0)
     assert len(toa) == 4
 
-    fix = _starts(measure(turned, at(7, -8), Field.POSITION), centre, 150.0)
+    fix = starts_of(measure(turned, at(7, -8), Field.POSITION), centre, 150.0)
     np.testing.assert_allclose(fix, [centre, [7.0, -8.0]], atol=1e-9)
-    assert len(_starts(speed_row(3.0, 1.0, 0), centre, 150.0)) == 1
+    assert len(starts_of(speed_row(3.0, 1.0, 0), centre, 150.0)) == 1
 
 
 def test_starts_reach_as_far_as_devices_may_be() -> None:
     centre, far = np.array([1.0, 2.0]), measure(rsu(0, 0), at(3e4, 4e4), Field.AZIMUTH)
-    near, wide = (np.array(_starts(far, centre, reach)[1:]) for reach in (10.0, 6e4))
-    np.testing.assert_allclose(near, _starts(far, centre, 150.0)[1:])
+    near, wide = (np.array(starts_of(far, centre, reach)[1:]) for reach in (10.0, 6e4))
+    np.testing.assert_allclose(near, starts_of(far, centre, 150.0)[1:])
     np.testing.assert_allclose(wide, 400.0 * near, rtol=1e-12)
 
 
@@ -201,8 +269,8 @@ def test_clock_start_is_the_weighted_mean_of_what_the_times_leave() -> None:
     rows[:, 2] = 1.0, 1.0, 1.0, 4.0
     left = [100.0 - math.sqrt(12**2 + 9**2 + 4**2), 230.0 - math.hypot(math.hypot(28, 9), 2)]
     expected = (left[0] + left[1] / 4) / 1.25
-    assert _clock_at(at(12.0, 9.0), rows, 2.0) == pytest.approx(expected)
-    assert _clock_at(at(12.0, 9.0), rows[[0, 2]], 2.0) == 0.0
+    assert clock_at(at(12.0, 9.0), rows, 2.0) == pytest.approx(expected)
+    assert clock_at(at(12.0, 9.0), rows[[0, 2]], 2.0) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -221,11 +289,11 @@ def test_a_mode_is_elsewhere_and_probable(share: float, apart: float, several: b
 
 
 def test_no_fit_whose_covariance_drowned_in_rounding() -> None:
-    assert _is_sound((1.0, np.zeros(6), np.eye(6)))
-    assert not _is_sound((math.nan, np.zeros(6), np.eye(6)))
-    assert not _is_sound((math.inf, np.zeros(6), np.eye(6)))
-    assert not _is_sound((1.0, np.zeros(6), np.diag([1.0, -1e-12, 1, 1, 1, 1])))
-    assert not _is_sound((1.0, np.zeros(6), np.diag([-1e-12, 1.0, 1, 1, 1, 1])))
+    assert is_sound((1.0, np.zeros(6), np.eye(6)))
+    assert not is_sound((math.nan, np.zeros(6), np.eye(6)))
+    assert not is_sound((math.inf, np.zeros(6), np.eye(6)))
+    assert not is_sound((1.0, np.zeros(6), np.diag([1.0, -1e-12, 1, 1, 1, 1])))
+    assert not is_sound((1.0, np.zeros(6), np.diag([-1e-12, 1.0, 1, 1, 1, 1])))
 
 
 def test_inverse_of_units_that_differ_by_many_orders() -> None:

@@ -364,7 +364,7 @@ def _finish(
     fused = FusedEpoch(prior_mean, prior_cov, rows, accepted, epoch.unheard_s, x)
     level = float(manoeuvre_level(fused, longest_s, options, memory.level))
     shown = math.isfinite(level) and not is_open and accepted[:groups].sum() > 0.0
-    return level, longest_s if shown else open_s
+    return level, min(longest_s, open_s) if shown else open_s
 
 
 @kernel

@@ -1,14 +1,23 @@
 """Cost of a state against all measurements of a window, in parts of which the accelerations of the
-device and of its clock are constant."""
+device and of its clock are constant. Each measurement may be an outlier."""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from netpos.estimation.compile import kernel, leaf
-from netpos.estimation.measurement import VALUE, VARIANCE, is_cyclic, predict_row, wrap
+from netpos.estimation.measurement import (
+    GROUP,
+    VALUE,
+    VARIANCE,
+    is_cyclic,
+    predict_row,
+    wrap,
+)
+from netpos.estimation.mixture.candidates import TAIL_LOG
 from netpos.estimation.state import X
 from netpos.messages.values import Array
 
@@ -23,6 +32,8 @@ class Window(NamedTuple):
     height_m : nominal height of the device
     first, part_s : index of the accelerations [m/s^2] of the device, two, and of its clock, in
         ``parts`` of so many seconds each, the newest first
+    outliers (m,) : probability that a row belongs to a measurement that is one
+    scale : of the variances of the rows
     """
 
     ages_s: Array
@@ -31,6 +42,8 @@ class Window(NamedTuple):
     first: int
     part_s: float
     parts: int
+    outliers: Array
+    scale: float
 
 
 @leaf
@@ -48,16 +61,70 @@ def _moved(age_s: float, part: int, part_s: float) -> tuple[float, float]:
 def normal_equations(
     state: Array, window: Window, prior: Array, prior_var: Array
 ) -> tuple[float, Array, Array]:
-    """Cost, gradient (n,) and Gauss-Newton Hessian (n, n) of the fit at ``state`` (n,)."""
-    rows, n = window.rows, state.size
+    """Cost, gradient (n,) and Gauss-Newton Hessian (n, n) of the fit at ``state`` (n,).
+
+    A measurement costs -2 ln of its density over that of a Gaussian at its peak: d with a squared
+    distance d that is small, and hardly more with any that is large, where it is an outlier. The
+    Hessian has it as far as it is none.
+    """
+    rows, n, m = window.rows, state.size, window.rows.shape[0]
     A = np.diag(1.0 / prior_var)
     difference = prior - state
     b = difference / prior_var
     cost = float((difference * b).sum())
-    h = np.zeros(n)
-    past = state.copy()
-    for i in range(rows.shape[0]):
-        age = window.ages_s[i]
+    residual, H = _linearised(state, window)
+    start = 0
+    while start < m:
+        stop = _measurement_end(window, start)
+        variance = window.scale * rows[start:stop, VARIANCE]
+        share = window.outliers[start]
+        density_log, sound = _density_log(share, residual[start:stop], variance)
+        cost -= 2.0 * density_log
+        for i in range(start, stop):
+            h, w = H[i], sound / variance[i - start]
+            slope = w * residual[i]
+            if residual[i] ** 2 > variance[i - start]:
+                slope += (1.0 - sound) / residual[i]
+            for a in range(n):
+                if h[a] != 0.0:  # few are not: a row names one or two of the slow errors
+                    b[a] += slope * h[a]
+                    for c in range(n):
+                        A[a, c] += w * (h[a] * h[c])
+        start = stop
+    return cost, b, A
+
+
+@kernel
+def outliers_of(state: Array, window: Window) -> tuple[float, float]:
+    """How many measurements are outliers at ``state`` (n,), and what they cost."""
+    residual, _ = _linearised(state, window)
+    count, cost, start = 0.0, 0.0, 0
+    while start < residual.size:
+        stop = _measurement_end(window, start)
+        variance = window.scale * window.rows[start:stop, VARIANCE]
+        share = window.outliers[start]
+        density_log, sound = _density_log(share, residual[start:stop], variance)
+        count += 1.0 - sound
+        cost -= 2.0 * (1.0 - sound) * density_log
+        start = stop
+    return count, cost
+
+
+@kernel
+def typical_scale(state: Array, window: Window) -> float:
+    """By how much variances would have to be larger, at least 1, for half of the rows to be within
+    one standard deviation at ``state`` (n,)."""
+    residual, _ = _linearised(state, window)
+    return max(1.0, float(np.median(residual**2 / window.rows[:, VARIANCE])))
+
+
+@kernel
+def _linearised(state: Array, window: Window) -> tuple[Array, Array]:
+    """Residuals (m,) at ``state`` (n,) and derivatives (m, n) of what is predicted."""
+    rows, m = window.rows, window.rows.shape[0]
+    residual, H, past = np.empty(m), np.zeros((m, state.size)), state.copy()
+    for i in range(m):
+        h, age = H[i], window.ages_s[i]
         past[:] = state
         for place, rate in _MOVES:
             past[place] += state[rate] * age
@@ -67,9 +134,9 @@ def normal_equations(
                 (place, rate), at = _MOVES[k], window.first + 3 * part + k
                 past[place] += farther * state[at]
                 past[rate] += faster * state[at]
-        residual = rows[i, VALUE] - predict_row(rows[i], past, window.height_m, h)
+        residual[i] = rows[i, VALUE] - predict_row(rows[i], past, window.height_m, h)
         if is_cyclic(rows[i]):
-            residual = wrap(residual)
+            residual[i] = wrap(residual[i])
         for part in range(window.parts):
             faster, farther = _moved(age, part, window.part_s)
             for k in range(3):
@@ -77,11 +144,35 @@ def normal_equations(
                 h[at] += farther * h[place] + faster * h[rate]
         for place, rate in _MOVES:
             h[rate] += age * h[place]
-        w = 1.0 / rows[i, VARIANCE]
-        cost += w * residual * residual
-        for a in range(n):
-            if h[a] != 0.0:  # few are not: a row names one or two of the slow errors
-                b[a] += w * residual * h[a]
-                for c in range(n):
-                    A[a, c] += w * (h[a] * h[c])
-    return cost, b, A
+    return residual, H
+
+
+@leaf
+def _measurement_end(window: Window, start: int) -> int:
+    """The row behind those of the measurement that begins with the row ``start``."""
+    rows, stop = window.rows, start + 1
+    while (
+        stop < rows.shape[0]
+        and rows[stop, GROUP] == rows[start, GROUP]
+        and window.ages_s[stop] == window.ages_s[start]
+    ):
+        stop += 1
+    return stop
+
+
+@leaf
+def _density_log(share: float, residual: Array, variance: Array) -> tuple[float, float]:
+    """Log density of one measurement with a ``residual`` (m,) and its ``variance`` (m,), over that
+    of a Gaussian at its peak, and the probability that it is no outlier; a ``share`` of those like
+    it are."""
+    sound, outlier = 0.0, 0.0
+    for i in range(residual.size):
+        square = residual[i] ** 2 / variance[i]
+        sound -= 0.5 * square
+        outlier += TAIL_LOG + 0.5 * math.log(2.0 * math.pi / max(square, 1.0))
+    if share <= 0.0:
+        return sound, 1.0
+    outlier += math.log(share)
+    top = max(sound, outlier)
+    total = top + math.log(math.exp(sound - top) + math.exp(outlier - top))
+    return total, math.exp(sound - total)

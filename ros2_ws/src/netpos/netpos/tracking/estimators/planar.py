@@ -44,7 +44,8 @@ from netpos.tracking.estimators.models import (
     pose_state,
     slow_states,
 )
-from netpos.tracking.first_fix.initialise import Initialiser, with_heading
+from netpos.tracking.first_fix.initialise import Initialiser
+from netpos.tracking.first_fix.lever_arm_heading import with_heading
 from netpos.tracking.first_fix.phase_start import PhaseStart
 from netpos.tracking.networks.secondary import OwnNoise, Secondary
 from netpos.tracking.rsus.learning import LearnedErrors

@@ -14,53 +14,37 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 
-from netpos.common.least_squares import minimise
-from netpos.estimation.chi_square import chi_square_bound
 from netpos.estimation.densities import Density, held
 from netpos.estimation.measurement import (
     AXES,
     BIAS,
-    BLOCKED,
     COMMON,
-    GROUP,
     HEADING,
     HEIGHT,
     KIND,
-    LEVER,
     ORIGIN,
+    OUTLIER_SHARE,
     REFERENCE,
-    VALUE,
-    VARIANCE,
     Kind,
-    wrap,
 )
+from netpos.estimation.mixture.candidates import OUTLIERS
 from netpos.estimation.mixture.gaussians import Mixture, mode_of, moments
 from netpos.estimation.mixture.reduction import PART_MERGE_COST, reduced
-from netpos.estimation.mixture.ridge import (
-    Fit,
-    cholesky_solve,
-    components_of,
-    inverse,
-    log_weight_of,
-    on_line,
-)
-from netpos.estimation.mixture.window import Window, normal_equations
+from netpos.estimation.mixture.ridge import Fit, log_weight_of, on_line
+from netpos.estimation.mixture.window import Window
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
-from netpos.estimation.rows import drop_biases
 from netpos.estimation.sensors.table import BY_KIND
 from netpos.estimation.state import N_CORE
-from netpos.estimation.update.fit import map_cost
-from netpos.estimation.update.fusion import workspace
-from netpos.estimation.update.iteration import iterate_from
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimators.models import carries_modes, slow_states, state_of_fit
 from netpos.tracking.first_fix import wrong_rsu
+from netpos.tracking.first_fix.fit import Problem, Solution, is_sound, minima
+from netpos.tracking.first_fix.starts import clock_at, starts_of
 from netpos.tracking.rsus.rsu import Rsu, SlowErrors
 
 _REFINED = 12
@@ -68,106 +52,13 @@ _ATTEMPT_NS = 100_000_000
 _LEAST_SPAN_S = 0.1  # of a window
 _PART_S, _PARTS_MAX = 0.75, 8  # of the window, in which accelerations are constant
 _RETRY_SHARE = 0.05  # the next attempt comes after so much of the time waited
-# Odds of another heading this much worse in cost (chi-square 0.99, 2 dof) rule it out; places that
-# cannot be told apart are waited for from the same share on, and carried along below it.
-_RIVAL_COST, _RIVAL_SHARE = 9.21, 0.01
+# Places that cannot be told apart are waited for from this share on, and carried along below it.
+_MODE_SHARE = 0.01
 _ANY_CLOCK_S = 1.0
 _CONTRADICTS = 9.0  # mean squared residual over variance
-_RELAXATIONS, _FITS = 5, 1.1
+_TELLING = 3  # values of an RSU, of which one can be told to be an outlier
 _NEAREST_M = 1.0
-_HEADINGS = 16
-_HEADING_SD_MAX = 0.5
 _LEAST_SD = 1e-9  # of a slow error
-_RAY_M = (2.0, 6.0, 15.0, 40.0, 100.0)
-_RAYS_REACH_M = 150.0  # where devices are farther from the RSUs, the rays are longer
-_CIRCLE = tuple(2.0 * math.pi * i / 12 for i in range(12))
-
-
-class Problem(NamedTuple):
-    """What ``normal_equations`` takes after the state."""
-
-    window: Window
-    prior: Array
-    prior_var: Array
-
-    def equations(self, state: Array) -> tuple[float, Array, Array]:
-        """``normal_equations`` at ``state`` (n,)."""
-        found: tuple[float, Array, Array] = normal_equations(state, *self)
-        return found
-
-
-class _Solution(NamedTuple):
-    """A problem, its minima and the ``constrained`` ones, at some distances from an RSU; there is
-    one of either. nearer: log weight of the heaviest minimum that is nearer to an RSU than a
-    device can be. log_odds: of what it takes for granted, and the log density of the states that
-    it has more than others, where these are 0."""
-
-    problem: Problem
-    minima: list[Fit]
-    constrained: list[Fit]
-    nearer: float
-    log_odds: float = 0.0
-
-    @property
-    def best(self) -> Fit:
-        """The one that fits best."""
-        return min((*self.minima, *self.constrained), key=lambda fit: fit[0])
-
-    @property
-    def heaviest(self) -> Fit:
-        """The minimum that weighs most."""
-        return max(self.minima or self.constrained, key=log_weight_of)
-
-    @property
-    def cost(self) -> float:
-        """That of the best."""
-        return self.best[0]
-
-    @property
-    def misfit(self) -> float:
-        """Cost for each row where it is more than the 1 of true measurements, or 1."""
-        return max(1.0, self.cost / len(self.problem.window.rows))
-
-    def mixture(self, is_possible: Callable[[Array], bool]) -> Mixture | None:
-        """The posterior of all states; None where more of it is impossible."""
-        found = components_of(self.problem.equations, self.minima, self.constrained, is_possible)
-        if found is None or np.logaddexp.reduce(found.log_weights) < self.nearer:
-            return None
-        return found._replace(log_weights=found.log_weights + self.log_odds)
-
-    def relaxed(
-        self, lasting: int, solution_of: Callable[[Problem], _Solution | None]
-    ) -> _Solution:
-        """With variances so much larger that nothing contradicts: of the measurements, and of the
-        place, the velocity and the clock beforehand, each by its own misfit. Slow errors, which
-        end with the first ``lasting`` states, are as certain as before; the states behind are
-        errors of one epoch, a part of the measurements."""
-        solution, factors = self, np.ones(1 + N_CORE)
-        for _ in range(_RELAXATIONS):
-            more = solution._misfits(lasting)
-            if more.max() < _FITS:
-                break
-            factors *= more
-            rows, prior_var = self.problem.window.rows.copy(), self.problem.prior_var.copy()
-            rows[:, VARIANCE] *= factors[0]
-            prior_var[:N_CORE] *= factors[1:]
-            prior_var[lasting:] *= factors[0]
-            window = self.problem.window._replace(rows=rows)
-            problem = self.problem._replace(window=window, prior_var=prior_var)
-            found = solution_of(problem)
-            if found is None:
-                break
-            solution = found._replace(log_odds=self.log_odds)
-        return solution
-
-    def _misfits(self, lasting: int) -> Array:
-        """Cost of the measurements for each row, and of place, velocity and clock for each of
-        their states, where that is more than 1 (1 + N_CORE,)."""
-        cost, state, _ = self.best
-        known = (state - self.problem.prior) ** 2 / self.problem.prior_var
-        of_rows = (cost - known[:lasting].sum()) / len(self.problem.window.rows)
-        pairs = known[:N_CORE].reshape(-1, 2).mean(axis=1)
-        return np.maximum([of_rows, *np.repeat(pairs, 2)], 1.0)
 
 
 def joined(mixtures: Sequence[Mixture]) -> Mixture:
@@ -192,17 +83,12 @@ def has_modes(mixture: Mixture, share: float) -> bool:
     return bool((sums > share).sum() > 1)
 
 
-def _solve(state: Array, problem: Problem) -> Fit:
-    """Levenberg-Marquardt from one start: cost, state, covariance of the fit."""
-    cost, state, A = minimise(problem.equations, state, cholesky_solve)
-    return cost, state, inverse(A)
-
-
 class Initialiser:
     """Collects rows until they determine a position."""
 
     def __init__(self, config: TrackerConfig) -> None:
         self._config = config
+        self._risk = 1.0 - config.gate_probability
         self._window: deque[tuple[int, Array, tuple[Rsu, ...]]] = deque()
         self._own = slow_states(config).slow_errors
         self._next_attempt_ns = 0
@@ -261,9 +147,9 @@ class Initialiser:
         agreed = self._solution(self._problem(rows, ages, errors_sd))
         if agreed is None:
             return nowhere
-        solutions, agrees = [agreed], self._consistent(agreed.cost, len(rows))
+        solutions, agrees = [agreed], agreed.is_consistent(self._risk)
         if not agrees:
-            solutions = self._that_agree(rows, ages, errors_sd) or solutions
+            solutions = self._that_agree(rows, ages, errors_sd) or self._without_outliers(agreed)
         misfit = solutions[0].misfit
         if misfit > 1.0:
             lasting = N_CORE + int(slow.lasts.sum())
@@ -284,15 +170,20 @@ class Initialiser:
         mixture = joined(found)
         waited_s = (self._window[-1][0] - self._window[0][0]) * 1e-9
         waits = waited_s < 0.8 * self._config.initial_window_s or not carries_modes(self._config)
-        if waits and has_modes(mixture, _RIVAL_SHARE):
+        if waits and has_modes(mixture, _MODE_SHARE):
             return f"more than one place fits {self._heard(rows)}; waiting for more"
         return mixture
 
-    def _that_agree(self, rows: Array, ages: Array, errors_sd: Array) -> list[_Solution]:
+    def _that_agree(self, rows: Array, ages: Array, errors_sd: Array) -> list[Solution]:
         """Consistent solutions of measurements that contradict each other: without one of the
         RSUs, or else with another clock; none where there are none."""
         without = self._without_one(rows, ages, errors_sd)
         return without or self._any_clock(rows, ages, errors_sd)
+
+    def _without_outliers(self, solution: Solution) -> list[Solution]:
+        """The solution if none of the measurements is an outlier: none where they contradict each
+        other is."""
+        return [self._solution(solution.problem.without_outliers()) or solution]
 
     def _of_track(self, mixture: Mixture, slow: SlowErrors) -> Mixture:
         """The states of a track, of the components of a fit."""
@@ -338,9 +229,9 @@ class Initialiser:
         var = np.append(var, problem.prior_var[len(var) :])
         start = mean = np.append(mean, problem.prior[len(mean) :])
         start = start.copy()
-        start[4] = _clock_at(start, rows, self._config.device_height_m)
-        cost = _solve(start, problem._replace(prior=mean, prior_var=var))[0]
-        return max(0.0, cost - found.cost)
+        start[4] = clock_at(start, rows, self._config.device_height_m)
+        found_there = minima(start, problem._replace(prior=mean, prior_var=var))
+        return max(0.0, min(cost for cost, _, _ in found_there) - found.best[0])
 
     def _stacked(self, slow: SlowErrors) -> tuple[Array, Array, Array]:
         """The rows of the window, their ages [s], <= 0, against the newest, and the sd of the slow
@@ -358,11 +249,7 @@ class Initialiser:
         rsus = sorted({rsu.info.rsu_id for entry in self._window for rsu in entry[2]})
         return f"{', '.join(kinds)} of {', '.join(rsus) or 'no RSU'}"
 
-    def _consistent(self, cost: float, rows: int) -> bool:
-        """Whether the ``cost`` of a fit is one that true measurements have."""
-        return bool(cost <= chi_square_bound(rows, 1.0 - self._config.gate_probability))
-
-    def _without_one(self, rows: Array, ages: Array, errors_sd: Array) -> list[_Solution]:
+    def _without_one(self, rows: Array, ages: Array, errors_sd: Array) -> list[Solution]:
         """Solutions with a consistent fit without one of the RSUs, best first; none of fewer than
         three RSUs."""
         placed = wrong_rsu.placed(rows)
@@ -373,20 +260,20 @@ class Initialiser:
         for origin in origins:
             keep = ~placed | (rows[:, ORIGIN:AXES] != origin).any(axis=1)
             others = self._solution(self._problem(rows[keep], ages[keep], errors_sd))
-            if others is not None and self._consistent(others.cost, int(keep.sum())):
+            if others is not None and others.is_consistent(self._risk):
                 solutions.append(others)
-        return sorted(solutions, key=lambda solution: solution.cost)
+        return sorted(solutions, key=lambda solution: solution.best[0])
 
-    def _any_clock(self, rows: Array, ages: Array, errors_sd: Array) -> list[_Solution]:
+    def _any_clock(self, rows: Array, ages: Array, errors_sd: Array) -> list[Solution]:
         """The solution with a consistent fit whatever the clock offset is, if there is one."""
         if not any(BY_KIND[int(kind)].has_clock for kind in np.unique(rows[:, KIND])):
             return []
         problem = self._problem(rows, ages, errors_sd)
         problem.prior_var[4] = (SPEED_OF_LIGHT_MPS * _ANY_CLOCK_S) ** 2
         found = self._solution(problem)
-        return [found] if found and self._consistent(found.cost, len(rows)) else []
+        return [found] if found and found.is_consistent(self._risk) else []
 
-    def _one_errs(self, rows: Array, problem: Problem) -> list[_Solution]:
+    def _one_errs(self, rows: Array, problem: Problem) -> list[Solution]:
         """Solutions in which one of the RSUs errs grossly, of at least three."""
         found = []
         for case in wrong_rsu.cases(*problem):
@@ -416,41 +303,48 @@ class Initialiser:
         prior_var = np.concatenate([sd, np.maximum(clock_sd, 1e-6), errors_sd]) ** 2
         prior = np.append(prior, np.zeros(errors_sd.size))
         first = prior.size - len(turns_sd)
-        window = Window(ages, rows, cfg.device_height_m, first, span_s / parts, parts)
+        height_m, outliers = cfg.device_height_m, _outlier_shares(rows)
+        window = Window(ages, rows, height_m, first, span_s / parts, parts, outliers, 1.0)
         return Problem(window, prior, prior_var)
 
-    def _solution(self, problem: Problem) -> _Solution | None:
+    def _solution(self, problem: Problem) -> Solution | None:
         """What is found from the most promising starts; None where that is nothing."""
         starts = self._starts(problem)
-        free = [fit for fit in (_solve(start, problem) for start in starts) if _is_sound(fit)]
+        free = [fit for start in starts for fit in minima(start, problem) if is_sound(fit)]
         nearer = [log_weight_of(fit) for fit in free if self._is_on_rsu(fit[1])]
         # on top of an RSU anything fits: the distances of the starts are as good
-        fits = [self._constrained(start, problem) for start in starts] if nearer else []
-        minima = [fit for fit in free if self._plausible(fit[1])]
-        constrained = [fit for fit in fits if _is_sound(fit) and self._plausible(fit[1])]
-        if not minima and not constrained:
+        constrained = [
+            fit
+            for start in (starts if nearer else [])
+            for fit in self._constrained(start, problem)
+            if is_sound(fit) and self._plausible(fit[1])
+        ]
+        free = [fit for fit in free if self._plausible(fit[1])]
+        if not free and not constrained:
             return None
-        return _Solution(problem, minima, constrained, max(nearer, default=-math.inf))
+        return Solution(problem, free, constrained, max(nearer, default=-math.inf))
 
     def _starts(self, problem: Problem) -> list[Array]:
         """The starts (n,) that cost least."""
-        rows = problem.window.rows
+        rows, sound = problem.window.rows, problem.without_outliers()
         scored: list[tuple[float, int, Array]] = []
-        for xy in _starts(rows, problem.prior[:2], math.sqrt(problem.prior_var[0])):
+        for xy in starts_of(rows, problem.prior[:2], math.sqrt(problem.prior_var[0])):
             state = problem.prior.copy()
             state[:2] = xy
-            state[4] = _clock_at(state, rows, self._config.device_height_m)
-            scored.append((problem.equations(state)[0], len(scored), state))
+            state[4] = clock_at(state, rows, self._config.device_height_m)
+            scored.append((sound.equations(state)[0], len(scored), state))
         return [state for _, _, state in sorted(scored)[:_REFINED]]
 
-    def _constrained(self, start: Array, problem: Problem) -> Fit:
-        """The most probable state that is as far from the nearest RSU as ``start``."""
+    def _constrained(self, start: Array, problem: Problem) -> list[Fit]:
+        """The most probable states that are as far from the nearest RSU as ``start``."""
         origins = np.array([r.info.position[:2] for e in self._window for r in e[2]])
         away = start[:2] - origins[np.argmin(np.hypot(*(start[:2] - origins).T))]
         far = float(np.hypot(*away))
         if far < _NEAREST_M:
-            return math.inf, start, np.eye(start.size)
-        return on_line(problem.equations, start, away / far)
+            return []
+        return minima(
+            start, problem, lambda state, step: on_line(step.equations, state, away / far)
+        )
 
     def _plausible(self, state: Array) -> bool:
         """Not behind an array without a back, and not on top of an RSU."""
@@ -474,43 +368,13 @@ class Initialiser:
         return any(math.dist(place, (state[0], state[1], up)) < _NEAREST_M for place in places)
 
 
-def with_heading(
-    mean: Array, cov: Array, rows: Array, height_m: float
-) -> tuple[Array, Array] | None:
-    """A fix mean (6,), cov (6, 6) that ignored the lever arms of ``rows`` (m, ROW_WIDTH), and the
-    heading they speak for: mean (7,), cov (7, 7); None where they leave it open."""
-    levers = rows[rows[:, HEADING] >= 0, LEVER:BLOCKED]
-    if not levers.any():
-        return None
-    rows = rows.copy()
-    drop_biases(rows)
-    rows[rows[:, HEADING] >= 0, HEADING] = 6
-    rows[:, GROUP] = 0
-    reach = 30.0 * float(np.hypot(levers[:, 0], levers[:, 1]).max())  # the fix tells no heading
-    prior = np.zeros((7, 7))
-    prior[:6, :6] = cov + reach**2 * np.diag([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
-    prior[6, 6] = math.pi**2
-    variance, work = rows[:, VARIANCE].copy(), workspace(7, len(rows))
-    candidates = []
-    for k in range(_HEADINGS):
-        start = np.append(mean, 2.0 * math.pi * k / _HEADINGS)
-        x, P = iterate_from(start, start, prior, rows, variance, height_m, 30, work)
-        candidates.append((map_cost(x, P, rows, variance, height_m, x), k, x, P))
-    candidates.sort(key=lambda c: c[:2])
-    cost, _, x, P = candidates[0]
-    far = 5.0 * math.sqrt(P[6, 6])
-    if P[6, 6] > _HEADING_SD_MAX**2 or any(
-        c[0] < cost + _RIVAL_COST and abs(wrap(c[2][6] - x[6])) > far for c in candidates
-    ):
-        return None
-    x[6] = wrap(float(x[6]))
-    return x, P
-
-
-def _is_sound(fit: Fit) -> bool:
-    """Whether the fit is finite and its position covariance survived rounding."""
-    cost, _, cov = fit
-    return bool(math.isfinite(cost) and np.linalg.eigvalsh(cov[:2, :2])[0] > 0.0)
+def _outlier_shares(rows: Array) -> Array:
+    """The probability of each of ``rows`` (m, ROW_WIDTH) that it is an outlier (m,): 0 where its
+    RSU has measured the quantity less than three times, which nobody can tell from a wrong RSU."""
+    sources = np.column_stack([rows[:, KIND], rows[:, ORIGIN:AXES]])
+    _, which, counts = np.unique(sources, axis=0, return_inverse=True, return_counts=True)
+    shares = np.where(rows[:, OUTLIER_SHARE] > 0.0, rows[:, OUTLIER_SHARE], OUTLIERS)
+    return np.where(counts[which.reshape(-1)] < _TELLING, 0.0, shares)
 
 
 def _acceleration_sd(density: float, part_s: float) -> float:
@@ -536,58 +400,3 @@ def _name_states_of_fit(rows: Array, ages_s: Array, slow: SlowErrors) -> Array:
             rows[new, column] = N_CORE + sd.size + which.reshape(-1)
             sd = np.append(sd, slow.sd[error[first]])
     return sd
-
-
-def _starts(rows: Array, centre: Array, reach_m: float) -> list[Array]:
-    """Positions to start from: along measured bearings, around measured ranges, the centre of the
-    RSUs, from which a device is about ``reach_m`` away."""
-    starts, rays_m = [centre], [r * max(1.0, reach_m / _RAYS_REACH_M) for r in _RAY_M]
-    seen = set()
-    for row in rows:
-        kind = Kind(int(row[KIND]))
-        key = (kind, *row[ORIGIN:AXES])
-        if key in seen or kind is Kind.SPEED:
-            continue
-        seen.add(key)
-        origin = row[ORIGIN : ORIGIN + 2]
-        if kind in (Kind.AZIMUTH, Kind.COSINE_Y):
-            A = row[AXES : AXES + 9].reshape(3, 3)
-            angle = row[VALUE] if kind is Kind.AZIMUTH else math.asin(np.clip(row[VALUE], -1, 1))
-            ray = A.T @ np.array([math.cos(angle), math.sin(angle), 0.0])
-            starts += [origin + r * ray[:2] for r in rays_m]
-        elif kind is Kind.TDOA:
-            starts += _on_hyperbola(row, rays_m[-1])
-        elif BY_KIND[kind].is_range and not BY_KIND[kind].has_clock:
-            starts += [origin + row[VALUE] * np.array([math.cos(a), math.sin(a)]) for a in _CIRCLE]
-        elif BY_KIND[kind].is_range:
-            starts += [origin + 30.0 * np.array([math.cos(a), math.sin(a)]) for a in _CIRCLE[::3]]
-    fix = rows[rows[:, KIND] == Kind.LINEAR]
-    if len(fix) >= 2:
-        H = fix[:, ORIGIN : ORIGIN + 2]
-        starts.append(np.linalg.lstsq(H, fix[:, VALUE], rcond=None)[0])
-    return starts
-
-
-def _on_hyperbola(row: Array, farthest_m: float) -> list[Array]:
-    """Horizontal positions, nearer than ``farthest_m`` to the RSU, from which a time difference of
-    arrival would read as it does: in polar coordinates around the RSU, in the direction e,
-    r = (D^2 - v^2) / (2 (e b - v)), with the reference at b, D away, and the value v."""
-    between, value = row[AXES : AXES + 2], float(row[VALUE])
-    excess = float(between @ between) - value * value
-    found = []
-    for angle in _CIRCLE:
-        direction = np.array([math.cos(angle), math.sin(angle)])
-        slope = 2.0 * (float(direction @ between) - value)
-        if abs(slope) > 1e-9 and 0.0 < excess / slope < farthest_m:
-            found.append(row[ORIGIN : ORIGIN + 2] + excess / slope * direction)
-    return found
-
-
-def _clock_at(state: Array, rows: Array, height_m: float) -> float:
-    """Clock offset [m] that fits the TOA rows best at the position of ``state``."""
-    toa = rows[rows[:, KIND] == Kind.TOA]
-    if not len(toa):
-        return 0.0
-    d = np.column_stack([state[0] - toa[:, ORIGIN], state[1] - toa[:, ORIGIN + 1]])
-    distance = np.hypot(np.hypot(d[:, 0], d[:, 1]), height_m - toa[:, ORIGIN + 2])
-    return float(np.average(toa[:, VALUE] - distance, weights=1.0 / toa[:, VARIANCE]))
