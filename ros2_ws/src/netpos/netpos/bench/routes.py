@@ -11,7 +11,7 @@ from concurrent.futures import ProcessPoolExecutor
 from netpos.bench.common import Result, growth_exponent, within
 
 _WORKERS = 2
-_LIMIT_S, _LIMIT_BYTES = 30.0, float(1 << 30)  # for the most routes
+_LIMIT_S, _LIMIT_BYTES = 20.0, float(1 << 30)  # for the most routes
 _EXPONENT = 1.1
 
 

@@ -93,7 +93,7 @@ def test_route_rows_scale_the_limit_and_fit_the_growth(monkeypatch: pytest.Monke
     monkeypatch.setattr(routes, "ProcessPoolExecutor", Here)
     duration, memory_row, exponent = routes.route_rows(quick=True)
     ratios = [row.ratio for row in (duration, memory_row, exponent) if isinstance(row, Row)]
-    assert ratios == pytest.approx([4.0 / (30.0 * 0.064), 0.5, 1.0])
+    assert ratios == pytest.approx([4.0 / (20.0 * 0.064), 0.5, 1.0])
 
 
 def peaks_with_and_without_memory(size: int) -> tuple[float, float]:

@@ -40,10 +40,13 @@ def _information(rows: Array, predicted: PredictedRows, n: int) -> Array:
     S = prior_cov_of(predicted, np.arange(m), n)
     for i in range(m):
         S[i, i] += rows[i, GATE_VARIANCE] + predicted.second_order_var[i]
-    H = predicted.H[:m, X.PX : X.VY + 1].copy()
-    weighed = H.copy()
+    weighed = predicted.H[:m, X.PX : X.VY + 1].copy()
     solve_factored(factor(S), weighed)
-    information: Array = H.T @ weighed
+    information = np.zeros((4, 4))
+    for i in range(m):
+        for a in range(4):
+            for b in range(4):
+                information[a, b] += predicted.H[i, X.PX + a] * weighed[i, b]
     return information
 
 

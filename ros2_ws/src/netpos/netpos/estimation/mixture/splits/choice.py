@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from netpos.estimation.compile import inlined, kernel
+from netpos.estimation.compile import inlined, kernel, leaf
 from netpos.estimation.dispatch import Kernel, choose
 from netpos.estimation.engine import EpochInput, FilterOptions
 from netpos.estimation.mixture.candidates import Candidates
@@ -88,7 +88,7 @@ def any_divides(components: Mixture, rows: Array, options: FilterOptions) -> boo
     return False
 
 
-@kernel
+@leaf
 def any_begins(
     mean: Array, cov: Array, epoch: EpochInput, predicted: PredictedRows, options: FilterOptions
 ) -> bool:

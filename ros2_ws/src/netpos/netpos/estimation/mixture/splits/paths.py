@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netpos.estimation.compile import kernel
+from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.engine import EpochInput, FilterOptions, is_sound
 from netpos.estimation.measurement import BLOCKED, VARIANCE, same_bend_variance
 from netpos.estimation.mixture.candidates import (
@@ -169,7 +169,7 @@ def add(
     return end + 2
 
 
-@kernel
+@leaf
 def begins(
     start: int,
     stop: int,

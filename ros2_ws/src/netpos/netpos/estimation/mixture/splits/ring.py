@@ -37,7 +37,7 @@ _END_SD = 6.0  # where a component ends along a ring: what lies beyond is pruned
 _RING_MIN, _RING_MAX = 12, 128
 
 
-@kernel
+@leaf
 def _own_variance(row: Array, cov: Array, h: Array) -> float:
     """Variance of a row without that of position and velocity: noise, clock and slow errors."""
     total = row[VARIANCE]
@@ -51,11 +51,17 @@ def _own_variance(row: Array, cov: Array, h: Array) -> float:
 def is_wide(row: Array, mean: Array, cov: Array, options: FilterOptions) -> bool:
     """Whether a component is to be split for a row: a range or time of arrival that narrows the
     position, but whose tangent does not hold over the component's width."""
+    h = np.empty(mean.size)
+    innovation_row(row, mean, options.height_m, h)
+    return bool(_bends(row, h, mean, cov, options))
+
+
+@leaf
+def _bends(row: Array, h: Array, mean: Array, cov: Array, options: FilterOptions) -> bool:
+    """``is_wide`` of a row with the Jacobian ``h`` (n,)."""
     width2 = cov[0, 0] + cov[1, 1]
     if not is_range(row) or width2 < _NARROW_M * _NARROW_M:
         return False
-    h = np.empty(mean.size)
-    innovation_row(row, mean, options.height_m, h)
     own = _own_variance(row, cov, h)
     if own > width2:
         return False
@@ -180,19 +186,21 @@ def add(
     return int(end + 1)
 
 
-@kernel
+@leaf
 def begins(
     start: int,
     stop: int,
     epoch: EpochInput,
-    _predicted: PredictedRows,
+    predicted: PredictedRows,
     mean: Array,
     cov: Array,
     options: FilterOptions,
 ) -> bool:
     """Whether the measurement in the rows ``start`` to ``stop`` of ``epoch`` divides the track:
     after a silence, or a turn that opened a direction that ranges hardly measure."""
-    return bool(divides(epoch.rows[start:stop], mean, cov, options))
+    if stop - start > 1:
+        return False
+    return bool(_bends(epoch.rows[start], predicted.H[start], mean, cov, options))
 
 
 SPLIT = Split(divides=divides, add=add, most=2 * _RING_MAX + 1, begins=begins)
