@@ -9,15 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from netpos.estimation.compile import kernel, leaf
-from netpos.estimation.measurement import (
-    GROUP,
-    VALUE,
-    VARIANCE,
-    is_cyclic,
-    predict_row,
-    wrap,
-)
+from netpos.estimation.measurement import VALUE, VARIANCE, is_cyclic, predict_row, wrap
 from netpos.estimation.mixture.candidates import TAIL_LOG
+from netpos.estimation.sensors.row import group_end
 from netpos.estimation.state import X
 from netpos.messages.values import Array
 
@@ -28,7 +22,8 @@ class Window(NamedTuple):
     """Measurements of a short time.
 
     ages_s (m,) : when each was made, <= 0 before the stamp of the state
-    rows (m, ROW_WIDTH) : the slow errors in them are states behind those of the device
+    rows (m, ROW_WIDTH) : groups are numbered through; the slow errors in them are states behind
+        those of the device
     height_m : nominal height of the device
     first, part_s : index of the accelerations [m/s^2] of the device, two, and of its clock, in
         ``parts`` of so many seconds each, the newest first
@@ -75,7 +70,7 @@ def normal_equations(
     residual, H = _linearised(state, window)
     start = 0
     while start < m:
-        stop = _measurement_end(window, start)
+        stop = group_end(rows, start)
         variance = window.scale * rows[start:stop, VARIANCE]
         share = window.outliers[start]
         density_log, sound = _density_log(share, residual[start:stop], variance)
@@ -97,10 +92,10 @@ def normal_equations(
 @kernel
 def outliers_of(state: Array, window: Window) -> tuple[float, float]:
     """How many measurements are outliers at ``state`` (n,), and what they cost."""
-    residual, _ = _linearised(state, window)
+    rows, (residual, _) = window.rows, _linearised(state, window)
     count, cost, start = 0.0, 0.0, 0
     while start < residual.size:
-        stop = _measurement_end(window, start)
+        stop = group_end(rows, start)
         variance = window.scale * window.rows[start:stop, VARIANCE]
         share = window.outliers[start]
         density_log, sound = _density_log(share, residual[start:stop], variance)
@@ -145,19 +140,6 @@ def _linearised(state: Array, window: Window) -> tuple[Array, Array]:
         for place, rate in _MOVES:
             h[rate] += age * h[place]
     return residual, H
-
-
-@leaf
-def _measurement_end(window: Window, start: int) -> int:
-    """The row behind those of the measurement that begins with the row ``start``."""
-    rows, stop = window.rows, start + 1
-    while (
-        stop < rows.shape[0]
-        and rows[stop, GROUP] == rows[start, GROUP]
-        and window.ages_s[stop] == window.ages_s[start]
-    ):
-        stop += 1
-    return stop
 
 
 @leaf

@@ -177,9 +177,7 @@ def is_sound(fit: Fit) -> bool:
 def _most_outliers(window: Window, risk: float) -> int:
     """The number of outliers in a window that is exceeded with the probability ``risk`` at most,
     by the distribution of rare events."""
-    _, first = np.unique(
-        np.column_stack([window.ages_s, window.rows[:, GROUP]]), axis=0, return_index=True
-    )
+    _, first = np.unique(window.rows[:, GROUP], return_index=True)
     expected = float(window.outliers[first].sum())
     count, term = 0, math.exp(-expected)
     beyond = 1.0 - term

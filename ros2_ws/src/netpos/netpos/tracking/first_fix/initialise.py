@@ -23,6 +23,7 @@ from netpos.estimation.measurement import (
     AXES,
     BIAS,
     COMMON,
+    GROUP,
     HEADING,
     HEIGHT,
     KIND,
@@ -234,13 +235,15 @@ class Initialiser:
         return max(0.0, min(cost for cost, _, _ in found_there) - found.best[0])
 
     def _stacked(self, slow: SlowErrors) -> tuple[Array, Array, Array]:
-        """The rows of the window, their ages [s], <= 0, against the newest, and the sd of the slow
-        errors that are states of the fit."""
+        """The rows of the window, their groups numbered through, their ages [s], <= 0, against the
+        newest, and the sd of the slow errors that are states of the fit."""
         newest = self._window[-1][0]
         rows = np.vstack([entry[1] for entry in self._window])
         ages = np.concatenate(
             [np.full(len(entry[1]), (entry[0] - newest) * 1e-9) for entry in self._window]
         )
+        measurements = np.column_stack([ages, rows[:, GROUP]])
+        rows[:, GROUP] = np.unique(measurements, axis=0, return_inverse=True)[1].reshape(-1)
         return rows, ages, _name_states_of_fit(rows, ages, slow)
 
     def _heard(self, rows: Array) -> str:
