@@ -51,7 +51,7 @@ def mixed_rows() -> tuple[list[Rsu], Array, Array]:
 def problem_of(rows: Array, prior: Array, prior_var: Array) -> Problem:
     """Rows of one instant, that tell nothing of accelerations."""
     none = np.zeros(len(rows))
-    window = Window(none, rows, 0.0, len(prior), 1.0, 1, none, 1.0)
+    window = Window(none, rows, 0.0, len(prior), 1.0, 1, none)
     return Problem(window, np.append(prior, np.zeros(3)), np.append(prior_var, np.ones(3)))
 
 
@@ -110,7 +110,7 @@ def test_cost_gradient_and_curvature_of_the_fit(shares: bool) -> None:
         ):
             rows[of_it, column] = 6 + error
             signs[of_it, error] = -1.0 if column == REFERENCE else 1.0
-    window = Window(ages, rows, 0.7, 6 + errors_var.size, 0.8, 2, np.zeros(len(rows)), 1.0)
+    window = Window(ages, rows, 0.7, 6 + errors_var.size, 0.8, 2, np.zeros(len(rows)))
     behind = np.append(errors_var, [4.0, 1.0, 9.0, 2.0, 3.0, 5.0])
     problem = Problem(window, np.append(prior, 0.0 * behind), np.append(prior_var, behind))
     rng = np.random.default_rng(2)
@@ -135,7 +135,7 @@ def test_an_outlier_costs_hardly_more_the_farther_off_it_is() -> None:
     costs 2 ln 10 more for each of its values."""
     _, rows, ages = mixed_rows()
     shares = np.where(rows[:, GROUP] == 1, 0.0, 0.02)
-    window = Window(ages, rows, 0.7, 6, 0.8, 2, shares, 1.0)
+    window = Window(ages, rows, 0.7, 6, 0.8, 2, shares)
     prior = np.append([1.0, 2.0, 0.5, -0.5, 300.0, 20.0], np.zeros(6))
     prior_var = np.array([900.0, 900.0, 25.0, 25.0, 1e4, 400.0, 4.0, 1.0, 9.0, 2.0, 3.0, 5.0])
     problem, rng = Problem(window, prior, prior_var), np.random.default_rng(3)
@@ -152,7 +152,7 @@ def test_an_outlier_costs_hardly_more_the_farther_off_it_is() -> None:
     costs = []
     for sds in (100.0, 1000.0):
         alone[0, VALUE] = 13.0 + 0.3 * sds
-        window = Window(np.zeros(1), alone, 0.0, 6, 1.0, 1, np.full(1, 0.02), 1.0)
+        window = Window(np.zeros(1), alone, 0.0, 6, 1.0, 1, np.full(1, 0.02))
         there = Problem(window, still(12.0, 5.0), np.ones(9))
         costs.append(normal_equations(there.prior, *there)[0])
     assert costs[1] - costs[0] == pytest.approx(2.0 * math.log(10.0))
@@ -170,7 +170,7 @@ def test_the_solver_finds_what_most_say_from_anywhere() -> None:
     prior_var = np.array([150.0**2, 150.0**2, 1e-4, 1e-4, 1e4, 1e4, 1e-6, 1e-6, 1e-6])
     prior = np.append([20.0, 20.0], np.zeros(7))
     shares = np.full(len(rows), 0.01)
-    problem = Problem(Window(ages, rows, 0.0, 6, 1.0, 1, shares, 1.0), prior, prior_var)
+    problem = Problem(Window(ages, rows, 0.0, 6, 1.0, 1, shares), prior, prior_var)
     expected = minimize(
         lambda place: cost_of(still(*place), problem), [25.0, 18.0], method="Nelder-Mead"
     ).x

@@ -28,7 +28,6 @@ class Window(NamedTuple):
     first, part_s : index of the accelerations [m/s^2] of the device, two, and of its clock, in
         ``parts`` of so many seconds each, the newest first
     outliers (m,) : probability that a row belongs to a measurement that is one
-    scale : of the variances of the rows
     """
 
     ages_s: Array
@@ -38,7 +37,6 @@ class Window(NamedTuple):
     part_s: float
     parts: int
     outliers: Array
-    scale: float
 
 
 @leaf
@@ -71,7 +69,7 @@ def normal_equations(
     start = 0
     while start < m:
         stop = group_end(rows, start)
-        variance = window.scale * rows[start:stop, VARIANCE]
+        variance = rows[start:stop, VARIANCE]
         share = window.outliers[start]
         density_log, sound = _density_log(share, residual[start:stop], variance)
         cost -= 2.0 * density_log
@@ -96,7 +94,7 @@ def outliers_of(state: Array, window: Window) -> tuple[float, float]:
     count, cost, start = 0.0, 0.0, 0
     while start < residual.size:
         stop = group_end(rows, start)
-        variance = window.scale * window.rows[start:stop, VARIANCE]
+        variance = rows[start:stop, VARIANCE]
         share = window.outliers[start]
         density_log, sound = _density_log(share, residual[start:stop], variance)
         count += 1.0 - sound

@@ -50,16 +50,23 @@ class Problem(NamedTuple):
         window = self.window._replace(outliers=np.zeros_like(self.window.outliers))
         return self._replace(window=window)
 
-    def paths(self, state: Array) -> list[list[Problem]]:
-        """The ways from ``state`` (n,) to minima of this problem, each a row of problems of which
-        one starts where the other ends: without outliers first; and with variances as large as the
-        residuals at ``state``, then with smaller ones (graduated non-convexity: Blake and
-        Zisserman 1987). Either may lead beside an RSU, where any direction fits."""
+    def scaled(self, factor: float) -> Problem:
+        """With variances of the measurements that are ``factor`` times as large."""
+        rows = self.window.rows.copy()
+        rows[:, VARIANCE] *= factor
+        return self._replace(window=self.window._replace(rows=rows))
+
+    def sequences(self, state: Array) -> list[list[Problem]]:
+        """Two sequences of problems that end with this one; each starts where the one before it
+        ended, the first at ``state`` (n,). One begins without outliers. The other begins with
+        variances as large as the residuals at ``state``, and goes on with smaller ones (graduated
+        non-convexity: Blake and Zisserman 1987). Either may lead to an RSU beside which any
+        direction fits. Without outliers the problem is its only sequence."""
         if not self.window.outliers.any():
             return [[self]]
         scale, graduated = typical_scale(state, self.window), []
         while scale > _GRADUATION:
-            graduated.append(self._replace(window=self.window._replace(scale=scale)))
+            graduated.append(self.scaled(scale))
             scale /= _GRADUATION
         return [[self.without_outliers(), self], [*graduated, self]]
 
@@ -127,13 +134,10 @@ class Solution(NamedTuple):
             if more.max() < _FITS:
                 break
             factors *= more
-            rows, prior_var = self.problem.window.rows.copy(), self.problem.prior_var.copy()
-            rows[:, VARIANCE] *= factors[0]
+            prior_var = self.problem.prior_var.copy()
             prior_var[:N_CORE] *= factors[1:]
             prior_var[lasting:] *= factors[0]
-            window = self.problem.window._replace(rows=rows)
-            problem = self.problem._replace(window=window, prior_var=prior_var)
-            found = solution_of(problem)
+            found = solution_of(self.problem.scaled(factors[0])._replace(prior_var=prior_var))
             if found is None:
                 break
             solution = found._replace(log_odds=self.log_odds)
@@ -157,11 +161,11 @@ def minimum(state: Array, problem: Problem) -> Fit:
 def minima(
     start: Array, problem: Problem, minimum_of: Callable[[Array, Problem], Fit] = minimum
 ) -> list[Fit]:
-    """What ``minimum_of`` finds from ``start`` (n,) along each of the ``problem.paths``."""
+    """What ``minimum_of`` finds from ``start`` (n,) at the ends of the ``problem.sequences``."""
     found = []
-    for path in problem.paths(start):
+    for sequence in problem.sequences(start):
         state = start
-        for step in path:
+        for step in sequence:
             fit = minimum_of(state, step)
             state = fit[1]
         found.append(fit)

@@ -307,7 +307,7 @@ class Initialiser:
         prior = np.append(prior, np.zeros(errors_sd.size))
         first = prior.size - len(turns_sd)
         height_m, outliers = cfg.device_height_m, _outlier_shares(rows)
-        window = Window(ages, rows, height_m, first, span_s / parts, parts, outliers, 1.0)
+        window = Window(ages, rows, height_m, first, span_s / parts, parts, outliers)
         return Problem(window, prior, prior_var)
 
     def _solution(self, problem: Problem) -> Solution | None:
