@@ -18,6 +18,7 @@ from netpos.estimation.mixture.ridge import (
     components_of,
     inverse,
     log_weight_of,
+    on_line,
 )
 from netpos.estimation.mixture.window import (
     Window,
@@ -152,21 +153,22 @@ class Solution(NamedTuple):
         return np.maximum([of_rows, *np.repeat(pairs, 2)], 1.0)
 
 
-def minimum(state: Array, problem: Problem) -> Fit:
-    """Levenberg-Marquardt from one start: cost, state, covariance of the fit."""
-    cost, state, A = minimise(problem.equations, state, cholesky_solve)
+def minimum(start: Array, problem: Problem, along: Array | None = None) -> Fit:
+    """Levenberg-Marquardt from ``start`` (n,): cost, state, covariance of the fit. With ``along``
+    (2,) the position in that direction stays as it is."""
+    if along is not None:
+        return on_line(problem.equations, start, along)
+    cost, state, A = minimise(problem.equations, start, cholesky_solve)
     return cost, state, inverse(A)
 
 
-def minima(
-    start: Array, problem: Problem, minimum_of: Callable[[Array, Problem], Fit] = minimum
-) -> list[Fit]:
-    """What ``minimum_of`` finds from ``start`` (n,) at the ends of the ``problem.sequences``."""
+def minima(start: Array, problem: Problem, along: Array | None = None) -> list[Fit]:
+    """Each ``minimum`` to which one of the ``problem.sequences`` leads from ``start`` (n,)."""
     found = []
     for sequence in problem.sequences(start):
         state = start
         for step in sequence:
-            fit = minimum_of(state, step)
+            fit = minimum(state, step, along)
             state = fit[1]
         found.append(fit)
     return found

@@ -35,7 +35,7 @@ from netpos.estimation.measurement import (
 from netpos.estimation.mixture.candidates import OUTLIERS
 from netpos.estimation.mixture.gaussians import Mixture, mode_of, moments
 from netpos.estimation.mixture.reduction import PART_MERGE_COST, reduced
-from netpos.estimation.mixture.ridge import Fit, log_weight_of, on_line
+from netpos.estimation.mixture.ridge import Fit, log_weight_of
 from netpos.estimation.mixture.window import Window
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.estimation.sensors.table import BY_KIND
@@ -231,8 +231,8 @@ class Initialiser:
         start = mean = np.append(mean, problem.prior[len(mean) :])
         start = start.copy()
         start[4] = clock_at(start, rows, self._config.device_height_m)
-        found_there = minima(start, problem._replace(prior=mean, prior_var=var))
-        return max(0.0, min(cost for cost, _, _ in found_there) - found.best[0])
+        there = minima(start, problem._replace(prior=mean, prior_var=var))
+        return max(0.0, min(cost for cost, _, _ in there) - found.best[0])
 
     def _stacked(self, slow: SlowErrors) -> tuple[Array, Array, Array]:
         """The rows of the window, their groups numbered through, their ages [s], <= 0, against the
@@ -345,9 +345,7 @@ class Initialiser:
         far = float(np.hypot(*away))
         if far < _NEAREST_M:
             return []
-        return minima(
-            start, problem, lambda state, step: on_line(step.equations, state, away / far)
-        )
+        return minima(start, problem, along=away / far)
 
     def _plausible(self, state: Array) -> bool:
         """Not behind an array without a back, and not on top of an RSU."""
@@ -373,7 +371,8 @@ class Initialiser:
 
 def _outlier_shares(rows: Array) -> Array:
     """The probability of each of ``rows`` (m, ROW_WIDTH) that it is an outlier (m,): 0 where its
-    RSU has measured the quantity less than three times, which nobody can tell from a wrong RSU."""
+    RSU has measured the quantity fewer than three times. Nobody can tell an outlier from a wrong
+    RSU then."""
     sources = np.column_stack([rows[:, KIND], rows[:, ORIGIN:AXES]])
     _, which, counts = np.unique(sources, axis=0, return_inverse=True, return_counts=True)
     shares = np.where(rows[:, OUTLIER_SHARE] > 0.0, rows[:, OUTLIER_SHARE], OUTLIERS)
