@@ -24,7 +24,7 @@ from netpos.estimation.mixture.gaussians import (
 )
 from netpos.estimation.mixture.reduction import PART_MERGE_COST, reduced
 from netpos.estimation.mixture.splits import paths
-from netpos.estimation.mixture.splits.ring import cut_along_ring, is_wide
+from netpos.estimation.mixture.splits.ring import cut_along_ring, divides
 from netpos.estimation.motion import NO_BIAS
 from netpos.estimation.rows import linear_rows
 from netpos.estimation.update.predicted import predicted_rows
@@ -310,8 +310,10 @@ def test_a_component_is_wide_where_the_tangent_costs_a_share_of_the_noise(
 ) -> None:
     options = options_of(TrackerConfig(filter="ekf", nlos_probability=blocked))
     x, P = prior((distance, 0.0), (0.1, sd))
-    assert is_wide(row(Kind.RANGE, distance, 0.04), x, P, options) is wide
-    assert not is_wide(row(Kind.AZIMUTH, 0.0, 0.04), x, P, options)
+    alone = row(Kind.RANGE, distance, 0.04)[None]
+    assert divides(alone, x, P, options) is wide
+    assert not divides(row(Kind.AZIMUTH, 0.0, 0.04)[None], x, P, options)
+    assert not divides(np.vstack([alone, alone]), x, P, options)
 
 
 def test_modes_are_chains_of_components_without_a_valley() -> None:

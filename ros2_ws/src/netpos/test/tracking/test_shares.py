@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from netpos.estimation.measurement import BLOCKED, KIND, OUTLIER_SHARE, Kind
-from netpos.estimation.mixture.candidates import OUTLIERS
+from netpos.estimation.mixture.outliers import OUTLIERS
 from netpos.estimation.rows import rsu_axes, rsu_rows
 from netpos.messages.values import Field, RsuInfo, RsuMeasurement
 from netpos.tracking import TrackerConfig

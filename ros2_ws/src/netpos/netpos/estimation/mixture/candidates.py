@@ -16,20 +16,15 @@ from netpos.estimation.engine import (
     is_sound,
     update_with_gate,
 )
-from netpos.estimation.measurement import GATE_VARIANCE, GROUP, OUTLIER_SHARE
+from netpos.estimation.measurement import GROUP
 from netpos.estimation.mixture.gaussians import Mixture
+from netpos.estimation.mixture.outliers import outlier_log
 from netpos.estimation.sensors.row import group_end
 from netpos.estimation.update import fusion
 from netpos.estimation.update.fit import neg2_log_likelihood
 from netpos.estimation.update.gate import accepted_rows
 from netpos.estimation.update.predicted import PredictedRows, predict_rows
 from netpos.messages.values import Array
-
-OUTLIERS = 1e-2
-"""Share of all values that are wrong by nobody knows how much."""
-_FARTHEST_OUTLIER = 1e3  # standard deviations
-TAIL_LOG = -math.log(2.0 * (1.0 + math.log(_FARTHEST_OUTLIER)))
-"""Log density of such an error, times its size: each octave is as likely."""
 
 
 class Update(NamedTuple):
@@ -95,20 +90,6 @@ def first_of(found: Candidates, end: int) -> Candidates:
 def mixture_of(found: Candidates) -> Mixture:
     """The candidates as components."""
     return Mixture(found.means, found.covs, found.log_weights)
-
-
-@kernel
-def outlier_log(rows: Array, predicted: PredictedRows, start: int, stop: int) -> float:
-    """Log density of the rows ``start`` to ``stop`` of one measurement that is wrong by nobody
-    knows how much: beyond the standard deviation of what is ``predicted`` each octave is as
-    likely."""
-    share = rows[start, OUTLIER_SHARE]
-    total = math.log(share if share > 0.0 else OUTLIERS)
-    for i in range(start, stop):
-        known = predicted.prior_var[i] + predicted.second_order_var[i]
-        off = max(abs(predicted.innovation[i]), math.sqrt(rows[i, GATE_VARIANCE] + known))
-        total += TAIL_LOG - math.log(off)
-    return total
 
 
 @kernel

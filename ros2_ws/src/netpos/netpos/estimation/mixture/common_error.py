@@ -11,8 +11,9 @@ import numpy as np
 from netpos.estimation.compile import inlined, kernel
 from netpos.estimation.engine import FilterOptions
 from netpos.estimation.measurement import COMMON, GROUP, VARIANCE
-from netpos.estimation.mixture.candidates import OUTLIERS, TAIL_LOG, Candidates, apply
+from netpos.estimation.mixture.candidates import Candidates, apply
 from netpos.estimation.mixture.gaussians import Mixture
+from netpos.estimation.mixture.outliers import OUTLIERS, TAIL_LOG
 from netpos.estimation.state import X
 from netpos.estimation.update.fusion import workspace
 from netpos.estimation.update.predicted import PredictedRows, predicted_rows

@@ -10,7 +10,7 @@ import numpy as np
 
 from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.measurement import VALUE, VARIANCE, is_cyclic, predict_row, wrap
-from netpos.estimation.mixture.candidates import TAIL_LOG
+from netpos.estimation.mixture.outliers import tail_log
 from netpos.estimation.sensors.row import group_end
 from netpos.estimation.state import X
 from netpos.messages.values import Array
@@ -147,9 +147,9 @@ def _density_log(share: float, residual: Array, variance: Array) -> tuple[float,
     it are."""
     sound, outlier = 0.0, 0.0
     for i in range(residual.size):
-        square = residual[i] ** 2 / variance[i]
-        sound -= 0.5 * square
-        outlier += TAIL_LOG + 0.5 * math.log(2.0 * math.pi / max(square, 1.0))
+        sound -= 0.5 * residual[i] ** 2 / variance[i]
+        outlier += tail_log(residual[i], math.sqrt(variance[i]))
+        outlier += 0.5 * math.log(2.0 * math.pi * variance[i])
     if share <= 0.0:
         return sound, 1.0
     outlier += math.log(share)

@@ -28,12 +28,11 @@ from netpos.estimation.measurement import (
     HEIGHT,
     KIND,
     ORIGIN,
-    OUTLIER_SHARE,
     REFERENCE,
     Kind,
 )
-from netpos.estimation.mixture.candidates import OUTLIERS
 from netpos.estimation.mixture.gaussians import Mixture, mode_of, moments
+from netpos.estimation.mixture.outliers import share_of_outliers
 from netpos.estimation.mixture.reduction import PART_MERGE_COST, reduced
 from netpos.estimation.mixture.ridge import Fit, log_weight_of
 from netpos.estimation.mixture.window import Window
@@ -375,7 +374,7 @@ def _outlier_shares(rows: Array) -> Array:
     RSU then."""
     sources = np.column_stack([rows[:, KIND], rows[:, ORIGIN:AXES]])
     _, which, counts = np.unique(sources, axis=0, return_inverse=True, return_counts=True)
-    shares = np.where(rows[:, OUTLIER_SHARE] > 0.0, rows[:, OUTLIER_SHARE], OUTLIERS)
+    shares = np.array([share_of_outliers(row) for row in rows])
     return np.where(counts[which.reshape(-1)] < _TELLING, 0.0, shares)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 from netpos.estimation.measurement import BLOCKED, GROUP, KIND, OUTLIER_SHARE
-from netpos.estimation.mixture.candidates import OUTLIERS
+from netpos.estimation.mixture.outliers import OUTLIERS
 from netpos.estimation.sensors.table import SENSORS
 from netpos.estimation.update.robust import update_prior
 from netpos.messages.values import RsuMeasurement

@@ -20,8 +20,9 @@ from netpos.estimation.measurement import (
     is_range,
     offset_up,
 )
-from netpos.estimation.mixture.candidates import Candidates, outlier_log
+from netpos.estimation.mixture.candidates import Candidates
 from netpos.estimation.mixture.gaussians import CURVATURE_SHARE, SPACING_SD, Mixture, fuse_value
+from netpos.estimation.mixture.outliers import outlier_log
 from netpos.estimation.mixture.reduction import PART_MERGE_COST
 from netpos.estimation.mixture.splits.paths import fuse_by, paths_in, paths_of
 from netpos.estimation.mixture.splits.split import Split
@@ -47,20 +48,13 @@ def _own_variance(row: Array, cov: Array, h: Array) -> float:
     return float(total)
 
 
-@kernel
-def is_wide(row: Array, mean: Array, cov: Array, options: FilterOptions) -> bool:
-    """Whether a component is to be split for a row: a range or time of arrival that narrows the
-    position, but whose tangent does not hold over the component's width."""
-    h = np.empty(mean.size)
-    innovation_row(row, mean, options.height_m, h)
-    return bool(_bends(row, h, mean, cov, options))
-
-
 @leaf
-def _bends(row: Array, h: Array, mean: Array, cov: Array, options: FilterOptions) -> bool:
-    """``is_wide`` of a row with the Jacobian ``h`` (n,)."""
+def is_wide(row: Array, h: Array, mean: Array, cov: Array, options: FilterOptions) -> bool:
+    """Whether a component is to be split for the row of a range or time of arrival, with the
+    Jacobian ``h`` (n,): it narrows the position, but its tangent does not hold over the
+    component's width."""
     width2 = cov[0, 0] + cov[1, 1]
-    if not is_range(row) or width2 < _NARROW_M * _NARROW_M:
+    if width2 < _NARROW_M * _NARROW_M:
         return False
     own = _own_variance(row, cov, h)
     if own > width2:
@@ -71,11 +65,21 @@ def _bends(row: Array, h: Array, mean: Array, cov: Array, options: FilterOptions
     return bool(_REACH_SD * _REACH_SD * width2 > dx * dx + dy * dy)
 
 
+@leaf
+def _is_range_alone(rows: Array) -> bool:
+    """Whether the ``rows`` of one measurement are a range or a time alone: an angle measured with
+    it tells where on the ring the device is."""
+    return rows.shape[0] == 1 and bool(is_range(rows[0]))
+
+
 @kernel
 def divides(rows: Array, mean: Array, cov: Array, options: FilterOptions) -> bool:
-    """Whether the ``rows`` of one measurement are a range alone that ``is_wide``. An angle
-    measured with it tells where on the ring the device is."""
-    return bool(rows.shape[0] == 1 and is_wide(rows[0], mean, cov, options))
+    """Whether the ``rows`` of one measurement are a range alone that ``is_wide``."""
+    if not _is_range_alone(rows):
+        return False
+    h = np.empty(mean.size)
+    innovation_row(rows[0], mean, options.height_m, h)
+    return bool(is_wide(rows[0], h, mean, cov, options))
 
 
 @leaf
@@ -198,9 +202,10 @@ def begins(
 ) -> bool:
     """Whether the measurement in the rows ``start`` to ``stop`` of ``epoch`` divides the track:
     after a silence, or a turn that opened a direction that ranges hardly measure."""
-    if stop - start > 1:
+    rows = epoch.rows[start:stop]
+    if not _is_range_alone(rows):
         return False
-    return bool(_bends(epoch.rows[start], predicted.H[start], mean, cov, options))
+    return bool(is_wide(rows[0], predicted.H[start], mean, cov, options))
 
 
 SPLIT = Split(divides=divides, add=add, most=2 * _RING_MAX + 1, begins=begins)
