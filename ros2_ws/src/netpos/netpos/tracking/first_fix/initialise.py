@@ -88,13 +88,16 @@ class Initialiser:
 
     def __init__(self, config: TrackerConfig) -> None:
         self._config = config
-        self._risk = 1.0 - config.gate_probability
         self._window: deque[tuple[int, Array, tuple[Rsu, ...]]] = deque()
         self._own = slow_states(config).slow_errors
         self._next_attempt_ns = 0
         self._since_ns = 0
         self.missing = ""
         """What a first fix lacks, for people; empty before the first attempt."""
+
+    @property
+    def _risk(self) -> float:
+        return 1.0 - self._config.gate_probability
 
     def copy(self) -> Initialiser:
         """An independent copy."""
@@ -123,10 +126,11 @@ class Initialiser:
         components, and places that cannot be told apart are modes. None while the position is
         open, or for most of the window while there are several modes.
 
-        Of three or more RSUs one may err grossly: what the others say is a part of the posterior.
-        Where the measurements contradict each other and leaving out one RSU makes them agree, the
-        fix is that of the others. Otherwise another clock offset may make them agree: the declared
-        one is that of a device just switched on. Where nothing does, they are less certain than
+        Of three values of an RSU one may be an outlier. Of three or more RSUs one may err
+        grossly: what the others say is a part of the posterior. Where the measurements
+        contradict each other and leaving out one RSU makes them agree, the fix is that of
+        the others. Otherwise another clock offset may make them agree: the declared one is
+        that of a device just switched on. Where nothing does, they are less certain than
         stated.
         """
         newest = self._window[-1][0]
