@@ -14,7 +14,7 @@ from netpos.messages.values import RsuMeasurement as Measurement
 from netpos.scenario.settings import change_fact, tracker_fact
 from netpos.tracking import Tracker, TrackOutput
 from netpos.tracking.door.validation import explanation
-from netpos.tracking.warm_up import warm_up, warm_up_anchors, warm_up_components
+from netpos.tracking.warm_up import warm_up, warm_up_anchors
 from netpos.world.geodesy import Datum
 from netpos_msgs.msg import NetworkTrack, RsuErrors, RsuInfo, RsuMeasurement
 from netpos_node import (
@@ -59,8 +59,6 @@ class EkfTrackerNode(EstimatingNode):
         config = parameters.config
         if config.network:
             warm_up(config.network)
-        if config.manoeuvre_sd_mps > 0.0:
-            warm_up_components()
         tracker = Tracker(config, parameters.rsu_list)
         self._network = config.network
         self._told_refusal_s = -_TELL_S

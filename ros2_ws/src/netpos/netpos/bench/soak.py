@@ -20,7 +20,7 @@ from netpos.bench.memory import resident_bytes
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
 from netpos.messages.values import Array, Field, InitialPose, RsuInfo, RsuMeasurement
 from netpos.tracking import Tracker
-from netpos.tracking.warm_up import warm_up, warm_up_components
+from netpos.tracking.warm_up import warm_up
 
 _NS = 1_000_000_000
 _PLACES = {"west": (0.0, 0.0), "east": (120.0, 40.0)}
@@ -147,8 +147,7 @@ def _growth(what: str, samples: Sequence[Sample], name: str) -> Row:
 def day(hours: float) -> Iterator[Sample]:
     """The series of the core, a sample each 10 simulated minutes: memory, median and 99 % of an
     epoch's time [s], what is missing or not finite, largest error."""
-    warm_up("")
-    warm_up_components()  # as the node: loaded by the first refusal, they are no growth
+    warm_up("")  # as the node: what the first refusal would load is no growth
     tracker, rng = Tracker(), np.random.default_rng(_SEED)
     for name, (x, y) in _PLACES.items():
         tracker.add_rsu(RsuInfo(rsu_id=name, position=np.array([x, y, 0.0])))

@@ -18,6 +18,10 @@ from numba.core import cgutils, event
 from numba.extending import intrinsic
 from numba.np import arrayobj
 
+from netpos.kernel_memory import keep_bitcode_packed
+
+keep_bitcode_packed()  # before the first kernel is loaded
+
 # Said of each that it is not inlined: what is compiled for an inlined caller would be, otherwise,
 # with all that it calls.
 kernel: Callable[..., Any] = njit(cache=True, error_model="numpy", _nrt=True, forceinline=False)

@@ -23,23 +23,20 @@ def warm_up(network: str | None = None) -> None:
     """Run tiny tracks through the kernels: first fix, prediction, gate, update.
 
     network : of the tracker, "" where it takes all; None: every kernel, as at set-up. Those for
-        anchors follow with the first anchor (``warm_up_anchors``), those for devices that turn
-        where they are told to (``warm_up_components``, 50 MB): a kernel that is only loaded costs
-        a tracker memory and time, too.
+        anchors follow with the first anchor (``warm_up_anchors``): a kernel that is only loaded
+        costs a tracker memory and time, too.
     """
     _angles_and_ranges()
+    _components()
     if network is None:
         warm_up_anchors()
-        warm_up_components()
         Tracker(TrackerConfig(motion_model="strapdown", robust="huber"))
     if network != "":
         _fixes_of_a_network()
 
 
-@cache
-def warm_up_components() -> None:
-    """Two epochs of a mixture, the first of which begins it by a refused fix; once in a
-    process."""
+def _components() -> None:
+    """Two epochs of a mixture, the first of which begins it by a refused fix."""
     config = TrackerConfig()
     estimate = Estimate(config, 0, np.zeros(6), np.eye(6))
     for k in (1, 2):

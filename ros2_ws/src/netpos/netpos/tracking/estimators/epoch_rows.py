@@ -142,7 +142,7 @@ def epoch_rows_of(
             block = form.speed(item.speed_mps, item.speed_var, group)
         end += len(block)
         rows[first:end] = block
-    return EpochRows(rows[:end], tuple(items))
+    return EpochRows(rows[:end].copy(), tuple(items))  # the rest would be kept, too
 
 
 def velocity_inflation(
