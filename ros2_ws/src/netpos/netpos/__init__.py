@@ -18,7 +18,7 @@ The values of the other messages, such as ``ImuSample`` and ``Odometry``, are in
 Rooms
 -----
 ``messages``      values of the ROS interfaces and their conversion
-``common``        parameters, least squares
+``common``        parameters, least squares, files, memory of the compiler
 ``world``         maps, routes, motion, frames
 ``radio``         measurement models, arrays, Cramer-Rao bounds, line of sight, clocks, noise
 ``inertial``      IMU models, attitude, steps, pedestrian dead reckoning

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from nav_msgs.msg import Odometry
 from netpos.bags import cdr_codec
-from netpos.kernel_memory import give_back_compiler
+from netpos.common.kernel_memory import give_back_compiler
 from netpos.messages import topics
 from netpos.messages.fields import Frames
 from netpos.messages.values import Odometry as Estimated

@@ -18,7 +18,7 @@ from numba.core import cgutils, event
 from numba.extending import intrinsic
 from numba.np import arrayobj
 
-from netpos.kernel_memory import keep_bitcode_packed
+from netpos.common.kernel_memory import keep_bitcode_packed
 
 keep_bitcode_packed()  # before the first kernel is loaded
 

@@ -10,7 +10,7 @@ from pathlib import Path
 _PROGRAM = """
 import numpy as np
 from numba import njit
-from netpos.kernel_memory import give_back_compiler
+from netpos.common.kernel_memory import give_back_compiler
 
 def resident_kb():
     for line in open("/proc/self/status"):
@@ -43,7 +43,7 @@ def doubled(x):
 """
 
 _LOADED = """
-import netpos.kernel_memory as memory
+import netpos.common.kernel_memory as memory
 {before}
 from netpos.tracking.warm_up import warm_up
 
@@ -74,7 +74,7 @@ def test_the_compiler_is_handed_back_and_comes_back() -> None:
 
 
 def test_without_a_compiler_there_is_nothing_to_hand_back() -> None:
-    program = "from netpos.kernel_memory import give_back_compiler as g; print(g())"
+    program = "from netpos.common.kernel_memory import give_back_compiler as g; print(g())"
     assert int(_run(program)) == 0
 
 

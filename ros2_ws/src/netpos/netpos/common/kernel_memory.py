@@ -17,10 +17,10 @@ def keep_bitcode_packed() -> None:
     From its bitcode a kernel becomes part of others. The compiler keeps what it has read, nearly
     ten times as large, for as long as the kernel is loaded.
     """
-    from llvmlite.binding import parse_bitcode  # noqa: PLC0415 - the compiler, where it is used
-    from numba.core.codegen import CPUCodeLibrary  # noqa: PLC0415
+    from numba.core import codegen as compiler  # noqa: PLC0415 - loaded where it is used
 
-    load, module_for_linking = CPUCodeLibrary._unserialize, CPUCodeLibrary._get_module_for_linking
+    libraries = compiler.CPUCodeLibrary
+    load, module_for_linking = libraries._unserialize, libraries._get_module_for_linking
 
     def load_packed(_library_class: type, codegen: Any, state: tuple[str, str, Any]) -> Any:
         library, (_, kind, data) = load(codegen, state), state
@@ -31,11 +31,11 @@ def keep_bitcode_packed() -> None:
     def module_read_again(library: Any) -> Any:
         bitcode = vars(library).pop("packed_bitcode", None)
         if bitcode is not None:
-            library._shared_module = parse_bitcode(bitcode)
+            library._shared_module = compiler.ll.parse_bitcode(bitcode)
         return module_for_linking(library)
 
-    CPUCodeLibrary._unserialize = classmethod(load_packed)
-    CPUCodeLibrary._get_module_for_linking = module_read_again
+    libraries._unserialize = classmethod(load_packed)
+    libraries._get_module_for_linking = module_read_again
 
 
 def give_back_compiler() -> int:
