@@ -15,6 +15,7 @@ from netpos.messages.values import Array
 SCALES2 = 2.0 ** np.arange(8)
 """Ratios of true to stated variances: beyond the last a gate of 0.9999 refuses three rows in
 four."""
+_LOG_SCALES2 = np.log(SCALES2)
 _BEGIN = 1e-3
 _END = 1.0 / 50.0
 _STEPS = 60
@@ -90,7 +91,7 @@ def _add(weights: Array, nis: float, dof: float, censored: Array) -> None:
     for j in range(weights.size):
         if j > 0:
             weights[j] = (1.0 - _END) * weights[j] + _BEGIN * true / (weights.size - 1)
-        log_likelihood = censored[j] - 0.5 * (dof * math.log(SCALES2[j]) + nis / SCALES2[j])
+        log_likelihood = censored[j] - 0.5 * (dof * _LOG_SCALES2[j] + nis / SCALES2[j])
         weights[j] = math.log(weights[j]) + log_likelihood
         best = max(best, weights[j])
     total = 0.0
@@ -118,7 +119,7 @@ def _factor(weights: Array, risk: float) -> float:
         step = (math.log(outside) - log_risk) * outside / slope
         if step > 0.0:
             factor2 += step
-        if step <= 1e-12 * factor2:
+        if step <= 1e-6 * factor2:  # the next one would be its square
             break
     return math.sqrt(factor2)
 

@@ -62,7 +62,7 @@ def gaussian_radius(xx: float, xy: float, yy: float, risk: float) -> float:
         excess = math.log(total) - 0.5 * u - log_risk
         step = excess * total / slope
         u = max(u - step, 0.0)
-        if abs(step) <= 1e-6 * u:  # the next one would be its square
+        if abs(step) <= 1e-4 * u:  # the next one would be its square
             break
     return math.sqrt(u * large)
 

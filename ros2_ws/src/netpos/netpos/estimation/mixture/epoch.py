@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netpos.estimation.compile import kernel
+from netpos.estimation.compile import kernel, leaf
 from netpos.estimation.densities import PARAMETERS, learn, unknown_densities, write_densities
 from netpos.estimation.densities import move as move_densities
 from netpos.estimation.engine import (
@@ -71,7 +71,7 @@ from netpos.estimation.mixture.turns import (
     unnoticed_s,
 )
 from netpos.estimation.motion import add_velocity_step
-from netpos.estimation.sensors.row import group_count
+from netpos.estimation.sensors.row import ROW_WIDTH, group_count
 from netpos.estimation.update.conditioning import Robust, by_fit, by_path
 from netpos.estimation.update.fusion import predicted_in, workspace
 from netpos.estimation.update.gate import fail_together
@@ -279,53 +279,76 @@ class Outcome(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """Memory of ``advance`` for up to m rows: of one component, of ``manoeuvre_level``, and
-    innovations (m, 2) with their sd, as the whole estimate predicted them."""
+    """Memory of ``advance`` for up to m rows: of one component, of ``manoeuvre_level``,
+    innovations (m, 2) with their sd, as the whole estimate predicted them, and rows (m,
+    ROW_WIDTH) as they were."""
 
     step: Scratch
     level: LevelScratch
     innovations: Array
+    rows: Array
 
 
 @kernel
 def memory_of(n: int, m: int) -> Memory:
     """Memory for ``advance`` with ``n`` states and up to ``m`` rows."""
-    return Memory(scratch(n, m), level_scratch(n, m), np.empty((m, 2)))
+    return Memory(scratch(n, m), level_scratch(n, m), np.empty((m, 2)), np.empty((m, ROW_WIDTH)))
 
 
-@kernel
+@leaf
+def _copy_rows(rows: Array, to: Array) -> None:
+    for i in range(rows.shape[0]):
+        for k in range(ROW_WIDTH):
+            to[i, k] = rows[i, k]
+
+
+@leaf
 def _by_one(
     x: Array,
     S: Array,
     epoch: EpochInput,
     dynamics: Dynamics,
     options: FilterOptions,
-    memory: Scratch,
+    memory: Memory,
 ) -> tuple[bool, float, int]:
     """One epoch of the one component ``x`` (n,), ``S`` (n, n), in place: whether that is enough,
     NIS and number of the rows accepted. It is not where a measurement divides it, something is
     refused or contradicts the rest, or nothing tells that the device has not turned; the rows are
     as they were then."""
-    rows, motion, n = epoch.rows, dynamics.motions[0], x.size
+    rows, motion, n, step = epoch.rows, dynamics.motions[0], x.size, memory.step
     groups = group_count(rows)
-    predict_epoch(x, S, epoch, motion, dynamics.bias, options, memory)
-    predicted = predicted_in(memory.work, n, rows.shape[0])
-    if options.models == 1 and any_begins(x, memory.met_cov, epoch, predicted, options):
+    predict_epoch(x, S, epoch, motion, dynamics.bias, options, step)
+    predicted = predicted_in(step.work, n, rows.shape[0])
+    if options.models == 1 and any_begins(x, step.met_cov, epoch, predicted, options):
         return False, 0.0, 0
     changes = options.robust.kind != Robust.NONE or options.robust.nlos_probability > 0.0
-    raw = rows.copy() if changes else rows
-    result = update_epoch(x, S, epoch, motion, options, memory)
+    if changes:
+        _copy_rows(rows, memory.rows)
+    result = update_epoch(x, S, epoch, motion, options, step)
     if options.manoeuvre_speed_sd > 0.0:
         refused = result.groups < groups
         contradict = fail_together(result.nis, result.used, options.gate_nis)
         if refused or contradict or may_turn(predicted.H, groups, epoch.open_s, options):
             if changes:
-                rows[:] = raw
+                _copy_rows(memory.rows[: rows.shape[0]], rows)
             return False, 0.0, 0
     return True, result.nis, result.used
 
 
 @kernel
+def _open_radius(
+    components: Mixture, x: Array, cov: Array, open_s: float, options: FilterOptions
+) -> float:
+    """Radius round ``x`` (n,) that the several ``components``, or one with ``x`` and ``cov`` (n,
+    n), leave with the integrity risk if nobody knows of the last ``open_s`` seconds whether the
+    device turned."""
+    several = components.log_weights.size > 1
+    known = components if several else one_component(x, cov)
+    told = may_have_turned(known, open_s, options.manoeuvre_speed_sd)
+    return float(mixture_radius(told, x, options.integrity_risk))
+
+
+@leaf
 def _finish(
     x: Array,
     S: Array,
@@ -356,15 +379,30 @@ def _finish(
     _, longest_s = detection_delay_s(rows, predicted, x.size, gate, speed)
     is_open = leaves_turns_open(predicted.H, groups)
     if math.isinf(longest_s) and (is_open or math.isfinite(gate)):
-        several = components.log_weights.size > 1
-        known = components if several else one_component(x, step.met_cov)
-        told = may_have_turned(known, open_s, speed)
-        return float(mixture_radius(told, x, options.integrity_risk)), open_s
+        return _open_radius(components, x, step.met_cov, open_s, options), open_s
     prior_mean, prior_cov = step.prior_mean, step.prior_cov
     fused = FusedEpoch(prior_mean, prior_cov, rows, accepted, epoch.unheard_s, x)
     level = float(manoeuvre_level(fused, longest_s, options, memory.level))
     shown = math.isfinite(level) and not is_open and accepted[:groups].sum() > 0.0
     return level, min(longest_s, open_s) if shown else open_s
+
+
+@leaf
+def _advance_one(
+    x: Array,
+    S: Array,
+    components: Mixture,
+    epoch: EpochInput,
+    dynamics: Dynamics,
+    options: FilterOptions,
+    memory: Memory,
+) -> tuple[bool, float, int, float, float]:
+    """``_by_one`` and, where that is enough, ``_finish``."""
+    enough, nis, used = _by_one(x, S, epoch, dynamics, options, memory)
+    if not enough:
+        return False, 0.0, 0, 0.0, epoch.open_s
+    undetected_m, open_s = _finish(x, S, components, epoch, epoch.open_s, options, memory)
+    return True, nis, used, undetected_m, open_s
 
 
 @kernel
@@ -392,9 +430,10 @@ def advance(
         if rows.shape[0] == 0:
             predict(x, S, epoch.dt_s, dynamics.motions[0], dynamics.bias, options)
             return Outcome(components, 0.0, 0, np.zeros(0), 0.0, 0.0, epoch.open_s)
-        enough, nis, used = _by_one(x, S, epoch, dynamics, options, step)
+        enough, nis, used, undetected_m, open_s = _advance_one(
+            x, S, components, epoch, dynamics, options, memory
+        )
         if enough:
-            undetected_m, open_s = _finish(x, S, components, epoch, epoch.open_s, options, memory)
             groups = group_count(rows)
             return Outcome(components, nis, used, np.zeros(groups), undetected_m, 0.0, open_s)
         components = one_component(step.prior_mean, step.prior_cov)
