@@ -37,6 +37,7 @@ def _of_the_tracker(setup: Setup, seed: int) -> dict[int, tuple[np.ndarray, floa
     }
 
 
+@pytest.mark.timeout(900)  # hundreds of attempts at a first fix
 @pytest.mark.parametrize("seed", [7, 8])
 def test_a_track_that_was_lost_comes_back_as_in_the_tracker(seed: int) -> None:
     setup = Setup(replace(LOSING, estimator="scenario", tracker=RIGID))
