@@ -23,37 +23,51 @@ def eigenvalues(xx: float, xy: float, yy: float) -> tuple[float, float]:
 
 
 @kernel
-def factor(cov: Array) -> Array:
-    """Lower triangular L (n, n) with L L' = cov, also of a singular ``cov`` (n, n): what is known
-    exactly has a zero column."""
-    n = cov.shape[0]
-    L = np.zeros((n, n))
+def factor_in_place(A: Array) -> None:
+    """Lower triangular L (n, n) with L L' = A, in place of the lower triangle of ``A``, which may
+    be singular: what is known exactly has a zero column. The rest of ``A`` stays."""
+    n = A.shape[0]
     for j in range(n):
-        pivot = cov[j, j]
+        pivot = A[j, j]
         for k in range(j):
-            pivot -= L[j, k] * L[j, k]
-        if pivot <= _RANK * cov[j, j]:
-            continue
-        root = math.sqrt(pivot)
-        L[j, j] = root
+            pivot -= A[j, k] * A[j, k]
+        root = 0.0 if pivot <= _RANK * A[j, j] else math.sqrt(pivot)
+        A[j, j] = root
         for i in range(j + 1, n):
-            total = cov[i, j]
+            total = A[i, j]
             for k in range(j):
-                total -= L[i, k] * L[j, k]
-            L[i, j] = total / root
+                total -= A[i, k] * A[j, k]
+            A[i, j] = 0.0 if root == 0.0 else total / root
+
+
+@kernel
+def factor(cov: Array) -> Array:
+    """``factor_in_place`` of a copy of ``cov`` (n, n); 0 above the diagonal."""
+    L = np.zeros(cov.shape)
+    for i in range(cov.shape[0]):
+        L[i, : i + 1] = cov[i, : i + 1]
+    factor_in_place(L)
     return L
+
+
+@kernel
+def solve_lower(L: Array, B: Array) -> None:
+    """Solve L X = B for X (m, k), in place of ``B``; 0 along zero columns of ``L`` (m, m), of
+    which the lower triangle counts."""
+    for column in range(B.shape[1]):
+        for i in range(L.shape[0]):
+            total = B[i, column]
+            for k in range(i):
+                total -= L[i, k] * B[k, column]
+            B[i, column] = total / L[i, i] if L[i, i] > 0.0 else 0.0
 
 
 @kernel
 def solve_factored(L: Array, B: Array) -> None:
     """Solve L L' X = B for X (m, k), in place of ``B``; 0 along zero columns of ``L`` (m, m)."""
+    solve_lower(L, B)
     m = L.shape[0]
     for column in range(B.shape[1]):
-        for i in range(m):
-            total = B[i, column]
-            for k in range(i):
-                total -= L[i, k] * B[k, column]
-            B[i, column] = total / L[i, i] if L[i, i] > 0.0 else 0.0
         for i in range(m - 1, -1, -1):
             total = B[i, column]
             for k in range(i + 1, m):

@@ -9,7 +9,14 @@ import pytest
 from filter_rows import random_spd
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from netpos.estimation.factor import eigenvalues, factor, solve_factored
+from netpos.estimation.factor import (
+    eigenvalues,
+    factor,
+    factor_in_place,
+    solve_factored,
+    solve_lower,
+)
+from scipy import linalg
 
 
 @pytest.mark.parametrize("scale", [1e-20, 1.0, 1e20])
@@ -47,6 +54,20 @@ def test_what_is_known_exactly_has_a_zero_column() -> None:
     np.testing.assert_array_equal(L[2], 0.0)
     np.testing.assert_array_equal(L[:, 2], 0.0)
     np.testing.assert_allclose(L[np.ix_(others, others)], np.linalg.cholesky(rest), rtol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_factor_in_place_leaves_and_needs_nothing_above_the_diagonal(seed: int) -> None:
+    """The rest of the matrix stays, and half of a solution does not read it: SciPy's."""
+    rng = np.random.default_rng(seed)
+    S, B = random_spd(rng, 5), rng.normal(size=(5, 3))
+    A, X = np.tril(S) + np.triu(np.full((5, 5), 7.0), 1), B.copy()
+    factor_in_place(A)
+    solve_lower(A, X)
+    np.testing.assert_array_equal(np.tril(A), factor(S))
+    np.testing.assert_array_equal(A[np.triu_indices(5, 1)], 7.0)
+    expected = linalg.solve_triangular(np.linalg.cholesky(S), B, lower=True)
+    np.testing.assert_allclose(X, expected, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -17,11 +17,11 @@ import math
 import numpy as np
 
 from netpos.estimation.compile import kernel, leaf
-from netpos.estimation.factor import eigenvalues
+from netpos.estimation.factor import eigenvalues, factor_in_place, solve_lower
 from netpos.estimation.measurement import GATE_VARIANCE
 from netpos.estimation.motion import add_velocity_step
 from netpos.estimation.state import POSITION, VELOCITY, X
-from netpos.estimation.update.predicted import PredictedRows
+from netpos.estimation.update.predicted import PredictedRows, prior_cov_of
 from netpos.messages.values import Array
 
 # A turn to a side: steps of the velocity from 0.65 to 1.35 times its size are taken for such
@@ -35,32 +35,19 @@ TURN_SPEED_SD = 0.25  # of the speed
 def _information(rows: Array, predicted: PredictedRows, n: int) -> Array:
     """What ``rows`` (m, ROW_WIDTH) together tell of a change of x, y, vx and vy (4, 4) that the
     prediction of ``n`` states does not foresee. Its own uncertainty is noise, and what rows share
-    of it, a clock or the error of a common reference, is one noise: H' S^-1 H = w' w with the
-    factor L of S, L w = H."""
+    of it, a clock or the error of a common reference, is one noise: H' S^-1 H = W' W with the
+    factor L of S and L W = H."""
     m = rows.shape[0]
-    memory = np.zeros((m + 4, m + 4))
-    L, w, information = memory[:m, :m], memory[:m, m:], memory[m:, m:]
-    H, HP = predicted.H, predicted.HP
+    S = prior_cov_of(predicted, np.arange(m), n)
     for i in range(m):
-        for j in range(i + 1):
-            left = 0.0
-            for c in range(n):
-                left += H[i, c] * HP[j, c]
-            for k in range(j):
-                left -= L[i, k] * L[j, k]
-            if j < i:
-                L[i, j] = left / L[j, j]
-                continue
-            noise = rows[i, GATE_VARIANCE] + predicted.second_order_var[i]
-            L[i, i] = math.sqrt(max(left + noise, noise))
-        for a in range(4):
-            left = H[i, X.PX + a]
-            for k in range(i):
-                left -= L[i, k] * w[k, a]
-            w[i, a] = left / L[i, i]
+        S[i, i] += rows[i, GATE_VARIANCE] + predicted.second_order_var[i]
+    W, information = predicted.H[:m, X.PX : X.VY + 1].copy(), np.zeros((4, 4))
+    factor_in_place(S)
+    solve_lower(S, W)
+    for i in range(m):
         for a in range(4):
             for b in range(4):
-                information[a, b] += w[i, a] * w[i, b]
+                information[a, b] += W[i, a] * W[i, b]
     return information
 
 

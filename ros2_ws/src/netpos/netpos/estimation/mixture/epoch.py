@@ -387,24 +387,6 @@ def _finish(
     return level, min(longest_s, open_s) if shown else open_s
 
 
-@leaf
-def _advance_one(
-    x: Array,
-    S: Array,
-    components: Mixture,
-    epoch: EpochInput,
-    dynamics: Dynamics,
-    options: FilterOptions,
-    memory: Memory,
-) -> tuple[bool, float, int, float, float]:
-    """``_by_one`` and, where that is enough, ``_finish``."""
-    enough, nis, used = _by_one(x, S, epoch, dynamics, options, memory)
-    if not enough:
-        return False, 0.0, 0, 0.0, epoch.open_s
-    undetected_m, open_s = _finish(x, S, components, epoch, epoch.open_s, options, memory)
-    return True, nis, used, undetected_m, open_s
-
-
 @kernel
 def advance(
     x: Array,
@@ -430,10 +412,9 @@ def advance(
         if rows.shape[0] == 0:
             predict(x, S, epoch.dt_s, dynamics.motions[0], dynamics.bias, options)
             return Outcome(components, 0.0, 0, np.zeros(0), 0.0, 0.0, epoch.open_s)
-        enough, nis, used, undetected_m, open_s = _advance_one(
-            x, S, components, epoch, dynamics, options, memory
-        )
+        enough, nis, used = _by_one(x, S, epoch, dynamics, options, memory)
         if enough:
+            undetected_m, open_s = _finish(x, S, components, epoch, epoch.open_s, options, memory)
             groups = group_count(rows)
             return Outcome(components, nis, used, np.zeros(groups), undetected_m, 0.0, open_s)
         components = one_component(step.prior_mean, step.prior_cov)
