@@ -14,9 +14,9 @@ from pathlib import Path
 _VARIABLE = "NUMBA_CACHE_DIR"
 _KEPT = 4
 _MARKS = (b"@kernel", b"@leaf", b"@inlined", b"@link", b"njit")
-# The tables of the estimator and the indices of states are compiled into kernels, too.
+# The tables of the estimator, the indices of states and a loop are compiled into kernels, too.
 _TABLES = ("sensors", "motion", "forms", "splits")
-_INDICES = ("state.py", "navigation_state.py")
+_FILES = ("state.py", "navigation_state.py", "least_squares.py")
 
 
 def cache_folder(root: Path) -> Path:
@@ -24,7 +24,7 @@ def cache_folder(root: Path) -> Path:
     digest = hashlib.blake2b(digest_size=8)
     for path in sorted(root.rglob("*.py")):
         text = path.read_bytes()
-        is_compiled = path.parent.name in _TABLES or path.name in _INDICES
+        is_compiled = path.parent.name in _TABLES or path.name in _FILES
         if is_compiled or any(mark in text for mark in _MARKS):
             digest.update(str(path.relative_to(root)).encode() + b"\0" + text)
     return root / "__pycache__" / f"kernels-{digest.hexdigest()}"

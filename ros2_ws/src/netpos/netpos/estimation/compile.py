@@ -45,6 +45,9 @@ link: Callable[..., Any] = njit(
     error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True
 )
 
+# A closure made at import that allocates, as such part of the callers that are cached.
+linked_kernel: Callable[..., Any] = njit(error_model="numpy", _nrt=True, forceinline=False)
+
 
 def _local_array(_context: Any, *shape: Any) -> Any:
     """Array of a shape known at compile time on the stack of the kernel that calls it, its entries

@@ -73,3 +73,28 @@ def solve_factored(L: Array, B: Array) -> None:
             for k in range(i + 1, m):
                 total -= L[k, i] * B[k, column]
             B[i, column] = total / L[i, i] if L[i, i] > 0.0 else 0.0
+
+
+@kernel
+def solve(A: Array, b: Array) -> Array:
+    """x (n,) of A x = b for a positive definite ``A`` (n, n); 0 along what it leaves open."""
+    x = b.copy().reshape(-1, 1)
+    solve_factored(factor(A), x)
+    return x[:, 0]
+
+
+@kernel
+def inverse(A: Array) -> Array:
+    """Inverse of a positive definite ``A`` (n, n) whose units differ by many orders of magnitude;
+    large along what it leaves open."""
+    n = A.shape[0]
+    scale, scaled, inverted = 1.0 / np.sqrt(np.diag(A)), np.empty((n, n)), np.eye(n)
+    for i in range(n):
+        for j in range(n):
+            scaled[i, j] = A[i, j] * scale[i] * scale[j]
+        scaled[i, i] += 2.0 * _RANK  # what is only ill-conditioned is not known exactly
+    solve_factored(factor(scaled), inverted)
+    for i in range(n):
+        for j in range(n):
+            inverted[i, j] *= scale[i] * scale[j]
+    return inverted

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from netpos.common.least_squares import minimise
+from netpos.common.least_squares import GAIN_MIN, minimiser
 from netpos.inertial.attitude import GRAVITY_MPS2
 
 Array = npt.NDArray[np.float64]
@@ -152,24 +152,30 @@ def _predict(way: Way, x: Array) -> tuple[Array, Array]:
     return x[:2] + moved, J.reshape(-1, 5)
 
 
+def _equations(x: Array, given: tuple[Way, Array, Array]) -> tuple[float, Array, Array]:
+    """Those of ``minimiser``, of the fit of a way to positions (k, 2) with the roots (k, 2, 2) of
+    their information."""
+    way, position, root = given
+    predicted, J = _predict(way, x)
+    whitened = np.einsum("kij,kjl->kil", root, J.reshape(-1, 2, 5)).reshape(-1, 5)
+    r = np.einsum("kij,kj->ki", root, position - predicted).ravel()
+    prior = np.array([0.0, 0.0, 0.0, 0.0, 1.0 / _ACCELERATION_SD])
+    r, J = np.append(r, -x[4] / _ACCELERATION_SD), np.vstack([whitened, prior])
+    return float(r @ r), J.T @ r, J.T @ J
+
+
+_minimise = minimiser(_equations, np.linalg.solve)
+
+
 def _fit(
     way: Way, position: Array, root: Array, heading: float
 ) -> tuple[float, Array, Array] | None:
-    """Cost, parameters and normal matrix (5, 5) from one heading, by Levenberg-Marquardt."""
-
-    def equations(x: Array) -> tuple[float, Array, Array]:
-        predicted, J = _predict(way, x)
-        whitened = np.einsum("kij,kjl->kil", root, J.reshape(-1, 2, 5)).reshape(-1, 5)
-        r = np.einsum("kij,kj->ki", root, position - predicted).ravel()
-        prior = np.array([0.0, 0.0, 0.0, 0.0, 1.0 / _ACCELERATION_SD])
-        r, J = np.append(r, -x[4] / _ACCELERATION_SD), np.vstack([whitened, prior])
-        return float(r @ r), J.T @ r, J.T @ J
-
+    """Cost, parameters and normal matrix (5, 5) from one heading."""
     span = float(np.linalg.norm(way.A[-1])) or 1.0
     speed = max(float(np.linalg.norm(position[-1] - position[0])) / span, 0.0)
     start = np.array([*position[0], heading, speed, 0.0])
     try:
-        cost, x, normal = minimise(equations, start, np.linalg.solve)
+        cost, x, normal = _minimise(start, (way, position, root), GAIN_MIN)
     except np.linalg.LinAlgError:
         return None
     scale = np.sqrt(np.diag(normal))

@@ -7,7 +7,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from netpos.common.least_squares import Array, minimise
+from netpos.common.least_squares import GAIN_MIN, Array, minimiser
+from netpos.estimation.factor import solve
+from numba import njit
 from scipy.optimize import approx_fprime, least_squares
 
 Residuals = Callable[[Array], Array]
@@ -21,6 +23,12 @@ def equations(residuals: Residuals, seen: list[Array]) -> Equations:
         return float(r @ r), J.T @ r, J.T @ J
 
     return at
+
+
+def minimise(
+    equations: Equations, start: Array, gain_min: float = GAIN_MIN
+) -> tuple[float, Array, Array]:
+    return minimiser(lambda x, _: equations(x), np.linalg.solve)(start, None, gain_min)
 
 
 def ranges(x: Array) -> Array:
@@ -40,7 +48,7 @@ def rosenbrock(x: Array) -> Array:
 )
 def test_the_end_is_scipys(residuals: Residuals, start: list[float]) -> None:
     seen: list[Array] = []
-    cost, x, normal = minimise(equations(residuals, seen), np.array(start), np.linalg.solve)
+    cost, x, normal = minimise(equations(residuals, seen), np.array(start))
     expected = least_squares(residuals, start, method="lm", xtol=1e-12, ftol=1e-12)
     assert cost == pytest.approx(2.0 * expected.cost, abs=1e-5)
     np.testing.assert_allclose(x, expected.x, atol=1e-2)
@@ -52,9 +60,7 @@ def test_a_line_is_found_at_once() -> None:
     """Linear, the damping aside: the second step changes the cost by less than is worth it."""
     A = np.array([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]])
     z, seen = np.array([1.0, 2.5, 4.2]), list[Array]()
-    cost, x, normal = minimise(
-        equations(lambda x: z - A @ x, seen), np.array([100.0, -50.0]), np.linalg.solve
-    )
+    cost, x, normal = minimise(equations(lambda x: z - A @ x, seen), np.array([100.0, -50.0]))
     expected, (rest,), *_ = np.linalg.lstsq(A, z)
     np.testing.assert_allclose(x, expected, atol=1e-3)
     assert cost == pytest.approx(rest, rel=1e-3)
@@ -65,7 +71,7 @@ def test_a_line_is_found_at_once() -> None:
 def test_a_step_too_far_is_damped() -> None:
     """From 3 undamped steps to the zero of atan grow without end."""
     seen: list[Array] = []
-    cost, x, _ = minimise(equations(np.arctan, seen), np.array([3.0]), np.linalg.solve)
+    cost, x, _ = minimise(equations(np.arctan, seen), np.array([3.0]))
     assert abs(x[0]) < 1e-2
     assert cost < 1e-4
     assert max(abs(tried[0]) for tried in seen[-3:]) < 0.1
@@ -79,7 +85,7 @@ def test_where_nothing_falls_the_start_remains() -> None:
         cost, b, A = equations(lambda x: x, seen)(x)
         return cost, -b, A
 
-    cost, x, normal = minimise(uphill, np.array([2.0]), np.linalg.solve)
+    cost, x, normal = minimise(uphill, np.array([2.0]))
     assert (cost, x.tolist()) == (4.0, [2.0])
     assert normal[0, 0] == pytest.approx(1.0)
     assert len(seen) == 1 + round(math.log10(1e8 / 1e-3)) + 1
@@ -87,4 +93,35 @@ def test_where_nothing_falls_the_start_remains() -> None:
 
 def test_an_unsolvable_system_raises() -> None:
     with pytest.raises(np.linalg.LinAlgError):
-        minimise(lambda x: (1.0, x, np.zeros((2, 2))), np.ones(2), np.linalg.solve)
+        minimise(lambda x: (1.0, x, np.zeros((2, 2))), np.ones(2))
+
+
+def _to_stations(x: Array, measured: Array) -> tuple[float, Array, Array]:
+    """Of distances to four stations, one measured from each."""
+    cost, b, A = 0.0, np.zeros(2), np.zeros((2, 2))
+    for i in range(4):
+        dx, dy = x[0] - 50.0 * (i % 2), x[1] - 40.0 * (i // 2)
+        distance = math.sqrt(dx * dx + dy * dy)
+        h, r = np.array([dx / distance, dy / distance]), measured[i] - distance
+        cost += r * r
+        b += r * h
+        A += np.outer(h, h)
+    return cost, b, A
+
+
+def test_what_is_compiled_with_its_equations_does_the_same() -> None:
+    measured, start = np.array([22.0, 42.0, 30.0, 44.0]), np.array([300.0, -200.0])
+    in_python = minimiser(_to_stations, np.linalg.solve)(start, measured, GAIN_MIN)
+    compiled = njit(minimiser(njit(_to_stations), solve))(start, measured, GAIN_MIN)
+    for found, expected in zip(compiled, in_python, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_a_rough_minimum_takes_fewer_steps() -> None:
+    counts, costs = [], []
+    for gain_min in (GAIN_MIN, 1e-2):
+        seen: list[Array] = []
+        costs.append(minimise(equations(ranges, seen), np.array([300.0, -200.0]), gain_min)[0])
+        counts.append(len(seen))
+    assert counts[1] < counts[0]
+    assert costs[0] <= costs[1] < 1.05 * costs[0]

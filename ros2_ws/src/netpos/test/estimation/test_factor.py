@@ -13,6 +13,8 @@ from netpos.estimation.factor import (
     eigenvalues,
     factor,
     factor_in_place,
+    inverse,
+    solve,
     solve_factored,
     solve_lower,
 )
@@ -113,3 +115,25 @@ def test_eigenvalues_of_a_negative_matrix_keep_their_order() -> None:
     assert eigenvalues(-0.0, 2.0, -0.0) == (-2.0, 2.0)
     assert eigenvalues(0.0, 0.0, 0.0) == (0.0, 0.0)
     assert eigenvalues(math.inf, 0.0, 1.0)[1] == math.inf
+
+
+def test_inverse_of_units_that_differ_by_many_orders() -> None:
+    rng = np.random.default_rng(1)
+    B = rng.normal(size=(6, 6))
+    C, sd = B @ B.T + np.eye(6), 10.0 ** np.array([9.0, -9.0, 0.0, 6.0, -6.0, 3.0])
+    found = inverse(C * np.outer(sd, sd)) * np.outer(sd, sd)
+    np.testing.assert_allclose(found, np.linalg.inv(C), rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_right_hand_side_is_solved_as_numpy_does(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    A, b = random_spd(rng, 5), rng.normal(size=5)
+    np.testing.assert_allclose(solve(A, b), np.linalg.solve(A, b), rtol=1e-9, atol=1e-12)
+
+
+def test_what_is_left_open_has_a_large_inverse_not_a_zero_one() -> None:
+    """Only the sum of two numbers is known: their difference is not, though neither is 0."""
+    found = inverse(np.array([[4.0, 4.0], [4.0, 4.0]]))
+    assert found[0, 0] > 1e10
+    assert found.sum() == pytest.approx(0.25, rel=0.1)

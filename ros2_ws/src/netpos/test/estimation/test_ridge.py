@@ -7,20 +7,37 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from netpos.common.least_squares import minimise
+from netpos.common.least_squares import GAIN_MIN, minimiser
+from netpos.estimation.factor import inverse, solve
 from netpos.estimation.mixture.gaussians import Mixture
-from netpos.estimation.mixture.ridge import (
-    Equations,
-    Fit,
-    cholesky_solve,
-    components_of,
-    inverse,
-    on_line,
-)
+from netpos.estimation.mixture.ridge import Fit, Line, across, components_of, on_line
 from netpos.messages.values import Array
+
+Equations = Callable[[Array], tuple[float, Array, Array]]
 
 ANCHORS = np.array([[1.3, 2.2], [-1.3, 2.2], [1.3, -2.2], [-1.3, -2.2]])
 SD_M, PRIOR_M, SPEED_MPS = 0.2, 25.0, 1.5
+
+
+class Density:
+    """A posterior by its cost, gradient and normal matrix at a state."""
+
+    def __init__(self, equations: Equations) -> None:
+        self.equations = equations
+        self._minimise = minimiser(self._on_line, solve)
+
+    def _on_line(self, state: Array, line: Line | None) -> tuple[float, Array, Array]:
+        cost, b, A = self.equations(state)
+        if line is None:
+            return cost, b, A
+        u = np.append(line.direction, np.zeros(state.size - 2))
+        off = float(line.direction @ (line.centre - state[:2])) / line.sd
+        return cost + off**2, b + off / line.sd * u, A + np.outer(u, u) / line.sd**2
+
+    def minimum(
+        self, start: Array, line: Line | None = None, gain_min: float = GAIN_MIN
+    ) -> tuple[float, Array, Array]:
+        return self._minimise(start, line, gain_min)
 
 
 def ranges(seed: int, anchors: Array = ANCHORS) -> tuple[Array, Array]:
@@ -31,7 +48,7 @@ def ranges(seed: int, anchors: Array = ANCHORS) -> tuple[Array, Array]:
     return heard, np.hypot(*(place - heard).T) + SD_M * rng.standard_normal(len(heard))
 
 
-def equations_of(anchors: Array, measured: Array) -> Equations:
+def density_of(anchors: Array, measured: Array) -> Density:
     """Of [x, y, vx, vy], the velocity known by its prior only."""
     information = np.diag(np.array([PRIOR_M, PRIOR_M, SPEED_MPS, SPEED_MPS]) ** -2.0)
 
@@ -43,14 +60,14 @@ def equations_of(anchors: Array, measured: Array) -> Equations:
         cost = state @ information @ state + error @ error / SD_M**2
         return cost, H.T @ error / SD_M**2 - information @ state, information + H.T @ H / SD_M**2
 
-    return equations
+    return Density(equations)
 
 
-def minima(equations: Equations, radius: float) -> list[Fit]:
+def minima(density: Density, radius: float) -> list[Fit]:
     fits = []
     for angle in 0.1 + 2.0 * math.pi * np.arange(12) / 12:
         start = np.array([radius * math.cos(angle), radius * math.sin(angle), 0.0, 0.0])
-        cost, state, A = minimise(equations, start, cholesky_solve)
+        cost, state, A = density.minimum(start)
         fits.append((cost, state, inverse(A)))
     return sorted(fits, key=lambda fit: fit[0])
 
@@ -73,11 +90,11 @@ def on_grid(anchors: Array, measured: Array) -> tuple[Array, Array, float]:
 
 
 def posterior_of(
-    equations: Equations,
+    density: Density,
     fits: list[Fit],
     is_possible: Callable[[Array], bool] = lambda _: True,
 ) -> Mixture:
-    found = components_of(equations, fits, [], is_possible)
+    found = components_of(density, fits, [], is_possible)
     assert found is not None
     return found
 
@@ -96,8 +113,8 @@ def moments(mixture: Mixture) -> tuple[Array, Array, Array]:
 def test_a_thin_arc_is_a_row_of_gaussians(seed: int) -> None:
     """The figures for one Gaussian at the minimum are 0.3 to 0.4 sd."""
     anchors, measured = ranges(seed)
-    equations = equations_of(anchors, measured)
-    found = posterior_of(equations, minima(equations, measured.mean()))
+    density = density_of(anchors, measured)
+    found = posterior_of(density, minima(density, measured.mean()))
     weights, mean, cov = moments(found)
     expected, expected_cov, _ = on_grid(anchors, measured)
     away = mean - expected
@@ -112,8 +129,8 @@ def test_two_places_have_the_weights_of_their_evidence() -> None:
     images lies nearer to it."""
     anchors = np.array([[-15.0, 4.0], [15.0, 4.0]])
     measured = np.hypot(*(np.array([3.0, -14.0]) - anchors).T)
-    equations = equations_of(anchors, measured)
-    found = posterior_of(equations, minima(equations, 18.0))
+    density = density_of(anchors, measured)
+    found = posterior_of(density, minima(density, 18.0))
     weights, _, _ = moments(found)
     _, _, above = on_grid(anchors, measured)
     assert 0.2 < above < 0.5
@@ -130,7 +147,7 @@ def test_a_straight_posterior_is_its_one_gaussian() -> None:
         off = centre - state
         return float(off @ A @ off), A @ off, A
 
-    found = posterior_of(equations, [(0.0, centre, np.linalg.inv(A))])
+    found = posterior_of(Density(equations), [(0.0, centre, np.linalg.inv(A))])
     np.testing.assert_allclose(found.means, [centre])
     np.testing.assert_allclose(found.covs, [np.linalg.inv(A)], rtol=1e-9)
     evidence = 0.5 * math.log(np.linalg.det(2.0 * math.pi * np.linalg.inv(A)))
@@ -139,10 +156,10 @@ def test_a_straight_posterior_is_its_one_gaussian() -> None:
 
 def test_what_is_impossible_is_left_out() -> None:
     anchors, measured = ranges(3)
-    equations = equations_of(anchors, measured)
-    fits = minima(equations, measured.mean())
+    density = density_of(anchors, measured)
+    fits = minima(density, measured.mean())
     side = float(fits[0][1][0])
-    found = posterior_of(equations, fits, lambda state: bool(state[0] > side - 1e-6))
+    found = posterior_of(density, fits, lambda state: bool(state[0] > side - 1e-6))
     assert (found.means[:, 0] > side - 1e-6).all()
 
 
@@ -166,8 +183,9 @@ def test_a_ray_is_followed_from_anywhere_on_it(start_m: float, sd_deg: float) ->
         )
 
     towards = np.array([math.cos(0.4), math.sin(0.4)])
-    fit = on_line(equations, start_m * towards, towards)
-    found = components_of(equations, [], [fit], lambda state: bool(np.hypot(*state) > 1.0))
+    density, start = Density(equations), start_m * towards
+    fit = on_line(density, start, across(start, towards))
+    found = components_of(density, [], [fit], lambda state: bool(np.hypot(*state) > 1.0))
     assert found is not None
     weights, mean, cov = moments(found)
     along = np.array([towards, [-towards[1], towards[0]]])
@@ -183,5 +201,5 @@ def test_a_ray_is_followed_from_anywhere_on_it(start_m: float, sd_deg: float) ->
 
 def test_nothing_that_is_possible_is_no_posterior() -> None:
     anchors, measured = ranges(3)
-    equations = equations_of(anchors, measured)
-    assert components_of(equations, minima(equations, 10.0), [], lambda _: False) is None
+    density = density_of(anchors, measured)
+    assert components_of(density, minima(density, 10.0), [], lambda _: False) is None

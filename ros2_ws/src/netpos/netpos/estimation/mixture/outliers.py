@@ -16,6 +16,9 @@ _FARTHEST = 1e3  # standard deviations
 TAIL_LOG = -math.log(2.0 * (1.0 + math.log(_FARTHEST)))
 """Log density of such an error, times its size: each octave is as likely."""
 
+PEAK_TAIL_LOG = TAIL_LOG + 0.5 * math.log(2.0 * math.pi)
+"""Log density of an error up to one standard deviation over that of a Gaussian at its peak."""
+
 
 @leaf
 def share_of_outliers(row: Array) -> float:

@@ -15,20 +15,40 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from netpos.common.least_squares import minimise
-from netpos.estimation.factor import factor, solve_factored
+from netpos.common.least_squares import GAIN_MIN
+from netpos.estimation.factor import inverse
 from netpos.estimation.mixture.gaussians import CURVATURE_SHARE, SPACING_SD, Mixture
 from netpos.estimation.state import POSITION, VELOCITY
 from netpos.messages.values import Array
 
 Fit = tuple[float, Array, Array]
 """Cost, state (n,) and covariance (n, n) of a minimum."""
-Equations = Callable[[Array], tuple[float, Array, Array]]
-"""Cost, gradient (n,) and normal matrix (n, n) at a state, as ``minimise`` takes them."""
+
+
+class Line(NamedTuple):
+    """A Gaussian of ``sd`` along ``direction`` (2,) about ``centre`` (2,)."""
+
+    centre: Array
+    direction: Array
+    sd: float
+
+
+class Posterior(Protocol):
+    """A density of states (n,), by its cost, twice its negative log."""
+
+    def equations(self, state: Array) -> tuple[float, Array, Array]:
+        """Cost, gradient (n,) and normal matrix (n, n) at a state."""
+
+    def minimum(
+        self, start: Array, line: Line | None = None, gain_min: float = GAIN_MIN
+    ) -> tuple[float, Array, Array]:
+        """Least cost from ``start`` (n,), that of a ``line`` included, where it is, and the normal
+        matrix there; steps end where they gain less than ``gain_min``."""
+
 
 # A cost one sd away that differs by so much from the one of a Gaussian (1) shifts the mean by 1.5
 # times as many sd, where it is higher on one side.
@@ -40,7 +60,9 @@ _COST_MAX = 37.0  # twice the log of the least weight of a component
 _PIECES_MAX = 32  # one way from the most probable point
 _SAME2 = 9.0  # squared Mahalanobis distance within which a minimum belongs to a component
 _SIDES = (-1.0, 1.0)
-_PLACE = slice(POSITION.start, VELOCITY.stop)
+
+PLACE = slice(POSITION.start, VELOCITY.stop)
+"""The states by which minima and components are told apart."""
 
 
 class _Piece(NamedTuple):
@@ -49,21 +71,13 @@ class _Piece(NamedTuple):
     cov: Array
 
 
-class _Line(NamedTuple):
-    """A Gaussian of ``sd`` along ``direction`` (2,) about ``centre`` (2,)."""
-
-    centre: Array
-    direction: Array
-    sd: float
-
-
 def components_of(
-    equations: Equations,
+    posterior: Posterior,
     minima: Sequence[Fit],
     constrained: Sequence[Fit],
     is_possible: Callable[[Array], bool],
 ) -> Mixture | None:
-    """The posterior with the cost of ``equations``; log weights are not normalised.
+    """The posterior; log weights are not normalised.
 
     minima, constrained : where the cost is least, and where it is at a given distance, which
         ``on_line`` finds; arcs are followed from the latter as far as none has led from the former
@@ -76,7 +90,7 @@ def components_of(
         for fit in sorted(fits, key=log_weight_of, reverse=True):
             if fit[0] > limit or _is_known(fit[1], pieces):
                 continue
-            along = _along(equations, fit, limit, partial(_is_end, is_possible, tuple(pieces)))
+            along = _along(posterior, fit, limit, partial(_is_end, is_possible, tuple(pieces)))
             if along is None:  # one Gaussian describes it, about its minimum
                 along = [_whole(fit)] if fits is minima else []
             pieces += along
@@ -90,28 +104,17 @@ def components_of(
     )
 
 
-def inverse(A: Array) -> Array:
-    """Inverse of a positive definite matrix whose units differ by many orders of magnitude."""
-    scale = 1.0 / np.sqrt(np.diag(A))
-    scaling = np.outer(scale, scale)
-    # 1e-14 is rounding: it keeps inv from calling singular what is only ill-conditioned.
-    inverted: Array = np.linalg.inv(A * scaling + 1e-14 * np.eye(len(A))) * scaling
-    return inverted
+def across(state: Array, direction: Array) -> Line:
+    """The line that keeps the position where it is in a ``state`` (n,) along ``direction``
+    (2,)."""
+    return Line(state[POSITION], direction, _TIGHT)
 
 
-def cholesky_solve(A: Array, b: Array) -> Array:
-    """x (n,) of A x = b for a positive definite ``A`` (n, n)."""
-    x = b[:, None].copy()
-    solve_factored(factor(A), x)
-    return x[:, 0]
-
-
-def on_line(equations: Equations, start: Array, direction: Array) -> Fit:
-    """The most probable state where the position (2,) is the one of ``start`` (n,) along
-    ``direction`` (2,), and the covariance (n, n) there without that."""
-    line = _Line(start[POSITION], direction, _TIGHT)
-    state = _minimum(equations, line, start)[1]
-    cost, _, A = equations(state)
+def on_line(posterior: Posterior, start: Array, line: Line) -> Fit:
+    """The most probable state on a line to which ``start`` (n,) leads, and the covariance (n, n)
+    there without the line."""
+    _, state, _ = posterior.minimum(start, line)
+    cost, _, A = posterior.equations(state)
     return cost, state, inverse(A)
 
 
@@ -126,6 +129,11 @@ def log_weight_of(fit: Fit) -> float:
     return -0.5 * cost + 0.5 * _log_det(2.0 * math.pi * cov)
 
 
+def _fit(posterior: Posterior, start: Array, line: Line) -> Fit:
+    cost, state, A = posterior.minimum(start, line)
+    return cost, state, inverse(A)
+
+
 def _whole(fit: Fit) -> _Piece:
     """A minimum as one Gaussian."""
     _, mean, cov = fit
@@ -135,8 +143,8 @@ def _whole(fit: Fit) -> _Piece:
 def _is_known(state: Array, pieces: Sequence[_Piece]) -> bool:
     """Whether a minimum lies within a component there is."""
     for piece in pieces:
-        away = state[_PLACE] - piece.mean[_PLACE]
-        if float(away @ inverse(piece.cov[_PLACE, _PLACE]) @ away) < _SAME2:
+        away = state[PLACE] - piece.mean[PLACE]
+        if float(away @ inverse(piece.cov[PLACE, PLACE]) @ away) < _SAME2:
             return True
     return False
 
@@ -144,22 +152,6 @@ def _is_known(state: Array, pieces: Sequence[_Piece]) -> bool:
 def _is_end(is_possible: Callable[[Array], bool], known: Sequence[_Piece], state: Array) -> bool:
     """Whether an arc ends at a state."""
     return not is_possible(state) or _is_known(state, known)
-
-
-def _minimum(equations: Equations, line: _Line, start: Array) -> Fit:
-    """The minimum, from ``start``, of the cost and that of a Gaussian along a line."""
-    u, weight = line.direction, 1.0 / line.sd**2
-
-    def constrained(state: Array) -> tuple[float, Array, Array]:
-        cost, b, A = equations(state)
-        off = float(u @ (line.centre - state[POSITION]))
-        b, A = b.copy(), A.copy()
-        b[POSITION] += weight * off * u
-        A[POSITION, POSITION] += weight * np.outer(u, u)
-        return cost + weight * off * off, b, A
-
-    cost, state, A = minimise(constrained, start, cholesky_solve)
-    return cost, state, inverse(A)
 
 
 def _axis(cov: Array) -> tuple[float, Array, Array, float]:
@@ -172,7 +164,7 @@ def _axis(cov: Array) -> tuple[float, Array, Array, float]:
 
 
 def _along(
-    equations: Equations, fit: Fit, cost_max: float, ends: Callable[[Array], bool]
+    posterior: Posterior, fit: Fit, cost_max: float, ends: Callable[[Array], bool]
 ) -> list[_Piece] | None:
     """Components of the arc through a state on it, as far as where it ``ends``; None where it is
     straight and as wide all along."""
@@ -180,10 +172,10 @@ def _along(
 
     def beside(off: float) -> Fit:
         q = fit[1] + off * follows
-        return _minimum(equations, _Line(q[POSITION], u, _TIGHT * abs(off)), q)
+        return posterior.minimum(q, Line(q[POSITION], u, _TIGHT * abs(off)))
 
     wider = [
-        side * (_across(equations, beside(side * across)[1]) / across - 1.0) for side in _SIDES
+        side * (_across(posterior, beside(side * across)[1]) / across - 1.0) for side in _SIDES
     ]
     widening = min(wider, key=abs) / across  # the other may be that of another arc
     step = min(sd, _WIDENING / max(abs(widening), 1e-9))
@@ -197,20 +189,20 @@ def _along(
     if not is_bent and not differs:
         return None
     short = min(_length(sd, across, abs(bend), widening), step)
-    pieces = [_piece(equations, _Line(fit[1][POSITION], u, short), fit[1], widening)]
+    pieces = [_piece(posterior, Line(fit[1][POSITION], u, short), fit[1], widening)]
     if ends(pieces[0].mean):
         return []
     for side in _SIDES:
-        for piece in _one_way(equations, fit, side * u, short, cost_max):
+        for piece in _one_way(posterior, fit, side * u, short, cost_max):
             if ends(piece.mean):
                 break
             pieces.append(piece)
     return pieces
 
 
-def _across(equations: Equations, state: Array) -> float:
+def _across(posterior: Posterior, state: Array) -> float:
     """The sd across at a ``state`` (n,) of the arc."""
-    return _axis(inverse(equations(state)[2]))[3]
+    return _axis(inverse(posterior.equations(state)[2]))[3]
 
 
 def _length(sd: float, across: float, bend: float, widening: float) -> float:
@@ -221,7 +213,7 @@ def _length(sd: float, across: float, bend: float, widening: float) -> float:
 
 
 def _one_way(
-    equations: Equations, fit: Fit, towards: Array, short: float, cost_max: float
+    posterior: Posterior, fit: Fit, towards: Array, short: float, cost_max: float
 ) -> Iterator[_Piece]:
     """Components along the arc that leaves a minimum ``towards`` (2,), the first of about the sd
     ``short``."""
@@ -231,10 +223,10 @@ def _one_way(
         side = 1.0 if float(u @ towards) > 0.0 else -1.0
         towards = side * u
         q = state + SPACING_SD * short * side * follows
-        cost, new, _ = _minimum(equations, _Line(q[POSITION], towards, _TIGHT * short), q)
+        cost, new, _ = posterior.minimum(q, Line(q[POSITION], towards, _TIGHT * short))
         if not math.isfinite(cost) or cost > cost_max:
             break
-        sd, u, follows, wide = _axis(inverse(equations(new)[2]))
+        sd, u, follows, wide = _axis(inverse(posterior.equations(new)[2]))
         if wide == 0.0:  # lost to rounding: the device is on top of an RSU
             break
         moved = float(np.hypot(*(new - state)[POSITION]))
@@ -242,16 +234,16 @@ def _one_way(
         widening = math.log(wide / across) / moved
         length, before = _length(sd, wide, turned / moved, widening), short
         short = min(max(length, short / _LENGTH_RATIO), short * _LENGTH_RATIO)
-        piece = _piece(equations, _Line(new[POSITION], towards, short), new, widening)
+        piece = _piece(posterior, Line(new[POSITION], towards, short), new, widening)
         share = math.log(0.5 * (before + short) / short)  # of the constant that all add up to
         yield piece._replace(log_weight=piece.log_weight + share)
         state, across = new, wide
 
 
-def _piece(equations: Equations, line: _Line, start: Array, widening: float) -> _Piece:
+def _piece(posterior: Posterior, line: Line, start: Array, widening: float) -> _Piece:
     """The product of the posterior and of a Gaussian along the arc, times their spacing. The arc
     becomes wider along the line by the share ``widening`` [1/m]: there is more of it that way."""
-    log_weight, mean, cov = _whole(_minimum(equations, line, start))
+    log_weight, mean, cov = _whole(_fit(posterior, start, line))
     pull = cov[:, POSITION] @ (widening * line.direction)
     log_weight += math.log(SPACING_SD / math.sqrt(2.0 * math.pi))
     log_weight += 0.5 * widening * float(line.direction @ pull[POSITION])

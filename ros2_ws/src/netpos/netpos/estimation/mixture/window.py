@@ -7,14 +7,21 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from netpos.estimation.compile import kernel, leaf
+from netpos.common.least_squares import GAIN_MIN, minimiser
+from netpos.estimation.compile import kernel, leaf, linked_kernel
+from netpos.estimation.factor import solve
 from netpos.estimation.measurement import VALUE, VARIANCE, is_cyclic, predict_row, wrap
-from netpos.estimation.mixture.outliers import tail_log
+from netpos.estimation.mixture.outliers import PEAK_TAIL_LOG
+from netpos.estimation.mixture.ridge import Line
 from netpos.estimation.sensors.row import group_end
 from netpos.estimation.state import X
 from netpos.messages.values import Array
 
+Indices = npt.NDArray[np.int64]
+
+_NO_LINE = Line(np.zeros(2), np.zeros(2), math.inf)
 _MOVES = ((int(X.PX), int(X.VX)), (int(X.PY), int(X.VY)), (int(X.CLOCK), int(X.DRIFT)))
 
 
@@ -39,6 +46,39 @@ class Window(NamedTuple):
     outliers: Array
 
 
+class Problem(NamedTuple):
+    """The fit of a state (n,) to a window of measurements, and to what is known beforehand: its
+    ``prior`` (n,), with the variances ``prior_var`` (n,)."""
+
+    window: Window
+    prior: Array
+    prior_var: Array
+
+    def equations(self, state: Array) -> tuple[float, Array, Array]:
+        """``normal_equations`` at ``state`` (n,)."""
+        found: tuple[float, Array, Array] = normal_equations(state, self)
+        return found
+
+    def minimum(
+        self, start: Array, line: Line | None = None, gain_min: float = GAIN_MIN
+    ) -> tuple[float, Array, Array]:
+        """Cost, state and normal matrix (n, n) of the minimum to which ``start`` (n,) leads, under
+        a ``line``, where there is one; steps end where they gain less than ``gain_min``."""
+        found: tuple[float, Array, Array] = _minimum(start, self, line or _NO_LINE, gain_min)
+        return found
+
+    def without_outliers(self) -> Problem:
+        """As it is if no measurement is an outlier."""
+        window = self.window._replace(outliers=np.zeros_like(self.window.outliers))
+        return self._replace(window=window)
+
+    def scaled(self, factor: float) -> Problem:
+        """With variances of the measurements that are ``factor`` times as large."""
+        rows = self.window.rows.copy()
+        rows[:, VARIANCE] *= factor
+        return self._replace(window=self.window._replace(rows=rows))
+
+
 @leaf
 def _moved(age_s: float, part: int, part_s: float) -> tuple[float, float]:
     """By how many seconds an acceleration of one ``part`` changes the speed at ``age_s`` <= 0, and
@@ -51,21 +91,21 @@ def _moved(age_s: float, part: int, part_s: float) -> tuple[float, float]:
 
 
 @kernel
-def normal_equations(
-    state: Array, window: Window, prior: Array, prior_var: Array
-) -> tuple[float, Array, Array]:
+def normal_equations(state: Array, problem: Problem) -> tuple[float, Array, Array]:
     """Cost, gradient (n,) and Gauss-Newton Hessian (n, n) of the fit at ``state`` (n,).
 
     A measurement costs -2 ln of its density over that of a Gaussian at its peak: d with a squared
     distance d that is small, and hardly more with any that is large, where it is an outlier. The
     Hessian has it as far as it is none.
     """
+    window, prior, prior_var = problem
     rows, n, m = window.rows, state.size, window.rows.shape[0]
     A = np.diag(1.0 / prior_var)
     difference = prior - state
     b = difference / prior_var
     cost = float((difference * b).sum())
     residual, H = _linearised(state, window)
+    named = np.empty(n, np.int64)
     start = 0
     while start < m:
         stop = group_end(rows, start)
@@ -78,13 +118,54 @@ def normal_equations(
             slope = w * residual[i]
             if residual[i] ** 2 > variance[i - start]:
                 slope += (1.0 - sound) / residual[i]
-            for a in range(n):
-                if h[a] != 0.0:  # few are not: a row names one or two of the slow errors
-                    b[a] += slope * h[a]
-                    for c in range(n):
-                        A[a, c] += w * (h[a] * h[c])
+            _add_row(h, slope, w, named, b, A)
         start = stop
+    for a in range(n):
+        for c in range(a):
+            A[c, a] = A[a, c]
     return cost, b, A
+
+
+@kernel
+def _on_line(state: Array, given: tuple[Problem, Line]) -> tuple[float, Array, Array]:
+    """``normal_equations`` with those of a Gaussian along a line."""
+    problem, line = given
+    cost, b, A = normal_equations(state, problem)
+    u, weight = line.direction, 1.0 / line.sd**2
+    off = u[0] * (line.centre[0] - state[0]) + u[1] * (line.centre[1] - state[1])
+    for i in range(2):
+        b[i] += weight * off * u[i]
+        for j in range(2):
+            A[i, j] += weight * u[i] * u[j]
+    return cost + weight * off * off, b, A
+
+
+_minimise = linked_kernel(minimiser(_on_line, solve))
+
+
+@kernel
+def _minimum(
+    start: Array, problem: Problem, line: Line, gain_min: float
+) -> tuple[float, Array, Array]:
+    found: tuple[float, Array, Array] = _minimise(start, (problem, line), gain_min)
+    return found
+
+
+@leaf
+def _add_row(h: Array, slope: float, weight: float, named: Indices, b: Array, A: Array) -> None:
+    """What a row with the derivatives ``h`` (n,) adds to the gradient and to the lower triangle
+    of the Hessian. Few are not 0: it names one or two of the slow errors. ``named`` (n,) is
+    memory."""
+    count = 0
+    for a in range(h.size):
+        if h[a] != 0.0:
+            named[count] = a
+            count += 1
+    for j in range(count):
+        a = named[j]
+        b[a] += slope * h[a]
+        for k in range(j + 1):
+            A[a, named[k]] += weight * h[a] * h[named[k]]
 
 
 @kernel
@@ -145,14 +226,17 @@ def _density_log(share: float, residual: Array, variance: Array) -> tuple[float,
     """Log density of one measurement with a ``residual`` (m,) and its ``variance`` (m,), over that
     of a Gaussian at its peak, and the probability that it is no outlier; a ``share`` of those like
     it are."""
-    sound, outlier = 0.0, 0.0
+    squared, larger = 0.0, 1.0
     for i in range(residual.size):
-        sound -= 0.5 * residual[i] ** 2 / variance[i]
-        outlier += tail_log(residual[i], math.sqrt(variance[i]))
-        outlier += 0.5 * math.log(2.0 * math.pi * variance[i])
+        normed = residual[i] ** 2 / variance[i]
+        squared += normed
+        larger *= max(normed, 1.0)
+    sound = -0.5 * squared
     if share <= 0.0:
         return sound, 1.0
-    outlier += math.log(share)
-    top = max(sound, outlier)
-    total = top + math.log(math.exp(sound - top) + math.exp(outlier - top))
-    return total, math.exp(sound - total)
+    outlier = residual.size * PEAK_TAIL_LOG + math.log(share / math.sqrt(larger))
+    if outlier < sound:
+        odds = math.exp(outlier - sound)
+        return sound + math.log1p(odds), 1.0 / (1.0 + odds)
+    odds = math.exp(sound - outlier)
+    return outlier + math.log1p(odds), odds / (1.0 + odds)

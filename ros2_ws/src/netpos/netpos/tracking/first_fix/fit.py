@@ -3,73 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from netpos.common.least_squares import minimise
 from netpos.estimation.chi_square import chi_square_bound
-from netpos.estimation.measurement import GROUP, VARIANCE
+from netpos.estimation.factor import inverse
+from netpos.estimation.measurement import GROUP
 from netpos.estimation.mixture.gaussians import Mixture
-from netpos.estimation.mixture.ridge import (
-    Fit,
-    cholesky_solve,
-    components_of,
-    inverse,
-    log_weight_of,
-    on_line,
-)
-from netpos.estimation.mixture.window import (
-    Window,
-    normal_equations,
-    outliers_of,
-    typical_scale,
-)
+from netpos.estimation.mixture.ridge import PLACE, Fit, Line, components_of, log_weight_of, on_line
+from netpos.estimation.mixture.window import Problem, Window, outliers_of, typical_scale
 from netpos.estimation.state import N_CORE
 from netpos.messages.values import Array
 
 _RELAXATIONS, _FITS = 5, 1.1
 _GRADUATION = 4.0
+_NEAR = 0.1  # squared Mahalanobis distance within which minima are one
+_ROUGH_GAIN = 1e-2  # of the cost: where a minimum is only the next one's start
 _LEAST_RISK = 1e-12
 
 
-class Problem(NamedTuple):
-    """What ``normal_equations`` takes after the state."""
+class Start(NamedTuple):
+    """A state (n,) from which to look for a minimum, and a ``line`` that keeps its position where
+    it is along that."""
 
-    window: Window
-    prior: Array
-    prior_var: Array
-
-    def equations(self, state: Array) -> tuple[float, Array, Array]:
-        """``normal_equations`` at ``state`` (n,)."""
-        found: tuple[float, Array, Array] = normal_equations(state, *self)
-        return found
-
-    def without_outliers(self) -> Problem:
-        """As it is if no measurement is an outlier."""
-        window = self.window._replace(outliers=np.zeros_like(self.window.outliers))
-        return self._replace(window=window)
-
-    def scaled(self, factor: float) -> Problem:
-        """With variances of the measurements that are ``factor`` times as large."""
-        rows = self.window.rows.copy()
-        rows[:, VARIANCE] *= factor
-        return self._replace(window=self.window._replace(rows=rows))
-
-    def sequences(self, state: Array) -> list[list[Problem]]:
-        """Two sequences of problems that end with this one; each starts where the one before it
-        ended, the first at ``state`` (n,). One begins without outliers. The other begins with
-        variances as large as the residuals at ``state``, and goes on with smaller ones (graduated
-        non-convexity: Blake and Zisserman 1987). Either may lead to an RSU beside which any
-        direction fits. Without outliers the problem is its only sequence."""
-        if not self.window.outliers.any():
-            return [[self]]
-        scale, graduated = typical_scale(state, self.window), []
-        while scale > _GRADUATION:
-            graduated.append(self.scaled(scale))
-            scale /= _GRADUATION
-        return [[self.without_outliers(), self], [*graduated, self]]
+    state: Array
+    line: Line | None = None
 
 
 class Solution(NamedTuple):
@@ -119,7 +79,7 @@ class Solution(NamedTuple):
 
     def mixture(self, is_possible: Callable[[Array], bool]) -> Mixture | None:
         """The posterior of all states; None where more of it is impossible."""
-        found = components_of(self.problem.equations, self.minima, self.constrained, is_possible)
+        found = components_of(self.problem, self.minima, self.constrained, is_possible)
         if found is None or np.logaddexp.reduce(found.log_weights) < self.nearer:
             return None
         return found._replace(log_weights=found.log_weights + self.log_odds)
@@ -153,25 +113,51 @@ class Solution(NamedTuple):
         return np.maximum([of_rows, *np.repeat(pairs, 2)], 1.0)
 
 
-def minimum(start: Array, problem: Problem, along: Array | None = None) -> Fit:
-    """Levenberg-Marquardt from ``start`` (n,): cost, state, covariance of the fit. With ``along``
-    (2,) the position in that direction stays as it is."""
-    if along is not None:
-        return on_line(problem.equations, start, along)
-    cost, state, A = minimise(problem.equations, start, cholesky_solve)
+def minimum(start: Start, problem: Problem) -> Fit:
+    """The minimum to which a start leads: cost, state, covariance of the fit."""
+    if start.line is not None:
+        return on_line(problem, start.state, start.line)
+    cost, state, A = problem.minimum(start.state)
     return cost, state, inverse(A)
 
 
-def minima(start: Array, problem: Problem, along: Array | None = None) -> list[Fit]:
-    """Each ``minimum`` to which one of the ``problem.sequences`` leads from ``start`` (n,)."""
-    found = []
-    for sequence in problem.sequences(start):
-        state = start
-        for step in sequence:
-            fit = minimum(state, step, along)
-            state = fit[1]
-        found.append(fit)
-    return found
+def sequences(problem: Problem, state: Array) -> list[list[Problem]]:
+    """Two sequences of problems that end with this one; each starts where the one before it
+    ended, the first at ``state`` (n,). One begins without outliers. The other begins with
+    variances as large as the residuals at ``state``, and goes on with smaller ones (graduated
+    non-convexity: Blake and Zisserman 1987). Either may lead to an RSU beside which any
+    direction fits. Without outliers the problem is its only sequence."""
+    if not problem.window.outliers.any():
+        return [[problem]]
+    scale, graduated = typical_scale(state, problem.window), []
+    while scale > _GRADUATION:
+        graduated.append(problem.scaled(scale))
+        scale /= _GRADUATION
+    return [[problem.without_outliers(), problem], [*graduated, problem]]
+
+
+def minima(starts: Sequence[Start], problem: Problem) -> list[Fit]:
+    """Each ``minimum`` to which one of the ``sequences`` leads from one of the starts; of those
+    that end within a third of a standard deviation of each other the best."""
+    ends: list[tuple[float, Start, Array]] = []
+    for state, line in starts:
+        for sequence in sequences(problem, state):
+            end = state
+            for step in sequence:
+                cost, end, A = step.minimum(end, line, _ROUGH_GAIN)
+            ends.append((cost, Start(end, line), A))
+    different: list[tuple[Start, Array]] = []
+    for _, found, A in sorted(ends, key=lambda end: end[0]):
+        if not any(_is_near(found.state, other.state, cov) for other, cov in different):
+            different.append((found, inverse(A)))
+    return [minimum(start, problem) for start, _ in different]
+
+
+def _is_near(state: Array, other: Array, cov: Array) -> bool:
+    """Whether place and velocity of a ``state`` (n,) are near those of the ``other``, of the
+    covariance ``cov`` (n, n)."""
+    away = state[PLACE] - other[PLACE]
+    return bool(away @ inverse(cov[PLACE, PLACE]) @ away < _NEAR)
 
 
 def is_sound(fit: Fit) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from netpos.estimation.measurement import AXES, BIAS, KIND, ORIGIN, REFERENCE, VARIANCE, Kind
-from netpos.estimation.mixture.window import Window
+from netpos.estimation.mixture.window import Problem
 from netpos.messages.values import Array
 
 Flags = npt.NDArray[np.bool_]
@@ -29,12 +29,10 @@ _SAME_M = 1e-3  # RSUs nearer to each other are one
 
 
 class Case(NamedTuple):
-    """A fit as it is if one RSU is wrong: what ``normal_equations`` takes after the state, and the
-    log odds of that with the log density of the errors it may have, where they are 0."""
+    """A fit as it is if one RSU is wrong, and the log odds of that with the log density of the
+    errors it may have, where they are 0."""
 
-    window: Window
-    prior: Array
-    prior_var: Array
+    problem: Problem
     log_odds: float
 
 
@@ -44,9 +42,9 @@ def placed(rows: Array) -> Flags:
     return there
 
 
-def cases(window: Window, prior: Array, prior_var: Array) -> Iterator[Case]:
-    """The fit of ``window`` under ``prior`` (n,), of variances ``prior_var`` (n,), once for each
-    RSU that may be wrong; of fewer than three RSUs none."""
+def cases(problem: Problem) -> Iterator[Case]:
+    """The fit once for each RSU that may be wrong; of fewer than three RSUs none."""
+    window, prior, prior_var = problem
     references = _references(window.rows)
     own = placed(window.rows)
     origins = window.rows[:, ORIGIN : ORIGIN + 2]
@@ -69,7 +67,7 @@ def cases(window: Window, prior: Array, prior_var: Array) -> Iterator[Case]:
                 rows[alike, column] = len(states)
                 states, variances = np.append(states, 0.0), np.append(variances, variance)
                 log_odds -= 0.5 * math.log(2.0 * math.pi * variance)
-        yield Case(window._replace(rows=rows), states, variances, log_odds)
+        yield Case(Problem(window._replace(rows=rows), states, variances), log_odds)
 
 
 def _references(rows: Array) -> Array:

@@ -96,10 +96,15 @@ class Rsu:
         """Reason to refuse a phase difference of this RSU."""
         return None if self.info.baseline_m > 0.0 else "no_baseline"
 
+    @property
+    def has_no_back(self) -> bool:
+        """Whether devices are taken to be in front of its array: neither a CONE array nor two
+        antennas tell front from back."""
+        return self.cone or self.info.baseline_m > 0.0
+
     def in_front(self, dx: float, dy: float) -> bool:
-        """Whether a horizontal offset from the RSU is one its array can see: neither a CONE array
-        nor two antennas tell front from back."""
-        if not self.cone and not self.info.baseline_m:
+        """Whether a horizontal offset from the RSU is one its array can see."""
+        if not self.has_no_back:
             return True
         return bool(self.axes[0] * dx + self.axes[1] * dy >= 0.0)
 
