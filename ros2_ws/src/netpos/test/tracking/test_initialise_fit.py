@@ -211,18 +211,6 @@ def test_a_line_keeps_the_distance_and_what_is_across_is_fitted() -> None:
     assert math.sqrt([0.6, 0.8] @ cov[:2, :2] @ [0.6, 0.8]) > 100.0  # without the line
 
 
-def test_starts_that_lead_to_one_place_give_one_minimum() -> None:
-    """Two ranges: the two places they fit, from however many starts."""
-    stations = [rsu(0, 0), rsu(40, 0)]
-    rows = np.vstack([measure(s, at(25.0, 18.0), Field.RANGE) for s in stations])
-    prior_var = np.array([150.0**2, 150.0**2, 25.0, 25.0, 1e4, 1e4])
-    problem = problem_of(rows, np.array([20.0, 0, 0, 0, 0, 0]), prior_var)
-    rng = np.random.default_rng(5)
-    found = minima([Start(still(*rng.uniform(-60, 60, 2))) for _ in range(30)], problem)
-    places = [fit[1][:2] for fit in sorted(found, key=lambda fit: float(fit[1][1]))]
-    np.testing.assert_allclose(places, [[25.0, -18.0], [25.0, 18.0]], atol=0.1)
-
-
 @pytest.mark.parametrize("start", [(-59.4, 38.5), (43.2, 50.2), (22.7, 41.0), (-5.2, 57.1)])
 def test_a_step_uphill_is_tried_again_shorter(start: tuple[float, float]) -> None:
     """Two bearings from afar: the first step overshoots."""

@@ -12,15 +12,13 @@ from netpos.estimation.chi_square import chi_square_bound
 from netpos.estimation.factor import inverse
 from netpos.estimation.measurement import GROUP
 from netpos.estimation.mixture.gaussians import Mixture
-from netpos.estimation.mixture.ridge import PLACE, Fit, Line, components_of, log_weight_of, on_line
+from netpos.estimation.mixture.ridge import Fit, Line, components_of, log_weight_of, on_line
 from netpos.estimation.mixture.window import Problem, Window, outliers_of, typical_scale
 from netpos.estimation.state import N_CORE
 from netpos.messages.values import Array
 
 _RELAXATIONS, _FITS = 5, 1.1
 _GRADUATION = 4.0
-_NEAR = 0.1  # squared Mahalanobis distance within which minima are one
-_ROUGH_GAIN = 1e-2  # of the cost: where a minimum is only the next one's start
 _LEAST_RISK = 1e-12
 
 
@@ -69,6 +67,12 @@ class Solution(NamedTuple):
     def misfit(self) -> float:
         """Cost for each row where it is more than the 1 of true measurements, or 1."""
         return max(1.0, self.cost / len(self.problem.window.rows))
+
+    @property
+    def excess(self) -> float:
+        """Cost for each row that the states of the fit do not take up."""
+        taken = self.problem.prior.size - N_CORE
+        return self.cost / max(len(self.problem.window.rows) - taken, 1)
 
     def is_consistent(self, risk: float) -> bool:
         """Whether the cost of the best is one that true measurements have, with as many outliers
@@ -137,27 +141,16 @@ def sequences(problem: Problem, state: Array) -> list[list[Problem]]:
 
 
 def minima(starts: Sequence[Start], problem: Problem) -> list[Fit]:
-    """Each ``minimum`` to which one of the ``sequences`` leads from one of the starts; of those
-    that end within a third of a standard deviation of each other the best."""
-    ends: list[tuple[float, Start, Array]] = []
-    for state, line in starts:
-        for sequence in sequences(problem, state):
-            end = state
+    """Each ``minimum`` to which one of the ``sequences`` leads from one of the starts."""
+    found = []
+    for start in starts:
+        for sequence in sequences(problem, start.state):
+            there = start
             for step in sequence:
-                cost, end, A = step.minimum(end, line, _ROUGH_GAIN)
-            ends.append((cost, Start(end, line), A))
-    different: list[tuple[Start, Array]] = []
-    for _, found, A in sorted(ends, key=lambda end: end[0]):
-        if not any(_is_near(found.state, other.state, cov) for other, cov in different):
-            different.append((found, inverse(A)))
-    return [minimum(start, problem) for start, _ in different]
-
-
-def _is_near(state: Array, other: Array, cov: Array) -> bool:
-    """Whether place and velocity of a ``state`` (n,) are near those of the ``other``, of the
-    covariance ``cov`` (n, n)."""
-    away = state[PLACE] - other[PLACE]
-    return bool(away @ inverse(cov[PLACE, PLACE]) @ away < _NEAR)
+                fit = minimum(there, step)
+                there = start._replace(state=fit[1])
+            found.append(fit)
+    return found
 
 
 def is_sound(fit: Fit) -> bool:

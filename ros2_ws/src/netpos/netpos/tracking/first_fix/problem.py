@@ -27,6 +27,7 @@ from netpos.estimation.measurement import (
 from netpos.estimation.mixture.outliers import share_of_outliers
 from netpos.estimation.mixture.window import Problem, Window
 from netpos.estimation.motion import SPEED_OF_LIGHT_MPS
+from netpos.estimation.sensors.table import BY_KIND
 from netpos.estimation.state import N_CORE
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
@@ -36,6 +37,8 @@ _LEAST_SPAN_S = 0.1  # of a window
 _PART_S, _PARTS_MAX = 0.75, 8  # of the window, in which accelerations are constant
 _TELLING = 3  # values of an RSU, of which one can be told to be an outlier
 _LEAST_SD = 1e-9  # of a slow error
+_ANY_WALK_S = 1e-5  # by which a clock is off its line within a window
+_INSTANTS = 30  # at which the clock is free: each is a state of the fit
 _ANYWHERE_M = 1e6  # of a fix without RSUs
 
 
@@ -58,6 +61,24 @@ def stacked(heard: Collection[Heard], slow: SlowErrors) -> tuple[Array, Array, A
     measurements = np.column_stack([ages_s, rows[:, GROUP]])
     rows[:, GROUP] = np.unique(measurements, axis=0, return_inverse=True)[1].reshape(-1)
     return rows, ages_s, _name_states_of_fit(rows, ages_s, slow)
+
+
+def with_free_clock(rows: Array, ages_s: Array, errors_sd: Array) -> tuple[Array, Array, Array]:
+    """The same as ``stacked`` gives it if the clock of the device is anything at each instant: an
+    error of all times of that instant. Where there are many instants the times of some of them
+    are left out. Empty rows where no two RSUs hear the device at one instant: times say nothing
+    then."""
+    timed = np.flatnonzero([BY_KIND[int(kind)].has_clock for kind in rows[:, KIND]])
+    instants, which = np.unique(ages_s[timed], return_inverse=True)
+    if instants.size == timed.size:
+        return rows[:0], ages_s[:0], errors_sd
+    every = math.ceil(instants.size / _INSTANTS)
+    keep, own = np.ones(len(rows), bool), which.reshape(-1) // every
+    keep[timed] = which.reshape(-1) % every == 0
+    rows = rows.copy()
+    rows[timed, REFERENCE] = N_CORE + errors_sd.size + own
+    free = np.full(int(own.max()) + 1, SPEED_OF_LIGHT_MPS * _ANY_WALK_S)
+    return rows[keep], ages_s[keep], np.append(errors_sd, free)
 
 
 def problem_of(

@@ -28,13 +28,14 @@ from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimators.models import slow_states, state_of_fit
 from netpos.tracking.first_fix import wrong_rsu
 from netpos.tracking.first_fix.fit import Solution, Start, is_sound, minima
-from netpos.tracking.first_fix.problem import Heard, problem_of, stacked
+from netpos.tracking.first_fix.problem import Heard, problem_of, stacked, with_free_clock
 from netpos.tracking.first_fix.starts import clock_at, starts_of
 from netpos.tracking.first_fix.surroundings import NEAREST_M, Surroundings
 from netpos.tracking.rsus.rsu import SlowErrors
 
 _REFINED = 12  # starts
 _ANY_CLOCK_S = 1.0
+_MOST = 0.5  # of what measurements contradict
 _CONTRADICTS = 9.0  # mean squared residual over variance
 
 
@@ -81,8 +82,8 @@ class WindowFit:
         grossly: what the others say is a part of the posterior. Where the measurements
         contradict each other and leaving out one RSU makes them agree, the fix is that of
         the others. Otherwise another clock offset may make them agree: the declared one is
-        that of a device just switched on. Where nothing does, they are less certain than
-        stated.
+        that of a device just switched on; or it walks as nobody knows. Where nothing does, they
+        are less certain than stated.
         """
         nowhere = f"no place in front of the RSUs fits {self.heard}"
         agreed = self._solution(self._problem())
@@ -90,7 +91,7 @@ class WindowFit:
             return nowhere
         solutions, agrees = [agreed], agreed.is_consistent(self._risk)
         if not agrees:
-            solutions = self._that_agree() or self._without_outliers(agreed)
+            solutions = self._that_agree() or [self._least_contradicting(agreed)]
         misfit = solutions[0].misfit
         if misfit > 1.0:
             lasting = N_CORE + int(self._slow.lasts.sum())
@@ -134,10 +135,23 @@ class WindowFit:
         RSUs, or else with another clock; none where there are none."""
         return self._without_one() or self._any_clock()
 
-    def _without_outliers(self, solution: Solution) -> list[Solution]:
-        """The solution if none of the measurements is an outlier: none where they contradict each
-        other is."""
-        return [self._solution(solution.problem.without_outliers()) or solution]
+    def _least_contradicting(self, agreed: Solution) -> Solution:
+        """Of measurements that contradict each other the solution whose clock walks as nobody
+        knows, if that explains them, or most of what they contradict. Or else the one that
+        ``agreed`` on one clock. None of them is an outlier then: none is where they contradict
+        each other."""
+        walking = self._any_walk()
+        if walking is not None and walking.is_consistent(self._risk):
+            return walking
+        plain = self._without_outliers(agreed)
+        if walking is None:
+            return plain
+        walking = self._without_outliers(walking)
+        return walking if walking.excess < _MOST * plain.excess else plain
+
+    def _without_outliers(self, solution: Solution) -> Solution:
+        """The solution if none of the measurements is an outlier."""
+        return self._solution(solution.problem.without_outliers()) or solution
 
     def _without_one(self) -> list[Solution]:
         """Solutions with a consistent fit without one of the RSUs, best first; none of fewer than
@@ -165,6 +179,16 @@ class WindowFit:
         problem.prior_var[4] = (SPEED_OF_LIGHT_MPS * _ANY_CLOCK_S) ** 2
         found = self._solution(problem)
         return [found] if found and found.is_consistent(self._risk) else []
+
+    def _any_walk(self) -> Solution | None:
+        """The solution whatever the clock offset is at each instant; None where it is known how
+        the clock walks, or where no two RSUs hear the device at one instant."""
+        if self._config.clock_walk_density > 0.0:
+            return None
+        rows, ages_s, errors_sd = with_free_clock(self._rows, self._ages_s, self._errors_sd)
+        if not len(rows):
+            return None
+        return self._solution(problem_of(self._config, self._rsus, rows, ages_s, errors_sd))
 
     def _one_errs(self, problem: Problem) -> list[Solution]:
         """Solutions in which one of the RSUs errs grossly, of at least three."""
