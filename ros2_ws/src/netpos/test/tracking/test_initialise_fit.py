@@ -226,6 +226,25 @@ def test_a_step_uphill_is_tried_again_shorter(start: tuple[float, float]) -> Non
     np.testing.assert_allclose(state[:2], [25.0, 18.0], atol=1.0)
 
 
+def test_one_rsu_and_an_unknown_clock_leave_the_distance_open() -> None:
+    """Three seconds of a walk in front of one RSU: the cost is nearly the same from 1 m before it
+    to 40 m away, where the device is. Solvers stop in this flat valley, and the cheapest place of
+    those where they do is 1.4 m from the RSU, with an sd of 2.7 m."""
+    station = rsu(24.6716473, 0.0822178)
+    azimuths = [-2.757215, -2.793667, -2.878833, -2.810284, -2.872668, -2.858685, -2.884354]
+    times_m = [-153.73055, -159.16988, -164.42721, -168.25301, -171.93788, -175.39257, -180.2176]
+    initialiser = Initialiser(
+        TrackerConfig(accel_density_mps2_sqrthz=0.6, initial_speed_sd_mps=1.5)
+    )
+    for k, values in enumerate(zip(azimuths, times_m, strict=True)):
+        rows = measure(station, at(0.0, 0.0), Field.AZIMUTH | Field.TOA)
+        rows[:, VALUE], rows[:, VARIANCE], rows[:, BIAS] = values, [0.00246586, 0.18213588], [6, 7]
+        initialiser.add(T0 + k * 500_000_000, rows, (station,))
+    slow = SlowErrors(6, np.array([0.04240559, 0.36444918]), np.array([True, True]))
+    assert initialiser.solve(slow) is None
+    assert "another RSU or quantity is needed" in initialiser.missing
+
+
 def test_starts_lie_where_the_measurements_point() -> None:
     centre = np.array([1.0, 2.0])
     turned = rsu(10, 20, 90)
