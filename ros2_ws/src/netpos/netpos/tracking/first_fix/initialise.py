@@ -85,7 +85,7 @@ class Initialiser:
         span_s = (newest - self._window[0].stamp_ns) * 1e-9
         is_new = span_s < _WAITS_SHARE * self._config.initial_window_s
         if (is_new or not carries_modes(self._config)) and has_modes(found, _MODE_SHARE):
-            self.missing = f"more than one place fits {fit.heard}; waiting for more"
+            self.missing = f"more than one place fits {fit.sources}; waiting for more"
             return None
         return found
 

@@ -63,15 +63,16 @@ def stacked(heard: Collection[Heard], slow: SlowErrors) -> tuple[Array, Array, A
     return rows, ages_s, _name_states_of_fit(rows, ages_s, slow)
 
 
-def with_free_clock(rows: Array, ages_s: Array, errors_sd: Array) -> tuple[Array, Array, Array]:
+def with_free_clock(
+    rows: Array, ages_s: Array, errors_sd: Array
+) -> tuple[Array, Array, Array] | None:
     """The same as ``stacked`` gives it if the clock of the device is anything at each instant: an
     error of all times of that instant. Where there are many instants the times of some of them
-    are left out. Empty rows where no two RSUs hear the device at one instant: times say nothing
-    then."""
+    are left out. None where no two RSUs hear the device at one instant: times say nothing then."""
     timed = np.flatnonzero([BY_KIND[int(kind)].has_clock for kind in rows[:, KIND]])
     instants, which = np.unique(ages_s[timed], return_inverse=True)
     if instants.size == timed.size:
-        return rows[:0], ages_s[:0], errors_sd
+        return None
     every = math.ceil(instants.size / _INSTANTS)
     keep, own = np.ones(len(rows), bool), which.reshape(-1) // every
     keep[timed] = which.reshape(-1) % every == 0

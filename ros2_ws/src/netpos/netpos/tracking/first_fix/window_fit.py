@@ -35,7 +35,7 @@ from netpos.tracking.rsus.rsu import SlowErrors
 
 _REFINED = 12  # starts
 _ANY_CLOCK_S = 1.0
-_MOST = 0.5  # of what measurements contradict
+_LEFT = 0.5  # of what measurements contradict, where a clock that walks explains most of it
 _CONTRADICTS = 9.0  # mean squared residual over variance
 
 
@@ -67,7 +67,7 @@ class WindowFit:
         self._risk = 1.0 - config.gate_probability
 
     @property
-    def heard(self) -> str:
+    def sources(self) -> str:
         """What was measured, by whom, for people."""
         kinds = sorted({BY_KIND[int(kind)].name for kind in self._rows[:, KIND]})
         rsus = sorted({rsu.info.rsu_id for rsu in self._rsus})
@@ -85,7 +85,7 @@ class WindowFit:
         that of a device just switched on; or it walks as nobody knows. Where nothing does, they
         are less certain than stated.
         """
-        nowhere = f"no place in front of the RSUs fits {self.heard}"
+        nowhere = f"no place in front of the RSUs fits {self.sources}"
         agreed = self._solution(self._problem())
         if agreed is None:
             return nowhere
@@ -147,7 +147,7 @@ class WindowFit:
         if walking is None:
             return plain
         walking = self._without_outliers(walking)
-        return walking if walking.excess < _MOST * plain.excess else plain
+        return walking if walking.excess < _LEFT * plain.excess else plain
 
     def _without_outliers(self, solution: Solution) -> Solution:
         """The solution if none of the measurements is an outlier."""
@@ -185,10 +185,10 @@ class WindowFit:
         the clock walks, or where no two RSUs hear the device at one instant."""
         if self._config.clock_walk_density > 0.0:
             return None
-        rows, ages_s, errors_sd = with_free_clock(self._rows, self._ages_s, self._errors_sd)
-        if not len(rows):
+        free = with_free_clock(self._rows, self._ages_s, self._errors_sd)
+        if free is None:
             return None
-        return self._solution(problem_of(self._config, self._rsus, rows, ages_s, errors_sd))
+        return self._solution(problem_of(self._config, self._rsus, *free))
 
     def _one_errs(self, problem: Problem) -> list[Solution]:
         """Solutions in which one of the RSUs errs grossly, of at least three."""
@@ -206,12 +206,12 @@ class WindowFit:
         limit_m = self._config.initial_position_sd_max_m
         if sd_m > limit_m and misfit < _CONTRADICTS:
             return (
-                f"{self.heard} leave a position sd of {sd_m:.1f} m "
+                f"{self.sources} leave a position sd of {sd_m:.1f} m "
                 f"(initial_position_sd_max_m: {limit_m:g}); another RSU or quantity is needed"
             )
         if sd_m > limit_m:
             return (
-                f"{self.heard} contradict each other by {math.sqrt(misfit):.3g} sd; are"
+                f"{self.sources} contradict each other by {math.sqrt(misfit):.3g} sd; are"
                 " they in m, rad and s, and the RSUs where RsuInfo says?"
             )
         return ""
