@@ -13,27 +13,26 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
-Minimise = Callable[[Array, Any, float], tuple[float, Array, Array]]
+Minimise = Callable[[Array, Any], tuple[float, Array, Array]]
 
 _ITERATIONS = 100
 _DAMPING, _DAMPING_MIN, _DAMPING_MAX = 1e-3, 1e-12, 1e8
-GAIN_MIN = 1e-6
-"""By which share of the cost, beside 1, a step has to lower it for another one to follow."""
+_GAIN_MIN = 1e-6  # of the cost, beside 1
 
 
 def minimiser(
     equations: Callable[[Array, Any], tuple[float, Array, Array]],
     solve: Callable[..., Array],
 ) -> Minimise:
-    """A function ``minimise(start, given, gain_min)`` that returns cost, state (n,) and normal
-    matrix (n, n) where the cost no longer falls, or by less than ``gain_min``.
+    """A function ``minimise(start, given)`` that returns cost, state (n,) and normal matrix (n, n)
+    where the cost no longer falls.
 
     equations : cost r'r, J'r (n,) and J'J (n, n) of the residuals r = z - h(state), J = dh/dstate,
         at a state (n,), by what is ``given`` beside it
     solve : x of A x = b by (A, b), for A (n, n) positive definite; what it raises is passed on
     """
 
-    def minimise(start: Array, given: Any, gain_min: float) -> tuple[float, Array, Array]:
+    def minimise(start: Array, given: Any) -> tuple[float, Array, Array]:
         state, damping = start, _DAMPING
         cost, b, A = equations(state, given)
         for _ in range(_ITERATIONS):
@@ -43,7 +42,7 @@ def minimiser(
             tried = state + solve(damped, b)
             new_cost, new_b, new_A = equations(tried, given)
             if new_cost < cost:
-                done = cost - new_cost < gain_min * (1.0 + cost)
+                done = cost - new_cost < _GAIN_MIN * (1.0 + cost)
                 state, cost, b, A = tried, new_cost, new_b, new_A
                 damping = max(damping / 10.0, _DAMPING_MIN)
                 if done:

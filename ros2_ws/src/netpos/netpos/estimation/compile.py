@@ -45,7 +45,7 @@ link: Callable[..., Any] = njit(
     error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True
 )
 
-# A closure made at import that allocates, as such part of the callers that are cached.
+# The same for a closure that allocates. It is called, and kept with the callers that are cached.
 linked_kernel: Callable[..., Any] = njit(error_model="numpy", _nrt=True, forceinline=False)
 
 

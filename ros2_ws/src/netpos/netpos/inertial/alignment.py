@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from netpos.common.least_squares import GAIN_MIN, minimiser
+from netpos.common.least_squares import minimiser
 from netpos.inertial.attitude import GRAVITY_MPS2
 
 Array = npt.NDArray[np.float64]
@@ -175,7 +175,7 @@ def _fit(
     speed = max(float(np.linalg.norm(position[-1] - position[0])) / span, 0.0)
     start = np.array([*position[0], heading, speed, 0.0])
     try:
-        cost, x, normal = _minimise(start, (way, position, root), GAIN_MIN)
+        cost, x, normal = _minimise(start, (way, position, root))
     except np.linalg.LinAlgError:
         return None
     scale = np.sqrt(np.diag(normal))

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from netpos.common.least_squares import GAIN_MIN, minimiser
+from netpos.common.least_squares import minimiser
 from netpos.estimation.factor import inverse, solve
 from netpos.estimation.mixture.gaussians import Mixture
 from netpos.estimation.mixture.ridge import Fit, Line, across, components_of, on_line
@@ -34,10 +34,8 @@ class Density:
         off = float(line.direction @ (line.centre - state[:2])) / line.sd
         return cost + off**2, b + off / line.sd * u, A + np.outer(u, u) / line.sd**2
 
-    def minimum(
-        self, start: Array, line: Line | None = None, gain_min: float = GAIN_MIN
-    ) -> tuple[float, Array, Array]:
-        return self._minimise(start, line, gain_min)
+    def minimum(self, start: Array, line: Line | None = None) -> tuple[float, Array, Array]:
+        return self._minimise(start, line)
 
 
 def ranges(seed: int, anchors: Array = ANCHORS) -> tuple[Array, Array]:

@@ -16,9 +16,6 @@ _FARTHEST = 1e3  # standard deviations
 TAIL_LOG = -math.log(2.0 * (1.0 + math.log(_FARTHEST)))
 """Log density of such an error, times its size: each octave is as likely."""
 
-PEAK_TAIL_LOG = TAIL_LOG + 0.5 * math.log(2.0 * math.pi)
-"""Log density of an error up to one standard deviation over that of a Gaussian at its peak."""
-
 
 @leaf
 def share_of_outliers(row: Array) -> float:
@@ -28,10 +25,10 @@ def share_of_outliers(row: Array) -> float:
 
 
 @leaf
-def tail_log(error: float, sd: float) -> float:
-    """Log density of the ``error`` of an outlier: beyond ``sd`` each octave is as likely, up to it
-    every error."""
-    return TAIL_LOG - math.log(max(abs(error), sd))
+def tail_log(squared: float, variance: float) -> float:
+    """Log density of the error of an outlier, by its square: beyond one standard deviation each
+    octave is as likely, up to it every error."""
+    return TAIL_LOG - 0.5 * math.log(max(squared, variance))
 
 
 @kernel
@@ -41,5 +38,5 @@ def outlier_log(rows: Array, predicted: PredictedRows, start: int, stop: int) ->
     total = math.log(share_of_outliers(rows[start]))
     for i in range(start, stop):
         known = predicted.prior_var[i] + predicted.second_order_var[i]
-        total += tail_log(predicted.innovation[i], math.sqrt(rows[i, GATE_VARIANCE] + known))
+        total += tail_log(predicted.innovation[i] ** 2, rows[i, GATE_VARIANCE] + known)
     return total

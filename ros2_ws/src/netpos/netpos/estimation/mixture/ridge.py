@@ -19,7 +19,6 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from netpos.common.least_squares import GAIN_MIN
 from netpos.estimation.factor import inverse
 from netpos.estimation.mixture.gaussians import CURVATURE_SHARE, SPACING_SD, Mixture
 from netpos.estimation.state import POSITION, VELOCITY
@@ -43,11 +42,9 @@ class Posterior(Protocol):
     def equations(self, state: Array) -> tuple[float, Array, Array]:
         """Cost, gradient (n,) and normal matrix (n, n) at a state."""
 
-    def minimum(
-        self, start: Array, line: Line | None = None, gain_min: float = GAIN_MIN
-    ) -> tuple[float, Array, Array]:
-        """Least cost from ``start`` (n,), that of a ``line`` included, where it is, and the normal
-        matrix there; steps end where they gain less than ``gain_min``."""
+    def minimum(self, start: Array, line: Line | None = None) -> tuple[float, Array, Array]:
+        """Cost, state and normal matrix (n, n) of the minimum to which ``start`` (n,) leads, with
+        those of a ``line``, where there is one."""
 
 
 # A cost one sd away that differs by so much from the one of a Gaussian (1) shifts the mean by 1.5
@@ -60,9 +57,7 @@ _COST_MAX = 37.0  # twice the log of the least weight of a component
 _PIECES_MAX = 32  # one way from the most probable point
 _SAME2 = 9.0  # squared Mahalanobis distance within which a minimum belongs to a component
 _SIDES = (-1.0, 1.0)
-
-PLACE = slice(POSITION.start, VELOCITY.stop)
-"""The states by which minima and components are told apart."""
+_PLACE = slice(POSITION.start, VELOCITY.stop)
 
 
 class _Piece(NamedTuple):
@@ -143,8 +138,8 @@ def _whole(fit: Fit) -> _Piece:
 def _is_known(state: Array, pieces: Sequence[_Piece]) -> bool:
     """Whether a minimum lies within a component there is."""
     for piece in pieces:
-        away = state[PLACE] - piece.mean[PLACE]
-        if float(away @ inverse(piece.cov[PLACE, PLACE]) @ away) < _SAME2:
+        away = state[_PLACE] - piece.mean[_PLACE]
+        if float(away @ inverse(piece.cov[_PLACE, _PLACE]) @ away) < _SAME2:
             return True
     return False
 

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from netpos.common.least_squares import GAIN_MIN, minimiser
+from netpos.common.least_squares import minimiser
 from netpos.estimation.compile import kernel, leaf, linked_kernel
 from netpos.estimation.factor import solve
 from netpos.estimation.measurement import VALUE, VARIANCE, is_cyclic, predict_row, wrap
-from netpos.estimation.mixture.outliers import PEAK_TAIL_LOG
+from netpos.estimation.mixture.outliers import tail_log
 from netpos.estimation.mixture.ridge import Line
 from netpos.estimation.sensors.row import group_end
 from netpos.estimation.state import X
@@ -21,6 +21,7 @@ from netpos.messages.values import Array
 
 Indices = npt.NDArray[np.int64]
 
+_PEAK_LOG = -0.5 * math.log(2.0 * math.pi)  # of a Gaussian of variance 1
 _NO_LINE = Line(np.zeros(2), np.zeros(2), math.inf)
 _MOVES = ((int(X.PX), int(X.VX)), (int(X.PY), int(X.VY)), (int(X.CLOCK), int(X.DRIFT)))
 
@@ -59,12 +60,10 @@ class Problem(NamedTuple):
         found: tuple[float, Array, Array] = normal_equations(state, self)
         return found
 
-    def minimum(
-        self, start: Array, line: Line | None = None, gain_min: float = GAIN_MIN
-    ) -> tuple[float, Array, Array]:
-        """Cost, state and normal matrix (n, n) of the minimum to which ``start`` (n,) leads, under
-        a ``line``, where there is one; steps end where they gain less than ``gain_min``."""
-        found: tuple[float, Array, Array] = _minimum(start, self, line or _NO_LINE, gain_min)
+    def minimum(self, start: Array, line: Line | None = None) -> tuple[float, Array, Array]:
+        """Cost, state and normal matrix (n, n) of the minimum to which ``start`` (n,) leads, with
+        those of a ``line``, where there is one."""
+        found: tuple[float, Array, Array] = _minimum(start, self, line or _NO_LINE)
         return found
 
     def without_outliers(self) -> Problem:
@@ -144,10 +143,8 @@ _minimise = linked_kernel(minimiser(_on_line, solve))
 
 
 @kernel
-def _minimum(
-    start: Array, problem: Problem, line: Line, gain_min: float
-) -> tuple[float, Array, Array]:
-    found: tuple[float, Array, Array] = _minimise(start, (problem, line), gain_min)
+def _minimum(start: Array, problem: Problem, line: Line) -> tuple[float, Array, Array]:
+    found: tuple[float, Array, Array] = _minimise(start, (problem, line))
     return found
 
 
@@ -226,15 +223,14 @@ def _density_log(share: float, residual: Array, variance: Array) -> tuple[float,
     """Log density of one measurement with a ``residual`` (m,) and its ``variance`` (m,), over that
     of a Gaussian at its peak, and the probability that it is no outlier; a ``share`` of those like
     it are."""
-    squared, larger = 0.0, 1.0
+    sound = 0.0
     for i in range(residual.size):
-        normed = residual[i] ** 2 / variance[i]
-        squared += normed
-        larger *= max(normed, 1.0)
-    sound = -0.5 * squared
+        sound -= 0.5 * residual[i] ** 2 / variance[i]
     if share <= 0.0:
         return sound, 1.0
-    outlier = residual.size * PEAK_TAIL_LOG + math.log(share / math.sqrt(larger))
+    outlier = math.log(share)
+    for i in range(residual.size):
+        outlier += tail_log(residual[i] ** 2 / variance[i], 1.0) - _PEAK_LOG
     if outlier < sound:
         odds = math.exp(outlier - sound)
         return sound + math.log1p(odds), 1.0 / (1.0 + odds)
