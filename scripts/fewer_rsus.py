@@ -1,12 +1,16 @@
-"""Leave each RSU out of the recordings in turn, thin them, and begin them later: ``python
-scripts/fewer_rsus.py [RECORDING…] [--workers N] [--json FILE]``.
+"""Leave each RSU out of the recordings in turn, and two of four; thin them, begin them later, and
+run them backwards: ``python scripts/fewer_rsus.py [RECORDING…] [--parts WORD…] [--workers N]
+[--json FILE]``.
 
 Nothing is tuned for these networks; without one of four anchors on a car the three that are left
-may stand in one line, whose two sides nothing tells apart. Printed for each: the share of the
-estimates that are TRACKING, how often the state changes, their RMSE and largest error [m], their
-median level [m], how many errors are above it, the largest error over its level, and the RMSE [m]
-of the plain Kalman filter at the same stamps from the same measurements. The misses come first.
-The file has the parts of each recording together, and one by one.
+may stand in one line, whose two sides nothing tells apart, and two anchors have two sides always.
+A recording that runs backwards is another one: other beginnings, other ends of each silence, other
+errors to be learned before others. Printed for each part, or those that begin with one of the
+``--parts``: the share of the estimates that are TRACKING, how often the state changes, their RMSE
+and largest error [m], their median level [m], how many errors are above it, the largest error over
+its level, and the RMSE [m] of the plain Kalman filter at the same stamps from the same
+measurements. The misses come first. The file has the parts of each recording together, and one by
+one.
 """
 
 from __future__ import annotations
@@ -15,10 +19,11 @@ import argparse
 import json
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
-from itertools import pairwise
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +36,8 @@ from netpos.messages.values import RsuMeasurement, TrackState
 from real_data import DATA, Source, sources
 
 SHARES, BEGINNINGS, SEED = (0.5, 0.8), (0.1, 0.25, 0.4, 0.55, 0.7), 1
+BACKWARDS = (0.0, 0.35, 0.7)  # how much of it is left out
+HALVED = 4  # RSUs of a network of which two are left out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,22 +57,63 @@ class Row:
     plain_m: float | None = None
 
 
+def without(material: Material, left_out: Collection[str]) -> Material:
+    """The same without what some RSUs measured, or measured against."""
+    kept = [
+        item
+        for item in material.items
+        if not isinstance(item, RsuMeasurement)
+        or (item.rsu_id not in left_out and item.reference_rsu_id not in left_out)
+    ]
+    return replace(material, items=kept)
+
+
+def later(material: Material, share: float) -> Material:
+    """The same from ``share`` of its time on."""
+    first, last = material.items[0].stamp_ns, material.items[-1].stamp_ns
+    begin_ns = first + round(share * (last - first))
+    return replace(material, items=[item for item in material.items if item.stamp_ns > begin_ns])
+
+
+def backwards(material: Material) -> Material:
+    """What the RSUs measured, and the truth, from the last to the first, stamped as from the first
+    to the last."""
+    measured = [item for item in material.items if isinstance(item, RsuMeasurement)]
+    both_ns = measured[0].stamp_ns + measured[-1].stamp_ns
+    truth = {
+        vue: [replace(odometry, stamp_ns=both_ns - odometry.stamp_ns) for odometry in way[::-1]]
+        for vue, way in material.truth.items()
+    }
+    items = [replace(item, stamp_ns=both_ns - item.stamp_ns) for item in measured[::-1]]
+    return replace(material, items=items, truth=truth)
+
+
 def parts(material: Material) -> Iterator[tuple[str, Material]]:
     """The recording, and what is left of it."""
     yield "whole", material
     measured = [item for item in material.items if isinstance(item, RsuMeasurement)]
-    names = {item.rsu_id for item in measured} | {item.reference_rsu_id for item in measured}
-    for name in sorted(names - {""}):
-        left_out = {id(m) for m in measured if name in (m.rsu_id, m.reference_rsu_id)}
-        kept = [item for item in material.items if id(item) not in left_out]
-        yield f"without {name}", replace(material, items=kept)
+    heard = {item.rsu_id for item in measured} | {item.reference_rsu_id for item in measured}
+    names = sorted(heard - {""})
+    for name in names:
+        yield f"without {name}", without(material, [name])
     for share in SHARES:
         yield f"without {share:.0%} of all", thinned(material, share, SEED)
-    first, last = material.items[0].stamp_ns, material.items[-1].stamp_ns
     for share in BEGINNINGS:
-        begin_ns = first + round(share * (last - first))
-        kept = [item for item in material.items if item.stamp_ns > begin_ns]
-        yield f"from {share:.0%} on", replace(material, items=kept)
+        yield f"from {share:.0%} on", later(material, share)
+    for two in combinations(names, 2) if len(names) == HALVED else ():
+        yield f"two, without {' and '.join(two)}", without(material, two)
+    turned = backwards(material)
+    for share in BACKWARDS:
+        begun = f" from {share:.0%} on" if share else ""
+        yield f"backwards{begun}", later(turned, share) if share else turned
+
+
+def seen_backwards(everything: Observations, material: Material) -> Observations:
+    """``seen_of`` what runs ``backwards``."""
+    columns = {f.name: getattr(everything, f.name)[::-1] for f in fields(everything)}
+    stamps = columns["stamp_ns"]
+    turned = Observations(**columns | {"stamp_ns": stamps[0] + stamps[-1] - stamps})
+    return seen_of(turned, material)
 
 
 def seen_of(everything: Observations, material: Material) -> Observations:
@@ -111,8 +159,8 @@ def row_of(recording: Recording, part: str, material: Material, seen: Observatio
     )
 
 
-def rows_of(source: Source) -> list[Row]:
-    """All parts of a recording."""
+def rows_of(source: Source, chosen: Sequence[str]) -> list[Row]:
+    """All parts of a recording, or those whose names begin with one of the ``chosen`` words."""
     name, path, load, used = source
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / "bag"
@@ -121,8 +169,14 @@ def rows_of(source: Source) -> list[Row]:
         material = material_of(bag)
         everything = observations_of_bag(bag, range_sd_m=recording.range_sd_m)
         found = [
-            row_of(recording, part, left, seen_of(everything, left))
+            row_of(
+                recording,
+                part,
+                left,
+                (seen_backwards if part.startswith("backwards") else seen_of)(everything, left),
+            )
             for part, left in parts(material)
+            if not chosen or part.startswith(tuple(chosen))
         ]
     sys.stderr.write(f"{name}: {len(found)} parts\n")
     return found
@@ -163,6 +217,7 @@ def main() -> None:
     """Print a line for each part, the misses first."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("recordings", nargs="*", metavar="RECORDING")
+    parser.add_argument("--parts", nargs="+", default=[], metavar="WORD")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
@@ -174,7 +229,9 @@ def main() -> None:
     if not chosen:
         raise SystemExit(f"none of these recordings lies in {DATA}; set NETPOS_DATA")
     with ProcessPoolExecutor(args.workers) as pool:
-        rows = [row for found in pool.map(rows_of, chosen) for row in found]
+        rows = [
+            row for found in pool.map(partial(rows_of, chosen=args.parts), chosen) for row in found
+        ]
     rows.sort(key=lambda row: -row.exceeded)
     for row in rows:
         print(text_of(row))

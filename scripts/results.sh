@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
 # Measure the figures of README.md and docs/results anew and render them: scripts/results.sh [--runs N] [PART]...
-# Parts: fokin2020 petukhov dvornikov2017 deng2022 learned error_grid random_networks real_data fewer_rsus scenarios walking speed; without any, all of them.
+# Parts: fokin2020 petukhov dvornikov2017 deng2022 learned error_grid random_networks real_data fewer_rsus halved scenarios walking speed; without any, all of them.
 set -euo pipefail
 
 usage() { sed -n '2,3s/^# //p' "${BASH_SOURCE[0]}" >&2; exit 2; }
 papers=(fokin2020 petukhov dvornikov2017 deng2022)
-every=("${papers[@]}" learned error_grid random_networks real_data fewer_rsus scenarios walking speed)
+every=("${papers[@]}" learned error_grid random_networks real_data fewer_rsus halved scenarios walking speed)
 runs=() parts=()
 while [ $# -gt 0 ]; do
   case $1 in
@@ -65,7 +65,8 @@ for part in "${parts[@]}"; do
     error_grid) python scripts/error_grid.py --json "$recorded/error_grid.json" ;;
     random_networks) python scripts/random_networks.py --json "$recorded/random_networks.json" ;;
     real_data) real_data ;;
-    fewer_rsus) python scripts/fewer_rsus.py --json "$recorded/fewer_rsus.json" ;;
+    fewer_rsus) python scripts/fewer_rsus.py --parts whole without from --json "$recorded/fewer_rsus.json" ;;
+    halved) python scripts/fewer_rsus.py --parts two backwards --json "$recorded/halved.json" ;;
     scenarios) scenarios ;;
     walking) python scripts/pdr_results.py "$data" --json "$recorded/walking.json" ;;
     speed) netpos bench --json "$recorded/speed.json" ;;

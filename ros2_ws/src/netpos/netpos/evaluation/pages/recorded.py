@@ -273,6 +273,7 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any]], tuple[list[Entry], str]]] =
     "learned": _read_table("python scripts/learned_papers.py"),
     "error_grid": _read_table("python scripts/error_grid.py"),
     "random_networks": _read_table("python scripts/random_networks.py"),
-    "fewer_rsus": _read_table("python scripts/fewer_rsus.py"),
+    "fewer_rsus": _read_table("python scripts/fewer_rsus.py --parts whole without from"),
+    "halved": _read_table("python scripts/fewer_rsus.py --parts two backwards"),
     "walking": _read_table("python scripts/pdr_results.py"),
 }
