@@ -1,16 +1,15 @@
 """Leave each RSU out of the recordings in turn, and two of four; thin them, begin them later, and
-run them backwards: ``python scripts/fewer_rsus.py [RECORDING…] [--parts WORD…] [--workers N]
+run them backwards: ``python scripts/fewer_rsus.py [RECORDING…] [--parts KIND…] [--workers N]
 [--json FILE]``.
 
 Nothing is tuned for these networks; without one of four anchors on a car the three that are left
 may stand in one line, whose two sides nothing tells apart, and two anchors have two sides always.
 A recording that runs backwards is another one: other beginnings, other ends of each silence, other
-errors to be learned before others. Printed for each part, or those that begin with one of the
-``--parts``: the share of the estimates that are TRACKING, how often the state changes, their RMSE
-and largest error [m], their median level [m], how many errors are above it, the largest error over
-its level, and the RMSE [m] of the plain Kalman filter at the same stamps from the same
-measurements. The misses come first. The file has the parts of each recording together, and one by
-one.
+errors to be learned before others. Printed for each part, of all kinds or of the ``--parts``
+chosen: the share of the estimates that are TRACKING, how often the state changes, their RMSE and
+largest error [m], their median level [m], how many errors are above it, the largest error over its
+level, and the RMSE [m] of the plain Kalman filter at the same stamps from the same measurements.
+The misses come first. The file has the parts of each recording together, and one by one.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from itertools import combinations, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from netpos.evaluation.guarded_runs import Material, material_of, outputs_of, thinned
@@ -38,6 +37,7 @@ from real_data import DATA, Source, sources
 SHARES, BEGINNINGS, SEED = (0.5, 0.8), (0.1, 0.25, 0.4, 0.55, 0.7), 1
 BACKWARDS = (0.0, 0.35, 0.7)  # how much of it is left out
 HALVED = 4  # RSUs of a network of which two are left out
+KINDS = ("whole", "without", "from", "two", "backwards")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,7 +75,16 @@ def later(material: Material, share: float) -> Material:
     return replace(material, items=[item for item in material.items if item.stamp_ns > begin_ns])
 
 
-def backwards(material: Material) -> Material:
+class Part(NamedTuple):
+    """What is left of a recording, and the measurements of all of it as the plain filter takes
+    them."""
+
+    name: str
+    material: Material
+    everything: Observations
+
+
+def backwards(material: Material, everything: Observations) -> tuple[Material, Observations]:
     """What the RSUs measured, and the truth, from the last to the first, stamped as from the first
     to the last."""
     measured = [item for item in material.items if isinstance(item, RsuMeasurement)]
@@ -85,35 +94,34 @@ def backwards(material: Material) -> Material:
         for vue, way in material.truth.items()
     }
     items = [replace(item, stamp_ns=both_ns - item.stamp_ns) for item in measured[::-1]]
-    return replace(material, items=items, truth=truth)
+    columns = {f.name: getattr(everything, f.name)[::-1] for f in fields(everything)}
+    columns["stamp_ns"] = both_ns - columns["stamp_ns"]
+    return replace(material, items=items, truth=truth), Observations(**columns)
 
 
-def parts(material: Material) -> Iterator[tuple[str, Material]]:
-    """The recording, and what is left of it."""
-    yield "whole", material
+def parts(material: Material, everything: Observations) -> Iterator[Part]:
+    """The recording, and what is left of it; each name begins with one of ``KINDS``."""
+
+    def part(name: str, left: Material) -> Part:
+        return Part(name, left, everything)
+
+    yield part("whole", material)
     measured = [item for item in material.items if isinstance(item, RsuMeasurement)]
     heard = {item.rsu_id for item in measured} | {item.reference_rsu_id for item in measured}
     names = sorted(heard - {""})
     for name in names:
-        yield f"without {name}", without(material, [name])
+        yield part(f"without {name}", without(material, [name]))
     for share in SHARES:
-        yield f"without {share:.0%} of all", thinned(material, share, SEED)
+        yield part(f"without {share:.0%} of all", thinned(material, share, SEED))
     for share in BEGINNINGS:
-        yield f"from {share:.0%} on", later(material, share)
+        yield part(f"from {share:.0%} on", later(material, share))
     for two in combinations(names, 2) if len(names) == HALVED else ():
-        yield f"two, without {' and '.join(two)}", without(material, two)
-    turned = backwards(material)
+        yield part(f"two, without {' and '.join(two)}", without(material, two))
+    turned, turned_round = backwards(material, everything)
     for share in BACKWARDS:
         begun = f" from {share:.0%} on" if share else ""
-        yield f"backwards{begun}", later(turned, share) if share else turned
-
-
-def seen_backwards(everything: Observations, material: Material) -> Observations:
-    """``seen_of`` what runs ``backwards``."""
-    columns = {f.name: getattr(everything, f.name)[::-1] for f in fields(everything)}
-    stamps = columns["stamp_ns"]
-    turned = Observations(**columns | {"stamp_ns": stamps[0] + stamps[-1] - stamps})
-    return seen_of(turned, material)
+        left = later(turned, share) if share else turned
+        yield Part(f"backwards{begun}", left, turned_round)
 
 
 def seen_of(everything: Observations, material: Material) -> Observations:
@@ -160,25 +168,20 @@ def row_of(recording: Recording, part: str, material: Material, seen: Observatio
 
 
 def rows_of(source: Source, chosen: Sequence[str]) -> list[Row]:
-    """All parts of a recording, or those whose names begin with one of the ``chosen`` words."""
-    name, path, load, used = source
+    """The parts of a recording whose names begin with one of the ``chosen`` words."""
+    recorded, path, load, used = source
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / "bag"
         load(path, bag)
-        recording = Recording(name=name, bag=bag, **used)
+        recording = Recording(name=recorded, bag=bag, **used)
         material = material_of(bag)
         everything = observations_of_bag(bag, range_sd_m=recording.range_sd_m)
         found = [
-            row_of(
-                recording,
-                part,
-                left,
-                (seen_backwards if part.startswith("backwards") else seen_of)(everything, left),
-            )
-            for part, left in parts(material)
-            if not chosen or part.startswith(tuple(chosen))
+            row_of(recording, name, left, seen_of(seen, left))
+            for name, left, seen in parts(material, everything)
+            if name.startswith(tuple(chosen))
         ]
-    sys.stderr.write(f"{name}: {len(found)} parts\n")
+    sys.stderr.write(f"{recorded}: {len(found)} parts\n")
     return found
 
 
@@ -217,7 +220,7 @@ def main() -> None:
     """Print a line for each part, the misses first."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("recordings", nargs="*", metavar="RECORDING")
-    parser.add_argument("--parts", nargs="+", default=[], metavar="WORD")
+    parser.add_argument("--parts", nargs="+", default=KINDS, choices=KINDS)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
