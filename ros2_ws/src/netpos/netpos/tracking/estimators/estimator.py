@@ -169,6 +169,7 @@ class Estimator(ABC):
         """Rows of one measurement without states for its RSU's biases, and its innovations at the
         estimate with their sd, which holds these biases (m, 2)."""
         rows = epoch_rows_of([item], self._rsus, None, self._form)
+        self.biases.take_out_stretch(rows.rows)
         innovations = self.innovations(rows.rows)
         widen(innovations, rows.rows, self._rsus[item.rsu_id], reference_of(item, self._rsus))
         return rows, innovations

@@ -16,8 +16,10 @@ from netpos.estimation.measurement import (
     COMMON,
     GATE_VARIANCE,
     GROUP,
+    KIND,
     REFERENCE,
     SAME_BEND_S,
+    VALUE,
     Kind,
 )
 from netpos.estimation.rows import WHITE, RowErrors, rsu_axes, rsu_place, scalar_kinds
@@ -251,6 +253,12 @@ class BiasStates:
         inflation = scale * self._inflation(m, tau_s, kind)
         same_bend = self._inflation(m, SAME_BEND_S, kind) - 1.0 if own >= 0 else 0.0
         return RowErrors(own, common, other, inflation, gate, same_bend, self._stretch(kind)[0])
+
+    def take_out_stretch(self, rows: Array) -> None:
+        """Take out of the distances in ``rows`` (m, ROW_WIDTH), in place, the share by which all
+        are too long."""
+        for row in rows:
+            row[VALUE] /= 1.0 + self._stretch(Kind(int(row[KIND])))[0]
 
     def _stretch(self, kind: Kind) -> tuple[float, float]:
         """By which share values of a kind are too long, and the sd of that; 0 of what is no
