@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Protocol, Self
 import numpy as np
 
 from netpos.estimation.mixture.gaussians import Mixture
+from netpos.estimation.rows import couple
 from netpos.estimation.state import POSITION
 from netpos.messages.values import (
     Array,
@@ -167,11 +168,12 @@ class Estimator(ABC):
 
     def rows_alone(self, item: RsuMeasurement) -> tuple[EpochRows, Array]:
         """Rows of one measurement without states for its RSU's biases, and its innovations at the
-        estimate with their sd, which holds these biases (m, 2)."""
-        rows = epoch_rows_of([item], self._rsus, None, self._form)
-        self.biases.take_out_stretch(rows.rows)
+        estimate with their sd, which holds these biases (m, 2). A share by which all distances are
+        too long is taken out."""
+        rows, rsu = epoch_rows_of([item], self._rsus, None, self._form), self._rsus[item.rsu_id]
+        couple(rows.rows, self.biases.stretches(rsu, item))
         innovations = self.innovations(rows.rows)
-        widen(innovations, rows.rows, self._rsus[item.rsu_id], reference_of(item, self._rsus))
+        widen(innovations, rows.rows, rsu, reference_of(item, self._rsus))
         return rows, innovations
 
     def heard(self, epoch_rows: EpochRows) -> tuple[Rsu, ...]:

@@ -16,10 +16,8 @@ from netpos.estimation.measurement import (
     COMMON,
     GATE_VARIANCE,
     GROUP,
-    KIND,
     REFERENCE,
     SAME_BEND_S,
-    VALUE,
     Kind,
 )
 from netpos.estimation.rows import WHITE, RowErrors, rsu_axes, rsu_place, scalar_kinds
@@ -254,11 +252,10 @@ class BiasStates:
         same_bend = self._inflation(m, SAME_BEND_S, kind) - 1.0 if own >= 0 else 0.0
         return RowErrors(own, common, other, inflation, gate, same_bend, self._stretch(kind)[0])
 
-    def take_out_stretch(self, rows: Array) -> None:
-        """Take out of the distances in ``rows`` (m, ROW_WIDTH), in place, the share by which all
-        are too long."""
-        for row in rows:
-            row[VALUE] /= 1.0 + self._stretch(Kind(int(row[KIND])))[0]
+    def stretches(self, rsu: Rsu, m: RsuMeasurement) -> tuple[RowErrors, ...]:
+        """Of the errors of the scalar rows of ``m`` only the share by which all distances are too
+        long."""
+        return tuple(WHITE._replace(stretch=self._stretch(kind)[0]) for kind in rsu.kinds(m))
 
     def _stretch(self, kind: Kind) -> tuple[float, float]:
         """By which share values of a kind are too long, and the sd of that; 0 of what is no
