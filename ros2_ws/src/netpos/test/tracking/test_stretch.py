@@ -147,12 +147,16 @@ def test_distances_that_are_all_too_long_are_learned(stretch: float) -> None:
     assert rmse(found, 200.0) < 1.6 * rmse(none, 200.0)
 
 
-def test_an_rsu_that_was_excluded_before_they_were_known_comes_back() -> None:
+@pytest.mark.parametrize("seed", [3, 6, 8])
+def test_an_rsu_that_was_excluded_before_they_were_known_comes_back(seed: int) -> None:
     """Ranges that are 7 % too long contradict each other until that is known, and one of the four
     RSUs is excluded. Then it is judged by what is known of all."""
-    found = outputs(ranges(8, 100.0, 0.07))
-    last_ns = max(output.status.stamp_ns for output in found)
-    reported = {e.rsu_id for e in learned(found) if e.stamp_ns > last_ns - 20_000_000_000}
+    found = outputs(ranges(seed, 120.0, 0.07))
+    excluded = [output.status.rejected.get("isolated_rsu", 0) for output in found]
+    stamps = [output.status.stamp_ns for output in found]
+    after = next(k for k, stamp in enumerate(stamps) if stamp > stamps[0] + 100_000_000_000)
+    assert 0 < excluded[after] == excluded[-1]
+    reported = {e.rsu_id for e in learned(found) if e.stamp_ns > stamps[after]}
     assert reported == {"a0", "a1", "a2", "a3"}
 
 
