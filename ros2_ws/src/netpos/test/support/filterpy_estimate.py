@@ -39,6 +39,14 @@ class FilterpyEstimate:
         return ()
 
     @property
+    def moments(self) -> tuple[Array, Array]:
+        return self.mean, self.cov
+
+    @property
+    def is_smoothable(self) -> bool:
+        return True
+
+    @property
     def is_at_a_place(self) -> bool:
         return True
 

@@ -24,6 +24,7 @@ from netpos.estimation.mixture.gaussians import (
     moments,
     one_component,
 )
+from netpos.estimation.mixture.mirror import Mirror
 from netpos.estimation.motion import NO_BIAS, Parameter
 from netpos.estimation.state import N_CORE, POSITION, X
 from netpos.estimation.update.robust import positive_normal
@@ -67,10 +68,14 @@ class UpdateResult(NamedTuple):
 class Estimate:
     """One component in the compiled engine, or a mixture of them: while one does not explain the
     measurements, or where several motion models interact (``estimation.mixture``). It moves and is
-    updated in the order of stamps; ``bias`` (2, k): sd and time constant of the bias states."""
+    updated in the order of stamps; ``bias`` (2, k): sd and time constant of the bias states. Where
+    no measurement tells the device from its image in a ``mirror``, one side alone is carried, and
+    ``components`` has both."""
 
     mean: Array
-    """State (n,)."""
+    """State (n,) of the side that is carried."""
+    mirror: Mirror | None = None
+    """None: none, or the measurements have told the two sides apart since."""
     motion: Array
     """(Parameter,) of the last step; of no use to a smoother for interacting models."""
     declared_density: float
@@ -87,7 +92,7 @@ class Estimate:
         self.motion = self._dynamics.motions[0]
         self.declared_density = float(self.motion[Parameter.ACCEL])
         self._components: Mixture | None = None  # replaced, never changed; None: one component
-        self._modes: tuple[TrackMode, ...] | None = ()  # None: not yet asked for
+        self._modes: tuple[TrackMode, ...] | None = None  # not yet asked for
         mean, cov = start_state(config, mean, cov)
         self.mean, self._cov_or_sqrt = mean.copy(), engine.to_cov_or_sqrt(cov, self._options)
         if self._options.models > 1:
@@ -130,7 +135,7 @@ class Estimate:
             known[changed] = fresh[changed]
         self._dynamics.motions[:, Parameter.ACCEL] = motions_of(config)[:, Parameter.ACCEL]
         self.declared_density = float(self.motion[Parameter.ACCEL])
-        self._modes = () if self._components is None else None
+        self._modes = None
 
     def _move_learned(self, dt_s: float, bias: Array) -> None:
         """Take the density that is set, learned or declared, and move what is learned with the
@@ -155,7 +160,7 @@ class Estimate:
 
     @property
     def cov(self) -> Array:
-        """Covariance (n, n)."""
+        """Covariance (n, n) of the side that is carried."""
         return (
             engine.to_cov(self._cov_or_sqrt, self._options)
             if self._factored
@@ -172,17 +177,39 @@ class Estimate:
         self._components = mixture if mixture.log_weights.size > 1 else None
         self.mean, cov = moments(mixture)
         self._cov_or_sqrt = engine.to_cov_or_sqrt(cov, self._options)
-        self._modes = () if self._components is None else None
+        self._modes = None
 
     @property
-    def components(self) -> Mixture:
-        """The components that the estimate has."""
+    def _is_gaussian(self) -> bool:
+        return self._components is None and self.mirror is None
+
+    @property
+    def _carried(self) -> Mixture:
+        """The components of the side that is carried."""
         return self._components or one_component(self.mean, self.cov)
 
     @property
+    def components(self) -> Mixture:
+        """The components that the estimate has, on both sides of a mirror."""
+        return self._carried if self.mirror is None else self.mirror.both_sides(self._carried)
+
+    @property
+    def moments(self) -> tuple[Array, Array]:
+        """Mean and covariance of all ``components``."""
+        if self.mirror is None:
+            return self.mean, self.cov
+        mean, cov = moments(self.components)
+        return mean, cov
+
+    def _tell_sides_apart(self) -> None:
+        """Carry both sides of the mirror from now on."""
+        both, self.mirror = self.components, None
+        self._set(both)
+
+    @property
     def likeliest(self) -> tuple[Array, Array]:
-        """Mean and covariance of the most probable component. The mean of several may lie where
-        the device cannot be: between two places, or inside an arc."""
+        """Mean and covariance of the most probable component that is carried. The mean of several
+        may lie where the device cannot be: between two places, or inside an arc."""
         if self._components is None:
             return self.mean, self.cov
         best = int(np.argmax(self._components.log_weights))
@@ -192,30 +219,36 @@ class Estimate:
     def modes(self) -> tuple[TrackMode, ...]:
         """Where the device may be while that is not decided: modes that carry more than the
         integrity risk, the most probable first; none where it is only one."""
+        if self._is_gaussian:
+            return ()
         if self._modes is None:
-            assert self._components is not None
-            self._modes = modes_of(self._components, self._options.integrity_risk)
+            self._modes = modes_of(self.components, self._options.integrity_risk)
         return self._modes
+
+    @property
+    def is_smoothable(self) -> bool:
+        """Whether it is one place, on no side of a mirror: a smoother keeps one Gaussian."""
+        return self.mirror is None and not self.modes
 
     @property
     def is_at_a_place(self) -> bool:
         """Whether the device can be where the mean is. The density there, over that at the place
         of the most probable component, is at least what a Gaussian has at 3 sd. The mean of a
         ring, or of two places that a row of components joins, is no such place."""
-        if self._components is None:
+        if self._is_gaussian:
             return True
-        means, _, log_weights = self._components
-        places = np.stack([self.mean, means[int(np.argmax(log_weights))]])[:, POSITION]
-        here, peak = log_densities(self._components, places).tolist()
+        every, (mean, _) = self.components, self.moments
+        places = np.stack([mean, every.means[int(np.argmax(every.log_weights))]])[:, POSITION]
+        here, peak = log_densities(every, places).tolist()
         return bool(here > peak + LEAST_DENSITY_LOG)
 
     def radius(self, level_m: float) -> float:
-        """Radius [m] round ``mean`` that holds ``level_m``, the level of the Gaussian, and all
-        other places where the device may be."""
-        if self._components is None:
+        """Radius [m] round the mean of all that holds ``level_m``, the level of the Gaussian, and
+        all other places where the device may be."""
+        if self._is_gaussian:
             return level_m
         risk = self._options.integrity_risk
-        held: float = mixture_radius(self._components, self.mean, risk)
+        held: float = mixture_radius(self.components, self.moments[0], risk)
         return max(level_m, held)
 
     def augment(self, sd: Array) -> None:
@@ -235,7 +268,7 @@ class Estimate:
         ``after`` (``with_prior``)."""
         if before == after:
             return
-        changed = with_prior(self.components, index, before, after)
+        changed = with_prior(self._carried, index, before, after)
         if self._components is not None:
             self._set(changed)
             return
@@ -246,6 +279,8 @@ class Estimate:
         """Where the mean is behind the line through ``origin`` (2,) m with ``front`` (2,), of unit
         length, across it, take away what is behind it, from each component that has its mean
         there."""
+        if self.mirror is not None:
+            self._tell_sides_apart()
         if float(front @ (self.mean[POSITION] - origin)) >= 0.0:
             return
         means, covs, log_weights = (array.copy() for array in self.components)
@@ -259,6 +294,7 @@ class Estimate:
         dt = (stamp_ns - self.stamp_ns) * 1e-9
         self.stamp_ns = stamp_ns
         self._open_s += dt
+        self._modes = None
         self._move_learned(dt, bias)
         if self._components is None:
             engine.predict(self.mean, self._cov_or_sqrt, dt, self.motion, bias, self._options)
@@ -270,7 +306,9 @@ class Estimate:
         self, stamp_ns: int, unheard_s: float, rejected_in_row: int, rows: Array, bias: Array
     ) -> UpdateResult:
         """Move to ``stamp_ns`` and apply one epoch. ``prior`` holds the prediction afterwards."""
-        m = len(rows)
+        n, m, height_m = self.mean.size, len(rows), self._options.height_m
+        if self.mirror is not None and not self.mirror.leaves(rows, n, height_m):
+            self._tell_sides_apart()
         if m > self._rows:
             self._make_room(m)
         memory = self._memory
@@ -293,8 +331,9 @@ class Estimate:
         stepped = densities.clock_has_stepped(prior_mean, prior_cov, self.mean)
         self._open_s = outcome.open_s
         several = outcome.components.log_weights.size > 1
-        self._components = outcome.components if several else None
-        self._modes = None if several else ()
+        self._components, self._modes = outcome.components if several else None, None
+        if several and self.mirror is not None:
+            self._set(self.mirror.one_side(outcome.components))
         return UpdateResult(
             outcome.nis,
             outcome.used,
@@ -389,10 +428,15 @@ def modes_of(mixture: Mixture, risk: float) -> tuple[TrackMode, ...]:
     return modes if len(modes) > 1 else ()
 
 
-def start_from(config: TrackerConfig, stamp_ns: int, mixture: Mixture) -> Estimate:
-    """An estimate from the components of a first fix; from their moments where it is one
-    Gaussian."""
+def start_from(
+    config: TrackerConfig, stamp_ns: int, mixture: Mixture, mirror: Mirror | None = None
+) -> Estimate:
+    """An estimate from the components of a first fix, which a ``mirror`` does not tell from their
+    images; from their moments where it is one Gaussian."""
+    if mirror is not None:
+        mixture = mirror.one_side(mixture)
     estimate = Estimate(config, stamp_ns, *moments(mixture))
+    estimate.mirror = mirror
     if mixture.log_weights.size > 1 and carries_modes(config):
         pairs = zip(mixture.means, mixture.covs, strict=True)
         states = [start_state(config, mean, cov) for mean, cov in pairs]

@@ -38,6 +38,7 @@ from netpos.tracking.estimators.estimator import (
     Recent,
 )
 from netpos.tracking.estimators.models import (
+    carries_modes,
     heading_index,
     height_state,
     initial_extra_sd,
@@ -79,6 +80,9 @@ class PlanarEstimator(Estimator):
         super().__init__(vue_id, config, rsus, planar_form(self._heading, self._height))
         self._shared, self._lives = shared, count(1)
         self._extra_sd = initial_extra_sd(config)
+        # states of a motion model have directions; a track for others is one Gaussian
+        one_model = carries_modes(config) and not self._extra_sd.size
+        self._may_mirror = one_model and not config.network
         self._use_imu, self._calibrates_steps = config.use_imu, config.calibrates_steps
         self._secondary = Secondary(vue_id, config) if config.network else None
         if config.fixed_lag_s > 0.0:
@@ -124,8 +128,8 @@ class PlanarEstimator(Estimator):
         return self._initialiser.missing
 
     def innovations(self, rows: Array) -> Array:
-        estimate, height_m = self._there(), self._config.device_height_m
-        innovations: Array = innovations_with_sd(estimate.mean, estimate.cov, rows, height_m)
+        mean, cov = self._there().moments
+        innovations: Array = innovations_with_sd(mean, cov, rows, self._config.device_height_m)
         return innovations
 
     def _there(self) -> Estimate:
@@ -170,7 +174,9 @@ class PlanarEstimator(Estimator):
                 self._initialiser.missing = _OPEN_HEADING
                 return FirstFix(False, refused="heading_open")
             fix = one_component(*turned)
-        self.estimate = estimates.start_from(self._config, stamp_ns, fix)
+        has_mirror = self._may_mirror and pose is None
+        mirror = self._initialiser.mirror(fix) if has_mirror else None
+        self.estimate = estimates.start_from(self._config, stamp_ns, fix, mirror)
         return FirstFix(True, epoch_rows.has_time)
 
     def _pose_at(self, stamp_ns: int) -> tuple[Array, Array] | None:
@@ -214,13 +220,13 @@ class PlanarEstimator(Estimator):
     def update(self, stamp_ns: int, epoch_rows: EpochRows, past: Past) -> UpdateResult:
         rows, unheard_s = epoch_rows.rows, past.unheard_s
         estimate = self._prepared(stamp_ns, epoch_rows.items)
-        was_ambiguous = bool(estimate.modes)
+        was_one = estimate.is_smoothable
         result = estimate.step(stamp_ns, unheard_s, past.rejected_in_row, rows, self.bias)
         if self._secondary is not None:
             self._own = self._secondary.after(self._own, stamp_ns, estimate, rows, self.bias)
         self._keep_in_front(epoch_rows, result.accepted)
         # a smoother does not reach across: it keeps one Gaussian, and its clock does not step
-        breaks = result.breaks > 0 or bool(estimate.modes) != was_ambiguous
+        breaks = result.breaks > 0 or estimate.is_smoothable != was_one
         return result._replace(breaks=int(breaks))
 
     def _keep_in_front(self, epoch_rows: EpochRows, accepted: Sequence[float]) -> None:
@@ -270,18 +276,19 @@ class PlanarEstimator(Estimator):
 
     def describe(self, stamp_ns: int) -> Description:
         estimate, config = self._there(), self._config
+        mean, cov = estimate.moments
         odometry, clock, self._yaw, sd_m, radius_m = output.describe(
             stamp_ns,
             self._vue_id,
-            estimate.mean,
-            estimate.cov,
+            mean,
+            cov,
             config.device_height_m,
             self._yaw,
             self._heading,
             config.integrity_risk,
         )
         if self._height.entry:
-            output.with_height(odometry, estimate.mean, estimate.cov, self._height)
+            output.with_height(odometry, mean, cov, self._height)
         return Description(odometry, clock, sd_m, radius_m)
 
     def step_calibration(self) -> StepCalibration | None:
@@ -301,7 +308,7 @@ class PlanarEstimator(Estimator):
 
     def record(self, segment: int) -> tuple[Odometry, ...]:
         estimate = self.estimate
-        if self.recorder is None or estimate is None or estimate.modes:
+        if self.recorder is None or estimate is None or not estimate.is_smoothable:
             return ()
         return self.recorder.note(Posterior.of(estimate, segment, self.bias))
 

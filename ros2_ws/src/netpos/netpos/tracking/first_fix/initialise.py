@@ -15,6 +15,7 @@ import numpy as np
 
 from netpos.estimation.measurement import HEADING
 from netpos.estimation.mixture.gaussians import Mixture, mode_of
+from netpos.estimation.mixture.mirror import Mirror, mirror_of
 from netpos.messages.values import Array
 from netpos.tracking.config import TrackerConfig
 from netpos.tracking.estimators.models import carries_modes, slow_states
@@ -88,6 +89,14 @@ class Initialiser:
             self.missing = f"more than one place fits {fit.sources}; waiting for more"
             return None
         return found
+
+    def mirror(self, fix: Mixture) -> Mirror | None:
+        """The mirror that the measurements leave the state of a ``fix``, in which position and
+        velocity alone have a direction; None where they tell its two sides apart."""
+        if any(rsu.cone for one in self._window for rsu in one.rsus):
+            return None
+        rows = np.vstack([one.rows for one in self._window])
+        return mirror_of(rows, fix.means.shape[1], self._config.device_height_m)
 
     def excess_cost(self, stamp_ns: int, mean: Array, var: Array, slow: SlowErrors) -> float:
         """``WindowFit.excess_cost``; 0 without measurements of the time."""
