@@ -153,8 +153,7 @@ def test_what_tells_the_sides_apart_decides(side: Any) -> None:
         t_s = k * STEP_S
         name, anchor = ("c", THIRD) if k % 3 == 0 else ("ab"[k % 2], ANCHORS[k % 2])
         made.add(heard(t_s, name, distance(side(t_s), anchor) + rng.normal(0.0, SD_M)))
-        outcome = [(output.status.state, error(output, side(t_s))) for output in made.process()]
-        states += outcome
+        states += [(output.status.state, error(output, side(t_s))) for output in made.process()]
     assert all(state is TrackState.TRACKING for state, _ in states[-20:])
     assert max(away for _, away in states[-20:]) < 0.5
 
